@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
 from gloves.takes.take import LOST, Take, labeled_markers
+from handsim.hand.keypoints import NUM_KEYPOINTS
+from handsim.hand.topology import NUM_JOINTS
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.pose_solver import AnglePrior, PoseSolver
+from track.kinematics.pose_spread import SpreadModel
+from track.user import are_calibrated
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] of hinges that markers leave open, around the tracked ones
 _BAD_RMS: Final = 0.006  # [m] after which a fit from general poses is tried too
@@ -56,11 +60,33 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
         if len(frames):
             targets = labeled_markers(take.points[frames], labels[frames], span)
             qpos[frames, number], rms[frames, number] = _fit_again(take, number, frames, targets)
+    spreads = _spreads(take, labels, qpos)
     corrected = dataclasses.replace(
-        take, labels=labels, confidence=np.where(about, 1.0, take.confidence), qpos=qpos, rms=rms,
+        take, **spreads, labels=labels, confidence=np.where(about, 1.0, take.confidence), qpos=qpos, rms=rms,
         settings={**take.settings, "corrections": _records(take, corrections, pins.unfitting)},
     )  # fmt: skip
     return CorrectedTake(corrected, int(about.sum()), int(about.any(axis=1).sum()), pins.unfitting)
+
+
+def _spreads(
+    take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Standard deviations of all poses with these labels, by the names of a take's fields."""
+    calibrated = are_calibrated(str(take.settings.get("user", "")))
+    angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)
+    keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS), np.nan)
+    for number, (hand, span) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
+        there = np.flatnonzero(take.status[:, number] != LOST)
+        if not len(there):
+            continue
+        seen = np.isfinite(labeled_markers(take.points, labels, span)[..., 0])
+        last = np.maximum.accumulate(np.where(seen, take.times[:, None], -np.inf), axis=0)
+        unseen = (take.times[:, None] - last)[there]
+        rms = take.rms[there, number]
+        usual = float(np.sqrt(np.nanmean(rms**2))) if np.isfinite(rms).any() else np.nan
+        model = SpreadModel(hand, is_calibrated=calibrated)
+        angles[there, number], keypoints[there, number] = model.spreads(qpos[there, number], unseen, usual)
+    return {"angle_spread": angles, "keypoint_spread": keypoints}
 
 
 def _fit_again(

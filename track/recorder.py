@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
+from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.take import (
     RATED_FRAMES,
@@ -99,6 +99,8 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "qpos": np.array([hand.qpos for hand in hands]),
         "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
         "rms": np.array([hand.rms for hand in hands]),
+        "angle_spread": np.array([hand.angle_spread for hand in hands], dtype=np.float32),
+        "keypoint_spread": np.array([hand.keypoint_spread for hand in hands], dtype=np.float32),
         "body_poses": np.array(poses).reshape(len(bodies), 7),
         "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
@@ -144,7 +146,7 @@ class Recorder:
             self.part,
             self._header(None),
             worn_arrays(self._hands, self._bodies),
-            [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
+            [column.sized(sizes) for column in (*FRAMES, *OPTIONAL, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
         self._closed = False

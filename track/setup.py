@@ -24,7 +24,7 @@ from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_g
 from track.hand_check import check_hands
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, as_user, checked_sides, nominal_user
+from track.user import MEASURED, User, as_user, checked_sides, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -148,7 +148,7 @@ def measured_user(
         stacklevel=3,
     )
     usual = nominal_user(layout, USUAL_SIZE, sides)
-    return User(usual.hands, f"auto, {USUAL_SIZE}")
+    return User(usual.hands, f"{MEASURED}{USUAL_SIZE}")
 
 
 def found_user(
@@ -156,7 +156,7 @@ def found_user(
 ) -> User | None:
     """The user whose hands are in some frames, measured; None if no hand is found."""
     size = fit_size(frames, layout, sides, labeler)
-    return None if size is None else User(size.hands(sides), f"auto, {size}")
+    return None if size is None else User(size.hands(sides), f"{MEASURED}{size}")
 
 
 def as_designed(user: User) -> tuple[GloveFit, ...]:

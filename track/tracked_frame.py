@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import Side
+from handsim.hand.keypoints import NUM_KEYPOINTS
+from handsim.hand.topology import NUM_JOINTS, Side
 
 
 class Status(Enum):
@@ -39,6 +40,10 @@ class TrackedHand:
     """The labeled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
     filled: Int[np.ndarray, "F"]
     """Indices of the markers that are filled in from the pose."""
+    angle_spread: Float[np.ndarray, "20"] = field(default_factory=lambda: np.full(NUM_JOINTS, np.nan))
+    """Standard deviation of each joint angle [rad]; NaN where the hand is lost or it is not known."""
+    keypoint_spread: Float[np.ndarray, "21"] = field(default_factory=lambda: np.full(NUM_KEYPOINTS, np.nan))
+    """Standard deviation of each keypoint in each direction [m]; NaN as of the angles."""
 
     @property
     def has_pose(self) -> bool:

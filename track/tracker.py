@@ -60,7 +60,8 @@ class Tracker:
     """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once; a `User`, or the path of a user's file.
+        hands: The user's hands, each side at most once; a `User`, which knows whether they are calibrated (of
+            others that is assumed), or the path of a user's file.
         labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
             the glove when not given.
         bodies: Rigid bodies beside the hands.
@@ -87,7 +88,7 @@ class Tracker:
         asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
         self._intake = Intake(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [HandState(hand, config) for hand in self.hands]
+        self._states = [HandState(hand, config, is_calibrated=self.user.is_calibrated) for hand in self.hands]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
@@ -136,7 +137,7 @@ class Tracker:
         final, outcomes = self._replace_doubted(started, outcomes)
         self._history.keep(final)
         hands = tuple(
-            _tracked_hand(state, outcome, final.points, final.markers(hand))
+            _tracked_hand(state, outcome, final, final.markers(hand))
             for hand, (state, outcome) in enumerate(zip(self._states, outcomes, strict=True))
         )
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
@@ -309,16 +310,17 @@ class Tracker:
 
 
 def _tracked_hand(
-    state: HandState, outcome: _Outcome, points: NDArray[np.float64], own: NDArray[np.int64]
+    state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
 ) -> TrackedHand:
-    """The output for a hand: labeled points (N, 3) [m] where there are some, the pose's markers elsewhere."""
+    """The output for a hand: its labeled points where there are some, the pose's markers elsewhere."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
         return TrackedHand(side, outcome.status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
     markers, labeled = state.positions.copy(), own >= 0
-    markers[own[labeled]] = points[labeled]
+    markers[own[labeled]] = frame.points[labeled]
     present = np.zeros(count, dtype=bool)
     present[own[labeled]] = True
     filled = np.flatnonzero(~present)
-    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled)
+    spreads = state.pose_spread(frame.time)
+    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, *spreads)

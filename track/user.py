@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast, overload
+from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
 
@@ -23,8 +23,11 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import SIDES, Side
 from track.calibration.user_calibration import Calibration
+from track.config import Size
 
 SCHEMA: Final = 1
+MEASURED: Final = "auto, "
+"""How the notes on hands begin whose size was measured; the size follows."""
 _MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """The stored arrays of an attachment and their types; indices keep theirs, so that fractions are refused."""
@@ -78,6 +81,11 @@ class User(Sequence[GloveFit]):
     def sides(self) -> tuple[Side, ...]:
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the hands are the person's, not hands of the same size."""
+        return are_calibrated(self.notes)
 
     def __str__(self) -> str:
         """Length and breadth of the hands [mm], one pair where both are alike."""
@@ -155,6 +163,11 @@ class User(Sequence[GloveFit]):
                 temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def are_calibrated(notes: str) -> bool:
+    """Whether hands with these notes are a person's; those of a size, named or measured (auto), are not."""
+    return not notes.startswith(MEASURED) and notes not in get_args(Size)
 
 
 def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handsim.hand.keypoints import NUM_KEYPOINTS
 from handsim.hand.records import HAND_DTYPE
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
 
 
 class Column(NamedTuple):
@@ -65,6 +65,13 @@ FRAMES: Final = (
 """The fields of a take with a row a frame."""
 NUMBERS: Final = Column("numbers", "<i8", ("T",))
 """The numbers of streamed frames; a take of anything else has none."""
+SPREADS: Final = (
+    Column("angle_spread", "<f4", ("T", "H", NUM_JOINTS)),
+    Column("keypoint_spread", "<f4", ("T", "H", NUM_KEYPOINTS)),
+)
+"""Standard deviations of tracked poses; a truth, and a take of an older version, has none."""
+OPTIONAL: Final = (NUMBERS, *SPREADS)
+"""Fields with a row a frame that a take may lack."""
 KEYPOINTS: Final = Column("keypoints", "<f8", ("T", "H", NUM_KEYPOINTS, 3))
 """Joint positions, for programs without a model of the hand: written, and not read, as poses give them."""
 ATTACHMENT: Final = (
@@ -113,7 +120,7 @@ def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArr
 
 def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -> None:
     """Raise a `ValueError` unless a file's arrays have the types and shapes of the table."""
-    columns = [*STORED, *([NUMBERS] if NUMBERS.name in arrays else [])]
+    columns = [*STORED, *(column for column in OPTIONAL if column.name in arrays)]
     if arrays[_HANDS].dtype != HAND_DTYPE or arrays[_HANDS].shape != (sizes["H"],):
         raise ValueError("the hands are of another type")
     for column in columns:
@@ -132,10 +139,10 @@ def stacked_frames(
         present: Which columns of points have one in each frame, (T, N).
 
     Returns:
-        The arrays of `FRAMES`, and the numbers of the frames.
+        The arrays of `FRAMES`, and those of `OPTIONAL` that the frames have.
     """
     stacked: dict[str, NDArray[Any]] = {}
-    for column in (*FRAMES, NUMBERS):
+    for column in (*FRAMES, *(column for column in OPTIONAL if column.name in frames[0])):
         rows = [np.asarray(frame[column.name], column.dtype) for frame in frames]
         if not column.of_points:
             stacked[column.name] = np.array(rows)

@@ -28,6 +28,9 @@ from gloves.takes.columns import (
     FRAMES,
     KEYPOINTS,
     NUMBERS,
+    OPTIONAL,
+    SPREADS,
+    Column,
     check_stored,
     fitted,
     spans,
@@ -129,6 +132,10 @@ class Take:
     """Settings that made it, as JSON; of a stream, also how many frames are missing and were left out."""
     numbers: Int[np.ndarray, "T"] | None = None
     """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
+    angle_spread: Float[np.ndarray, "T H 20"] | None = None
+    """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if it is not known."""
+    keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
+    """Standard deviation of each keypoint in each direction [m]; NaN and None as of the angles."""
 
     def __repr__(self) -> str:
         """What the take holds, without its arrays."""
@@ -148,8 +155,8 @@ class Take:
             )
             for column in FRAMES:
                 object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
-            if self.numbers is not None:
-                object.__setattr__(self, NUMBERS.name, fitted(NUMBERS, self.numbers, sizes))
+            for column in self._known():
+                object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
             _check(self)
         except ValueError as error:
             raise ArgumentError(f"not a take: {error}") from error
@@ -271,13 +278,13 @@ class Take:
         else:
             present = np.isfinite(capture.positions[: len(frames), :, 0])
         arrays = stacked_frames(frames, present)
-        numbers = arrays.pop(NUMBERS.name)
+        if capture is not None:
+            arrays.pop(NUMBERS.name)
         return cls(
             rate=usual_rate(arrays["times"]) if capture is None else capture.rate,
             hands=tuple(hands),
             bodies=tuple(bodies),
             settings=dict(settings),
-            numbers=numbers if capture is None else None,
             **arrays,
         )
 
@@ -495,9 +502,8 @@ class Take:
         """
         if not 0 <= first < last <= self.num_frames:
             raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
-        parts = {column.name: getattr(self, column.name)[first:last] for column in FRAMES}
-        numbers = None if self.numbers is None else self.numbers[first:last]
-        return dataclasses.replace(self, **parts, numbers=numbers)
+        parts = {column.name: getattr(self, column.name)[first:last] for column in (*FRAMES, *self._known())}
+        return dataclasses.replace(self, **parts)
 
     def export(self, path: str | Path, *, rate: float | None = None, up: UpAxis = "z") -> None:
         """Write the motion for other programs, in the format that the name's ending says.
@@ -530,11 +536,14 @@ class Take:
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
-        arrays = {column.name: getattr(self, column.name) for column in FRAMES}
-        arrays |= {} if self.numbers is None else {NUMBERS.name: self.numbers}
+        arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
         write_archive(Path(path), header, arrays)
+
+    def _known(self) -> tuple[Column, ...]:
+        """The optional columns that it has."""
+        return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
 
     def _labels_of(self, name: str) -> range:
         """The labels of a hand's markers, or of a body's."""
@@ -650,8 +659,8 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         hands=tuple(hands),
         bodies=bodies,
         settings=settings_of(header),
-        numbers=arrays.get(NUMBERS.name),
         **{column.name: arrays[column.name] for column in FRAMES},
+        **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
 
 
@@ -687,6 +696,9 @@ def _check(take: Take) -> None:
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
     _check_range(take.confidence, 0.0, 1.0)
+    for column in SPREADS:
+        if getattr(take, column.name) is not None:
+            _check_range(getattr(take, column.name), 0.0, _LARGEST)
     if not _within(take.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
 

@@ -338,6 +338,8 @@ def _write_spot(
         cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
         sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
         for i in range(3):
-            spots[spot, TANGENT + i] = sign * (cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i]))
+            spots[spot, TANGENT + i] = sign * (
+                cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
+            )
     spots[spot, COLOR], spots[spot, COLOR + 1], spots[spot, COLOR + 2] = red, green, blue
     spots[spot, ROUGH] = max(rough, _ROUGHEST)

@@ -24,6 +24,7 @@ from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_spread import SpreadModel
 
 # Process model.
 _LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand
@@ -109,9 +110,16 @@ class HandState:
     Args:
         hand: The hand and its glove.
         config: Noise of the markers, and density of strays.
+        is_calibrated: Whether it is the user's hand, not one of the same size.
     """
 
-    def __init__(self, hand: GloveFit, config: TrackerConfig = TrackerConfig()) -> None:  # noqa: B008
+    def __init__(
+        self,
+        hand: GloveFit,
+        config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
+        *,
+        is_calibrated: bool = True,
+    ) -> None:
         self.hand = hand
         self.config = config
         self.solver = PoseSolver(hand)
@@ -140,6 +148,9 @@ class HandState:
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.zeros(count)  # [s] of each marker
+        self._last_label = np.full(count, -np.inf)  # [s] of each marker
+        self._spread_model = SpreadModel(hand, is_calibrated=is_calibrated)
+        self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(self.adapted)
         self._now = 0.0  # [s] of the last prediction
@@ -210,6 +221,13 @@ class HandState:
         )
         return confirmed, confirmed._replace(joint_prior=self._resting_prior)
 
+    def pose_spread(self, time: float) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]:
+        """Standard deviations of the pose's joint angles [rad] and keypoints [m] at a time [s]."""
+        assert self.qpos is not None
+        unseen = np.maximum(time - self._last_label, 0.0)[None]
+        angles, keypoints = self._spread_model.spreads(self.qpos[None], unseen, np.sqrt(self._usual_square))
+        return angles[0], keypoints[0]
+
     @property
     def spread(self) -> float | None:
         """Standard deviation of the markers in each direction [m]; None while unknown."""
@@ -243,6 +261,7 @@ class HandState:
         """
         self._velocity[:] = 0.0
         self._last_seen[:] = time
+        self._last_label[:] = -np.inf
         self.confirmed[:] = False
         positions = self.solver.marker_positions(qpos)
         unknown = Prediction(qpos, positions, self._resting_prior, (1.0, 1.0))
@@ -318,7 +337,12 @@ class HandState:
         missing = np.bincount(self.digits[~present & (self.digits >= 0)], minlength=len(DIGITS))
         hidden = self._velocity[6:].reshape(len(DIGITS), -1)
         hidden[missing > 0] *= _HIDDEN_DIGIT_DAMPING
-        self._last_seen[present] = time
+        self._last_seen[present] = self._last_label[present] = time
+        square = self.rms_without_bias(estimate) ** 2
+        if np.isnan(self._usual_square):
+            self._usual_square = square
+        elif np.isfinite(square):
+            self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
         """Shift the markers of `adapted` by their biases."""

@@ -17,15 +17,14 @@ from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, DIGITS, JOINTS, NUM_JOINTS, PALM
+from handsim.hand.topology import BONE_NAMES, JOINTS, NUM_JOINTS, PALM
 from track.glove_advice.observed_hands import ObservedHand
-from track.kinematics.joint_prior import JointPrior, resting_angles
 from track.kinematics.marker_kinematics import hand_arrays
-from track.kinematics.marker_prediction import empty_prediction, predict_markers
+from track.kinematics.pose_spread import known_hand, tip_lengths
+from track.kinematics.pose_spread import pose_spreads as spreads_of_poses
 
 NOISE: Final = 0.0015
 """Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
-_ANYWHERE: Final = (10.0, 10.0)  # standard deviations of the wrist before any marker is seen [m, rad]
 _FEWEST: Final = 4  # markers of a pose
 _FEWEST_OF_BODY: Final = 3  # of a rigid body
 _IN_LINE: Final = 1e-8  # [m^2]
@@ -92,21 +91,14 @@ def untold_spreads() -> Float[np.ndarray, "20"]:
     return spreads
 
 
-def _limits() -> JointPrior:
-    """The limits of the joints, as a normal distribution of the same spread."""
-    variance = untold_spreads() ** 2
-    return JointPrior(resting_angles(), np.diag(variance), np.diag(1.0 / variance))
-
-
 def _variances(
     fit: GloveFit, qpos: Float[np.ndarray, "T 27"], seen: Bool[np.ndarray, "T M"]
 ) -> Float[np.ndarray, "T 20"]:
     """Variance of each joint [rad^2]."""
-    arrays, prior, out = hand_arrays(fit), _limits(), empty_prediction(seen.shape[1])
-    on_part = np.array([(arrays.digits == part).sum() for part in (*range(len(DIGITS)), -1)])
-    markers = np.where(seen[..., None], fit.markers(qpos)[0], np.nan)
-    nothing, variances = np.zeros(seen.shape[1]), np.empty((len(qpos), NUM_JOINTS))
-    for frame, (pose, target) in enumerate(zip(np.ascontiguousarray(qpos), markers, strict=True)):
-        predict_markers(arrays, on_part, pose, target, prior, _ANYWHERE, nothing, NOISE, out)
-        variances[frame] = np.diag(out.joint_covariance)
+    hand, limits = hand_arrays(fit), np.diag(untold_spreads() ** -2.0)
+    unseen = np.where(seen, 0.0, np.inf)
+    spreads, _ = spreads_of_poses(
+        hand, tip_lengths(fit), limits, known_hand(hand.digits, NOISE), qpos, unseen
+    )
+    variances: Float[np.ndarray, "T 20"] = spreads**2
     return variances

@@ -1,7 +1,7 @@
 """Prior of a hand's hinge angles before its markers are used: a normal distribution of all 20 together.
 
 The hinges follow an Ornstein-Uhlenbeck process whose resting distribution is that of the gestures people
-make. The uncertainty of a hinge that no marker shows for a while grows to that distribution, and not beyond.
+make. A hinge that no marker shows for a while returns to that distribution, in its mean and in its spread.
 Neighboring fingers bend together, so the covariance carries information from visible digits to hidden ones.
 """
 
@@ -57,6 +57,7 @@ def resting_covariance() -> Float[np.ndarray, "20 20"]:
     return covariance
 
 
+@cache
 def resting_prior() -> JointPrior:
     """Prior of a hand without any history."""
     covariance = resting_covariance()
@@ -71,13 +72,14 @@ def predict_joints(
     """Prior of the hinges some time after they were estimated.
 
     Args:
-        angles: Predicted angles [rad].
+        angles: Predicted angles [rad], by velocity alone; they return to those of a resting hand.
         covariance: Covariance of the estimate [rad^2].
         span: Time since the estimate [s].
     """
-    prior = JointPrior(angles, np.empty_like(covariance), np.empty_like(covariance))
-    kept = np.exp(-2.0 * max(span, 0.0) / _JOINT_MEMORY)
-    _predict_covariance(covariance, resting_covariance(), kept, prior)
+    kept = np.exp(-max(span, 0.0) / _JOINT_MEMORY)
+    mean = angles + (1.0 - kept) * (resting_angles() - angles)
+    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
+    _predict_covariance(covariance, resting_covariance(), kept**2, prior)
     return prior
 
 

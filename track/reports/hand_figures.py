@@ -27,6 +27,8 @@ class HandFigures:
     """Indices into `STATUSES`."""
     angles: Float[np.ndarray, "T 20"]
     """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
+    angle_spread: Float[np.ndarray, "T 20"] | None
+    """Standard deviation of each angle [deg]; None where the take does not know them."""
     residuals: Float[np.ndarray, "T M"]
     """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
     confidence: Float[np.ndarray, "T M"]
@@ -53,6 +55,13 @@ class HandFigures:
         np.divide(total, known.sum(axis=1), out=square, where=known.any(axis=1))
         rms: NDArray[np.float64] = np.sqrt(square)
         return rms
+
+    def usual_spreads(self) -> Float[np.ndarray, "20"]:
+        """Median standard deviation of each joint's angle over the fitted frames [deg]; NaN if unknown."""
+        if self.angle_spread is None or not self.fitted.any():
+            return np.full(self.angles.shape[1], np.nan)
+        usual: NDArray[np.float64] = np.median(self.angle_spread[self.fitted], axis=0)
+        return usual
 
     def range_of_motion(self) -> Float[np.ndarray, "20 5"]:
         """`RANGE` of each joint's angle over the fitted frames [deg]; NaN where there are none."""
@@ -103,9 +112,9 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
             part = shown[first : first + _CHUNK]
             expected, _ = hand.markers(take.qpos[part, number])
             residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
-        found.append(
-            HandFigures(hand.side, hand.layout.names, take.status[:, number], angles, residuals, confidence)
-        )
+        spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
+        status, names = take.status[:, number], hand.layout.names
+        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence))
     return tuple(found)
 
 

@@ -21,6 +21,7 @@ from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
+from track.user import MEASURED, are_calibrated
 from train.evaluation.metrics import percent
 from train.reports.plot_style import picture
 
@@ -29,7 +30,7 @@ _NOTHING: Final = "-"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
     "Joint angles of such hands are typically 7 to 8 degrees off in the mean, those of calibrated hands 1 to "
-    "2 (simulated captures, whose truth is known). "
+    "2 (simulated captures, whose truth is known); the bands say how much for each joint. "
 )
 _CALIBRATE: Final = (
     "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
@@ -82,7 +83,7 @@ def _lead(take: Take) -> str:
 def _user(take: Take) -> str:
     """Whose hands they are, in words."""
     notes = str(take.settings.get("user", ""))
-    _, is_measured, size = notes.partition("auto, ")
+    _, is_measured, size = notes.partition(MEASURED)
     if is_measured:
         return f"size measured in the capture, {size}"
     return f"size {notes}" if notes in get_args(Size) else notes
@@ -105,10 +106,10 @@ def _calibration_section(take: Take) -> Section:
     notes = str(take.settings.get("user", ""))
     if not take.is_tracked:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
-    elif notes.startswith("auto, "):
+    elif notes.startswith(MEASURED):
         text = "The hands are not calibrated: their size and proportions were measured in the capture. "
         text += _UNCALIBRATED + _CALIBRATE
-    elif notes in get_args(Size):
+    elif not are_calibrated(notes):
         text = (
             f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
         )
@@ -139,17 +140,22 @@ def _angles_section(take: Take, hand: HandFigures) -> Section:
         "Zero is the flat hand. Flexion counts positive towards the palm, extension negative. Abduction "
         "counts positive towards the thumb; for the thumb itself away from the palm."
     )
+    if hand.angle_spread is not None:
+        text += " The band is one standard deviation to either side."
     return Section(f"{hand.side.capitalize()} hand: joint angles", text, pictures=[(drawn, _SHADES)])
 
 
 def _range_section(hand: HandFigures) -> Section:
-    table = [["joint [deg]", *RANGE, "range of the model"]]
-    for joint, row in zip(JOINTS, hand.range_of_motion(), strict=True):
+    table = [["joint [deg]", *RANGE, "range of the model", "usual spread"]]
+    spreads = hand.usual_spreads()
+    for joint, row, spread in zip(JOINTS, hand.range_of_motion(), spreads, strict=True):
         cells = [f"{value:.1f}" for value in row]
-        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}"])
+        usual = _NOTHING if np.isnan(spread) else f"{spread:.1f}"
+        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}", usual])
     text = (
         f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points; 5th and 95th are "
-        "percentiles, which a single wrong frame does not move."
+        "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
+        "angle, from what is not known of the hand, hidden markers and noise."
     )
     return Section(f"{hand.side.capitalize()} hand: range of motion", text, table=table)
 

@@ -54,23 +54,29 @@ def write_table(path: Path, table: Table) -> None:
 def _frames(take: Take, hands: Sequence[HandFigures]) -> Table:
     """One row per frame and hand."""
     header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
-    numbers = [np.column_stack([1e3 * hand.rms, hand.angles]).tolist() for hand in hands]
+    numbers = []
+    for hand in hands:
+        spread = np.full_like(hand.angles, np.nan) if hand.angle_spread is None else hand.angle_spread
+        numbers.append(np.column_stack([1e3 * hand.rms, hand.angles, spread]).tolist())
     counts = [hand.seen.sum(axis=1).tolist() for hand in hands]
     rows: list[list[object]] = []
     for frame, time in enumerate(take.times.tolist()):
         for hand, count, row in zip(hands, counts, numbers, strict=True):
             first = [frame, _time(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
             rows.append([*first, *map(_number, row[frame])])
-    return Table([*header, *(f"{joint}_deg" for joint in JOINT_NAMES)], rows)
+    header += [f"{joint}_deg" for joint in JOINT_NAMES]
+    return Table([*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)], rows)
 
 
 def _joints(hands: Sequence[HandFigures]) -> Table:
     """The range of motion of each joint, beside the model's."""
-    columns = [f"{name}_deg" for name in (*RANGE, "model_low", "model_high")]
+    columns = [f"{name}_deg" for name in (*RANGE, "model_low", "model_high", "spread")]
     rows: list[list[object]] = [
-        [hand.side, joint.name, *map(_number, (*row, joint.low, joint.high))]
+        [hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread))]
         for hand in hands
-        for joint, row in zip(JOINTS, hand.range_of_motion().tolist(), strict=True)
+        for joint, row, spread in zip(
+            JOINTS, hand.range_of_motion().tolist(), hand.usual_spreads().tolist(), strict=True
+        )
     ]
     return Table(["hand", "joint", *columns], rows)
 

@@ -85,7 +85,14 @@ def _hand(hand: LiveHand) -> dict[str, Any]:
         "wrist": _pose(hand.position, hand.quaternion) if there else None,
         "angles": np.round(hand.angles, _DECIMALS).tolist() if there else None,
         "positions": np.round(hand.positions, _DECIMALS).tolist() if there else None,
+        "angle_spread": _numbers(hand.angle_spread),
+        "position_spread": _numbers(hand.position_spread),
     }
+
+
+def _numbers(values: Float[np.ndarray, "N"]) -> list[float] | None:
+    """Rounded numbers; None where they are not known."""
+    return None if np.isnan(values).any() else np.round(values, _DECIMALS).tolist()
 
 
 def _body(body: LiveBody) -> dict[str, Any]:

@@ -52,6 +52,10 @@ class LiveHand:
     """Joint angles [rad]."""
     positions: Float[np.ndarray, "21 3"]
     """Joint positions in the world [m]."""
+    angle_spread: Float[np.ndarray, "20"]
+    """Standard deviation of each joint angle [rad]."""
+    position_spread: Float[np.ndarray, "21"]
+    """Standard deviation of each joint position in each direction [m]."""
 
     @property
     def has_pose(self) -> bool:
@@ -160,4 +164,6 @@ class MessageEncoder:
         positions = np.full((len(KEYPOINT_NAMES), 3), np.nan)
         if hand.has_pose:
             positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
-        return LiveHand(hand.side, hand.status, hand.qpos[:3], hand.qpos[3:7], hand.qpos[7:], positions)
+        wrist, angles = (hand.qpos[:3], hand.qpos[3:7]), hand.qpos[7:]
+        spreads = hand.angle_spread, hand.keypoint_spread
+        return LiveHand(hand.side, hand.status, *wrist, angles, positions, *spreads)

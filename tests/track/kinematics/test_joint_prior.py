@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from track.kinematics.joint_prior import digit_prior, predict_joints, resting_covariance
+from track.kinematics.joint_prior import digit_prior, predict_joints, resting_angles, resting_covariance
 from track.kinematics.marker_prediction import empty_prediction
 
 SEEDS = st.integers(0, 1000)
@@ -36,6 +36,7 @@ def test_at_once_they_are_as_they_were(seed, span):
 def test_in_the_end_they_are_as_hands_rest(seed):
     prior = predict_joints(*draw_prior(seed), 100.0)
     np.testing.assert_allclose(prior.covariance, resting_covariance() + LEAST, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(prior.angles, resting_angles())
 
 
 @settings(deadline=None)
@@ -51,8 +52,10 @@ def test_precision_is_the_inverse_and_spread_the_root_of_the_diagonal(seed, span
 @given(SEEDS, SPANS, SPANS)
 def test_two_spans_are_as_good_as_one(seed, first, second):
     angles, known = draw_prior(seed)
-    then = predict_joints(angles, predict_joints(angles, known, first).covariance - LEAST, second)
+    soon = predict_joints(angles, known, first)
+    then = predict_joints(soon.angles, soon.covariance - LEAST, second)
     at_once = predict_joints(angles, known, first + second)
+    np.testing.assert_allclose(then.angles, at_once.angles, atol=1e-12)
     np.testing.assert_allclose(then.covariance, at_once.covariance, atol=1e-12)
 
 

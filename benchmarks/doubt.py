@@ -1,0 +1,136 @@
+"""Whether the standard deviations of joint angles and keypoints are true, on simulated people.
+
+    OMP_NUM_THREADS=1 python -m benchmarks.doubt [--gloves dense19 sparse13 starter10]
+        [--seeds 0 1 2 3] [--frames 480] [--free 20] [--without-calibration]
+
+Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands that
+are measured in it, and with hands that were calibrated in a capture of their own, whose labels are the
+truth's. Counted are the errors of all poses within one and within two standard deviations: of a normal
+distribution 68 and 95 %. A person's error is the same in all frames, so that single joints need many people.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.paper.take_evaluation import measured_users, nearest_size, seen_frame
+from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.fit import GloveFit, nominal_fit
+from gloves.takes.take import Take, keypoints_of
+from handsim.hand.topology import JOINT_NAMES
+from track.calibration.user_calibration import calibrate_hand
+from track.tracker import Tracker
+from track.user import MEASURED, User
+from train.glove_labeler import load_labeler
+from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import simulate_take
+
+EVERY = 4  # frames
+
+
+class Errors(NamedTuple):
+    """Errors of poses over their standard deviations, and the errors alone."""
+
+    angles: np.ndarray
+    """(P, 20)."""
+    keypoints: np.ndarray
+    """(P, 21, 3)."""
+    degrees: np.ndarray
+    """(P, 20) [deg]."""
+    spread: np.ndarray
+    """(P, 20), the standard deviations [deg]."""
+
+
+def errors_of(take: Take, user: User, glove: str) -> list[Errors]:
+    """The errors of a tracked take, hand by hand."""
+    tracker = Tracker(user, load_labeler(glove))
+    poses: list[list[tuple[np.ndarray, ...]]] = [[] for _ in user]
+    for number in range(take.num_frames):
+        seen = seen_frame(take, number)
+        tracked = tracker.step(seen.points, seen.ids, number / take.rate)
+        for index, hand in enumerate(tracked.hands):
+            true = take.qpos[number, index]
+            if number % EVERY == 0 and hand.has_pose and np.isfinite(true[0]):
+                poses[index].append((hand.qpos, true, hand.angle_spread, hand.keypoint_spread))
+    found = []
+    for index, rows in enumerate(poses):
+        if not rows:
+            continue
+        qpos, true, angles, keypoints = map(np.array, zip(*rows, strict=True))
+        off = qpos[:, 7:] - true[:, 7:]
+        places = keypoints_of([user[index]], qpos[:, None])[:, 0]
+        places -= keypoints_of([take.hands[index]], true[:, None])[:, 0]
+        found.append(Errors(off / angles, places / keypoints[..., None], np.rad2deg(off), np.rad2deg(angles)))
+    return found
+
+
+def calibrated_hands(take: Take, glove: str, seed: int, free: float) -> User:
+    """The people of a take, each hand calibrated in a capture of its own with the true labels."""
+    rng = np.random.default_rng((seed, 1))
+    made = simulate_calibration(take.hands, CalibrationTakeConfig(free=free, rounds=2), rng=rng)
+    hands: list[GloveFit] = []
+    for hand in take.hands:
+        start = nominal_fit(glove, nearest_size(hand.shape.length), hand.side)
+        hands.append(calibrate_hand(made.observed(hand.side), start, made.rate).hand)
+    return User(tuple(hands))
+
+
+def tell(name: str, errors: Sequence[Errors]) -> list[float]:
+    """Print a line of the table: shares within one and two [%], and what the worst joint has."""
+    angles, keypoints = (np.abs(np.concatenate(some)) for some in list(zip(*errors, strict=True))[:2])
+    shares = [[100.0 * (some < limit).mean() for limit in (1, 2)] for some in (angles, keypoints)]
+    joints = [100.0 * (angles < limit).mean(axis=0) for limit in (1, 2)]
+    off, spread = (
+        np.sqrt(np.mean(np.concatenate(some) ** 2)) for some in list(zip(*errors, strict=True))[2:]
+    )
+    row = [*shares[0], *(joint.min() for joint in joints), *shares[1]]
+    print(
+        f"{name:24s} | {row[0]:5.1f} {row[1]:5.1f} | {row[2]:5.1f} {JOINT_NAMES[joints[0].argmin()]}, "
+        f"{row[3]:5.1f} {JOINT_NAMES[joints[1].argmin()]} | {row[4]:5.1f} {row[5]:5.1f} | "
+        f"{off:5.2f} {spread:5.2f}",
+        flush=True,
+    )
+    return [float(number) for number in row]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gloves", nargs="+", default=["dense19", "sparse13", "starter10"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3])
+    parser.add_argument("--frames", type=int, default=480)
+    parser.add_argument("--free", type=float, default=20.0, help="free motion in a calibration capture [s]")
+    parser.add_argument("--without-calibration", action="store_true")
+    add_save(parser)
+    arguments = parser.parse_args()
+    print(describe("numba", "torch"))
+    print(
+        "errors within 1 and 2 standard deviations [%] | joint angles | worst joints | keypoints | RMS of "
+        "angle errors, of standard deviations [deg]"
+    )
+    table: dict[str, list[Errors]] = {}
+    for glove in arguments.gloves:
+        for seed in arguments.seeds:
+            kind = KINDS[seed % len(KINDS)]
+            take = simulate_take(kind=kind, glove=glove, num_frames=arguments.frames, seed=seed)
+            take = take.without_body()
+            users = {"measured": User(tuple(measured_users(take, load_labeler(glove))), f"{MEASURED}twin")}
+            if not arguments.without_calibration:
+                users["calibrated"] = calibrated_hands(take, glove, seed, arguments.free)
+            for name, user in users.items():
+                table.setdefault(f"{glove} {name}", []).extend(errors_of(take, user, glove))
+    figures: Figures = {}
+    what = "within 1, 2 standard deviations [%]: joint angles, the worst joint of each, keypoints"
+    for name, errors in {**table, "all": [one for some in table.values() for one in some]}.items():
+        figures[name.replace(" ", "_")] = f"{name}: {what}", tell(name, errors)
+    save_figures(arguments.save, figures)
+
+
+if __name__ == "__main__":
+    main()

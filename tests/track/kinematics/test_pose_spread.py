@@ -1,0 +1,148 @@
+"""Standard deviations of poses: against simulated errors, and what more or fewer markers do to them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gloves.fit import GloveFit, attach, nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import HandModel
+from handsim.hand.topology import SIDES
+from poses.shapes.sampling import sample_poses
+from track.kinematics.joint_prior import resting_prior
+from track.kinematics.marker_kinematics import hand_arrays
+from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_spread import (
+    SpreadModel,
+    calibrated_doubt,
+    known_hand,
+    measured_doubt,
+    pose_spreads,
+    tip_lengths,
+)
+
+NOTHING = 1e-9 * np.eye(20)  # precision of hinges of which nothing is known
+INDEX = slice(4, 8)
+
+
+def spreads_of(fit, doubt, qpos, unseen, prior=NOTHING):
+    return pose_spreads(hand_arrays(fit), tip_lengths(fit), prior, doubt, qpos, unseen)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_they_are_what_noise_makes_of_the_solver(side, rng):
+    """Markers of a known hand with noise, in one pose, solved again and again."""
+    fit = nominal_fit("starter30", "M", side)
+    qpos = np.repeat(sample_poses(fit.model, 1, rng=rng), 400, axis=0)
+    noise = 0.0003
+    markers = fit.markers(qpos)[0] + noise * rng.standard_normal((400, 30, 3))
+    solved = PoseSolver(fit).solve(markers, qpos).qpos
+    doubt = known_hand(hand_arrays(fit).digits, noise)
+    angles, keypoints = spreads_of(fit, doubt, qpos[:1], np.zeros((1, 30)))
+    found = np.sqrt(((solved - qpos)[:, 7:] ** 2).mean(axis=0))
+    assert 0.9 < np.median(found / angles[0]) < 1.1
+    off = hand_keypoints(fit.model, solved) - hand_keypoints(fit.model, qpos)
+    ratios = np.sqrt((off**2).mean(axis=(0, 2))) / keypoints[0]
+    np.testing.assert_allclose(ratios, 1.0, atol=0.15)
+
+
+def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng):
+    """A person whose hand is not the model's: drawn again and again, in one pose, without noise."""
+    fit = nominal_fit("starter30", "M", "right")
+    digits, shape = hand_arrays(fit).digits, fit.shape
+    qpos, solver = sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
+    usual = known_hand(digits, 0.0002)
+    doubt = usual._replace(
+        places=np.full(30, 0.0004),
+        knuckles=np.full(5, 0.0004),
+        directions=np.full((5, 3), np.deg2rad(0.8)),
+        bones=np.tile([0.01, 0.01], (5, 1)),
+    )
+    angles, keypoints = spreads_of(fit, doubt, qpos, np.zeros((1, 30)))
+    off, places = [], []
+    for _ in range(150):
+        lengths = 0.01 * (rng.standard_normal((5, 1)) + rng.standard_normal((5, 3)))
+        person = dataclasses.replace(
+            shape,
+            bone_lengths=shape.bone_lengths * np.exp(lengths),
+            knuckles=shape.knuckles + 0.0004 * rng.standard_normal((5, 3)),
+            base_angles=shape.base_angles + np.deg2rad(0.8) * rng.standard_normal((5, 3)),
+        )
+        worn = attach(load_layout("starter30"), HandModel(person))
+        moved = worn.attachment.points + 0.0004 * rng.standard_normal((30, 3))
+        worn = GloveFit(worn.model, dataclasses.replace(worn.attachment, points=moved))
+        solved = solver.solve(worn.markers(qpos)[0], qpos).qpos
+        off.append((solved - qpos)[0, 7:])
+        places.append(hand_keypoints(fit.model, solved)[0] - hand_keypoints(worn.model, qpos)[0])
+    ratios = np.sqrt(np.square(off).mean(axis=0)) / angles[0]
+    assert 0.8 < np.median(ratios) < 1.25
+    assert (ratios > 0.5).all() and (ratios < 2.0).all()
+    ratios = np.sqrt(np.square(places).mean(axis=(0, 2))) / keypoints[0]
+    assert 0.75 < np.median(ratios) < 1.3
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 1000), st.integers(0, 18))
+def test_a_further_marker_makes_no_angle_of_a_known_hand_wider(seed, marker):
+    rng = np.random.default_rng(seed)
+    fit = nominal_fit("dense19", "M", "right")
+    qpos, doubt = sample_poses(fit.model, 1, rng=rng), known_hand(hand_arrays(fit).digits, 0.001)
+    unseen = np.where(rng.random((1, 19)) < 0.4, np.inf, 0.0)
+    unseen[0, marker] = np.inf
+    without = spreads_of(fit, doubt, qpos, unseen, resting_prior().precision)
+    unseen[0, marker] = 0.0
+    there = spreads_of(fit, doubt, qpos, unseen, resting_prior().precision)
+    for one, other in zip(there, without, strict=True):
+        assert (one <= other * (1.0 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("is_calibrated", [False, True])
+def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_prior(is_calibrated):
+    fit = nominal_fit("dense19", "M", "left")
+    model = SpreadModel(fit, is_calibrated=is_calibrated)
+    qpos = np.zeros((4, 27))
+    qpos[:, 3] = 1.0
+    unseen = np.zeros((4, 19))
+    unseen[:, hand_arrays(fit).digits == 1] = np.array([0.0, 0.05, 1.0, np.inf])[:, None]
+    angles, keypoints = model.spreads(qpos, unseen, 0.0005)
+    assert (np.diff(angles[:, INDEX], axis=0) > 0.0).all()
+    assert (np.diff(keypoints[:, 8]) > 0.0).all()
+    assert (angles[-1, INDEX] > np.deg2rad([4.0, 10.0, 10.0, 10.0])).all()
+    assert (angles <= resting_prior().spread * 1.5).all()
+
+
+def test_calibration_makes_them_narrower_and_noise_wider(rng):
+    fit = nominal_fit("dense19", "M", "right")
+    digits, qpos, seen = hand_arrays(fit).digits, sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
+    measured, calibrated, noisy = (
+        spreads_of(fit, doubt, qpos, seen, resting_prior().precision)
+        for doubt in (
+            measured_doubt(digits),
+            calibrated_doubt(digits, 0.0002),
+            calibrated_doubt(digits, 0.001),
+        )
+    )
+    for wide, narrow, middle in zip(measured, calibrated, noisy, strict=True):
+        assert (narrow < wide).all()
+        assert (narrow < middle).all()
+
+
+def test_coupled_joints_without_a_marker_are_known_as_their_neighbor_tells():
+    """Without a marker beyond the middle bone the DIP follows the PIP with the prior's width."""
+    fit, doubt = nominal_fit("dense19", "M", "right"), 0.0005
+    digits = hand_arrays(fit).digits
+    qpos = np.zeros((1, 27))
+    qpos[:, 3] = 1.0
+    unseen = np.zeros((1, 19))
+    tip = fit.layout.names.index("IndexTip") if "IndexTip" in fit.layout.names else None
+    unseen[0, [tip] if tip is not None else np.flatnonzero(digits == 1)[-1:]] = np.inf
+    prior = resting_prior()
+    angles, _ = spreads_of(fit, known_hand(digits, doubt), qpos, unseen, prior.precision)
+    conditional = np.sqrt(1.0 / prior.precision[7, 7])
+    assert conditional * 0.5 < angles[0, 7] < prior.spread[7]

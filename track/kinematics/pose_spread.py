@@ -1,0 +1,513 @@
+"""Standard deviations of joint angles and keypoints: what markers, priors and the hand leave open.
+
+The model is linear and normal around the pose. Each marker is seen with noise, and tells less the longer it
+is hidden. The hand is not quite its user's, which is the same in every frame, so that no number of frames
+averages it out: its size is another, markers sit elsewhere on their bones, digits begin elsewhere and point
+another way, bones are longer. What no marker tells follows what hands usually do: the covariance of gestures.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gloves.fit import GloveFit
+from handsim.hand.keypoints import NUM_KEYPOINTS
+from handsim.hand.shape import ADULTS
+from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
+from handsim.kernels.kernel import kernel
+from track.kinematics.joint_prior import resting_prior
+from track.kinematics.levenberg_marquardt import MARKER_NOISE, invert_positive
+from track.kinematics.marker_kinematics import (
+    NUM_UNKNOWNS,
+    HandArrays,
+    Workspace,
+    accumulate_normal_equations,
+    compute_markers,
+    hand_arrays,
+    workspace,
+)
+
+_DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
+_ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
+_LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
+# A hand of which the size is measured, chosen on simulated people that benchmarks.doubt does not try; what is
+# not here is the population's.
+_SIZE: Final = 0.02  # logarithm
+_PLACE: Final = 0.0015  # [m]
+_KNUCKLE: Final = 0.0017  # [m]
+_THUMB: Final = 3.3  # times the fingers' directions
+# A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
+_DETERMINED: Final = 3  # markers that determine a digit
+_FEW: Final = 1.4  # times the doubt of such a digit, of one with fewer
+_CALIBRATED_SIZE: Final = 3.0  # [1/m] times the noise
+_CALIBRATED_PLACE: Final = 0.5  # times the noise
+_CALIBRATED_PALM: Final = 1.5  # times the noise
+_CALIBRATED_KNUCKLE: Final = 0.15  # times the noise
+_CALIBRATED_TURNS: Final = (0.55, 0.45, 1.5)  # [deg]; abduction hardly tells where a digit points
+_CALIBRATED_THUMB: Final = 1.6  # times the fingers' directions
+_CALIBRATED_BONES: Final = (5.0, 3.0)  # [1/m] times the noise
+_CALIBRATED_WRIST: Final = 0.0009  # [m]
+_CALIBRATED_JOINTS: Final = (0.0002, 0.0006)  # [m]
+_SINGLE: Final = 4.0  # times these, of a digit with one marker
+_LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
+_OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
+_CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
+
+
+class HandDoubt(NamedTuple):
+    """How far a hand in its glove may be from its user's: standard deviations."""
+
+    noise: float
+    """Of a marker around its place on the hand, from frame to frame [m]."""
+    size: float
+    """Of the size of the whole hand, its logarithm."""
+    places: Float[np.ndarray, "M"]
+    """Of each marker's place on its bone, in each direction [m]."""
+    knuckles: Float[np.ndarray, "5"]
+    """Of where each digit begins on the palm, in each direction [m]."""
+    directions: Float[np.ndarray, "5 3"]
+    """Of the way each digit points, about the axes of the palm [rad]."""
+    bones: Float[np.ndarray, "5 2"]
+    """Of the length of each bone of a digit, and of all of them together, logarithms."""
+    wrist: float
+    """Of where the wrist is in the palm, which no marker shows, in each direction [m]."""
+    joints: Float[np.ndarray, "5 2"]
+    """Of where a digit's joints and its tip are, as far as no marker shows it, in each direction [m]."""
+
+
+def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
+    """Of a hand of which everything is known, whose markers are seen with a noise [m]."""
+    count = len(DIGITS)
+    pairs, turns = np.zeros((count, 2)), np.zeros((count, 3))
+    return HandDoubt(noise, 0.0, np.zeros(len(digits)), np.zeros(count), turns, pairs, 0.0, pairs)
+
+
+def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
+    """Of a hand of which the size is known: people and gloves differ as simulated ones do.
+
+    Args:
+        digits: Digit of each marker, -1 for the palm.
+    """
+    count, turn = len(DIGITS), np.deg2rad(ADULTS.angle_spread)
+    directions = np.tile(turn, (count, 3))
+    directions[0] *= _THUMB
+    return HandDoubt(
+        MARKER_NOISE,
+        _SIZE,
+        np.full(len(digits), _PLACE),
+        np.full(count, _KNUCKLE),
+        directions,
+        np.tile([ADULTS.bone_spread, ADULTS.digit_spread], (count, 1)),
+        0.0,
+        np.zeros((count, 2)),
+    )
+
+
+def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
+    """Of a calibrated hand, which is as near to its user's as the noise of its markers lets it be.
+
+    A digit with a single marker remains half as doubtful as on a hand of which the size is known.
+
+    Args:
+        digits: Digit of each marker, -1 for the palm.
+        noise: Standard deviation of a marker around its place, from frame to frame [m].
+    """
+    before, counts = (
+        measured_doubt(digits),
+        np.array([(digits == digit).sum() for digit in range(len(DIGITS))]),
+    )
+    single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
+    places = np.where(single, 0.5 * _PLACE, _CALIBRATED_PLACE * noise * few)
+    lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
+    turns[0] *= _CALIBRATED_THUMB
+    return HandDoubt(
+        noise,
+        _CALIBRATED_SIZE * noise,
+        np.where(digits < 0, _CALIBRATED_PALM * noise, places[np.maximum(digits, 0)]),
+        np.where(single, 0.5 * before.knuckles, _CALIBRATED_KNUCKLE * noise * few),
+        np.where(single[:, None], 0.5 * before.directions, turns),
+        np.where(single[:, None], 0.5 * before.bones, lengths),
+        _CALIBRATED_WRIST,
+        np.outer(np.where(single, _SINGLE, few), _CALIBRATED_JOINTS),
+    )
+
+
+class SpreadModel:
+    """Standard deviations of the poses of one hand.
+
+    Args:
+        fit: The hand in its glove.
+        is_calibrated: Whether it is its user's; otherwise only the size is.
+    """
+
+    def __init__(self, fit: GloveFit, *, is_calibrated: bool) -> None:
+        self._hand, self._is_calibrated = hand_arrays(fit), is_calibrated
+        self._tips, self._measured = tip_lengths(fit), measured_doubt(self._hand.digits)
+
+    def spreads(
+        self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
+    ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
+        """Of each joint angle [rad], and of each keypoint in each direction [m].
+
+        Args:
+            qpos: The poses.
+            unseen: Time since each marker was last seen [s]; infinite if it never was.
+            rms: Usual RMS distance of markers from the pose's [m]; NaN if it is not known.
+        """
+        digits = self._hand.digits
+        freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
+        noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
+        doubt = calibrated_doubt(digits, noise) if self._is_calibrated else self._measured
+        return pose_spreads(self._hand, self._tips, resting_prior().precision, doubt, qpos, unseen)
+
+
+def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:
+    """Lengths of the last bones [m]."""
+    return np.array([fit.model.skeleton.lengths[bones_of(digit)[-1]] for digit in DIGITS])
+
+
+def pose_spreads(
+    hand: HandArrays,
+    tips: Float[np.ndarray, "5"],
+    prior: Float[np.ndarray, "20 20"],
+    doubt: HandDoubt,
+    qpos: Float[np.ndarray, "T 27"],
+    unseen: Float[np.ndarray, "T M"],
+) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
+    """Standard deviations of each joint angle [rad] and of each keypoint in each direction [m].
+
+    Args:
+        hand: The hand and its glove.
+        tips: Lengths of the last bones [m].
+        prior: Precision of the hinges before any marker is seen [1/rad^2].
+        doubt: What is not known of the hand.
+        qpos: The poses.
+        unseen: Time since each marker was last seen [s]; infinite if it never was.
+    """
+    angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
+    _fill_spreads(hand, tips, prior, doubt, qpos, unseen, angles, keypoints)
+    return angles, keypoints
+
+
+@kernel
+def _fill_spreads(
+    hand: HandArrays,
+    tips: Float[np.ndarray, "5"],
+    prior: Float[np.ndarray, "20 20"],
+    doubt: HandDoubt,
+    qpos: Float[np.ndarray, "T 27"],
+    unseen: Float[np.ndarray, "T M"],
+    angles: Float[np.ndarray, "T 20"],
+    keypoints: Float[np.ndarray, "T 21"],
+) -> None:
+    """Fill the standard deviations of `pose_spreads`."""
+    count = unseen.shape[1]
+    work, weights = workspace(count), np.empty(count)
+    posterior, covariance = np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    own, whole = np.empty((len(tips), _OWN, NUM_UNKNOWNS)), np.empty(NUM_UNKNOWNS)
+    work.residuals[:] = 0.0
+    for frame in range(len(qpos)):
+        for marker in range(count):
+            weights[marker] = 1.0 / (doubt.noise**2 + _DRIFT**2 * unseen[frame, marker])
+        compute_markers(hand, qpos[frame, 7:], work)
+        accumulate_normal_equations(hand, weights, work)
+        for row in range(NUM_UNKNOWNS):
+            for column in range(row + 1):
+                posterior[row, column] = work.normal[column, row]
+                if row < NUM_JOINTS:
+                    posterior[row, column] += prior[row, column]
+            if row >= NUM_JOINTS:
+                posterior[row, row] += _ANYWHERE
+        invert_positive(posterior)
+        _add_systematic(hand, doubt, weights, work, posterior, covariance, own, whole)
+        for hinge in range(NUM_JOINTS):
+            angles[frame, hinge] = np.sqrt(covariance[hinge, hinge])
+        _spread_keypoints(hand, tips, doubt, posterior, covariance, own, whole, work, keypoints[frame])
+
+
+@kernel
+def _add_systematic(
+    hand: HandArrays,
+    doubt: HandDoubt,
+    weights: Float[np.ndarray, "M"],
+    work: Workspace,
+    posterior: Float[np.ndarray, "26 26"],
+    covariance: Float[np.ndarray, "26 26"],
+    own: Float[np.ndarray, "5 10 26"],
+    whole: Float[np.ndarray, "26"],
+) -> None:
+    """Covariance of the unknowns: the posterior, and what the hand's own doubt makes of it.
+
+    Args:
+        hand: The hand and its glove.
+        doubt: What is not known of the hand.
+        weights: Weight of each marker [1/m^2].
+        work: Its markers and their `jacobian` are read, `factor` is overwritten.
+        posterior: Covariance of the unknowns on a hand that is known.
+        covariance: Lower triangle, filled.
+        own: How the gradient of the fit changes by each digit's own numbers, in their standard deviations;
+            filled.
+        whole: The same by the size of the whole hand; filled.
+    """
+    forces = work.factor
+    forces[:], own[:], whole[:] = 0.0, 0.0, 0.0
+    shift, unknowns = np.empty((_OWN, 3)), np.empty(NUM_UNKNOWNS, dtype=np.int64)
+    for marker in range(len(weights)):
+        weight, jacobian, place = weights[marker], work.jacobian[marker], work.markers[marker]
+        first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
+        count = last - first + 6
+        for one in range(count):
+            unknowns[one] = first + one if one < last - first else NUM_JOINTS + one - (last - first)
+        square, size = (weight * doubt.places[marker]) ** 2, weight * doubt.size
+        for one in range(count):
+            row = unknowns[one]
+            a, b, c = jacobian[0, row], jacobian[1, row], jacobian[2, row]
+            whole[row] += size * (a * place[0] + b * place[1] + c * place[2])
+            a, b, c = square * a, square * b, square * c
+            for other in range(one + 1):
+                column = unknowns[other]
+                forces[row, column] += (
+                    a * jacobian[0, column] + b * jacobian[1, column] + c * jacobian[2, column]
+                )
+        for digit in range(first // 4, last // 4):
+            _shift_marker(hand, doubt, marker, digit, work, shift)
+            for one in range(count):
+                row = unknowns[one]
+                a, b, c = weight * jacobian[0, row], weight * jacobian[1, row], weight * jacobian[2, row]
+                for number in range(_OWN):
+                    own[digit, number, row] += (
+                        a * shift[number, 0] + b * shift[number, 1] + c * shift[number, 2]
+                    )
+    _add_columns(own, whole, forces)
+    _propagate(forces, posterior, covariance)
+
+
+@kernel
+def _add_columns(
+    own: Float[np.ndarray, "5 10 26"], whole: Float[np.ndarray, "26"], forces: Float[np.ndarray, "26 26"]
+) -> None:
+    """Add the squares of columns to a matrix of which the lower triangle is given, and complete it."""
+    for row in range(NUM_UNKNOWNS):
+        for column in range(row + 1):
+            forces[row, column] += whole[row] * whole[column]
+        for digit in range(len(own)):
+            for number in range(_OWN):
+                share = own[digit, number, row]
+                if share != 0.0:
+                    for column in range(row + 1):
+                        forces[row, column] += share * own[digit, number, column]
+    for row in range(NUM_UNKNOWNS):
+        for column in range(row):
+            forces[column, row] = forces[row, column]
+
+
+@kernel
+def _propagate(
+    forces: Float[np.ndarray, "26 26"],
+    posterior: Float[np.ndarray, "26 26"],
+    covariance: Float[np.ndarray, "26 26"],
+) -> None:
+    """Fill the lower triangle of the posterior plus posterior times forces times posterior."""
+    product = np.zeros((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    for row in range(NUM_UNKNOWNS):
+        for inner in range(NUM_UNKNOWNS):
+            share = forces[row, inner]
+            if share != 0.0:
+                for column in range(NUM_UNKNOWNS):
+                    product[row, column] += share * posterior[inner, column]
+    for row in range(NUM_UNKNOWNS):
+        for column in range(row + 1):
+            covariance[row, column] = posterior[row, column]
+        for inner in range(NUM_UNKNOWNS):
+            share = posterior[row, inner]
+            for column in range(row + 1):
+                covariance[row, column] += share * product[inner, column]
+
+
+@kernel
+def _shift_marker(
+    hand: HandArrays,
+    doubt: HandDoubt,
+    marker: int,
+    digit: int,
+    work: Workspace,
+    shift: Float[np.ndarray, "10 3"],
+) -> None:
+    """Fill how a marker moves by each of a digit's own numbers, in their standard deviations [m]."""
+    root, point, share = work.origins[1 + 3 * digit], np.zeros(3), 0.0
+    shift[_OWN - 1] = 0.0
+    for link in range(2, -1, -1):
+        bone = 1 + 3 * digit + link
+        reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # along the bone [m]
+        for slot in range(4):
+            if hand.bones[marker, slot] == bone:
+                share += hand.bone_weights[marker, slot]
+                reach += hand.positions[marker, slot, 0]
+                for i in range(3):
+                    point[i] += work.bone_terms[marker, slot, i]
+        for i in range(3):
+            shift[6 + link, i] = doubt.bones[digit, 0] * reach * work.rotations[bone, i, 0]
+            shift[_OWN - 1, i] += doubt.bones[digit, 1] * reach * work.rotations[bone, i, 0]
+    for i in range(3):
+        point[i] -= share * root[i]
+    _shift_digit(doubt, digit, point, share, shift)
+
+
+@kernel
+def _shift_digit(
+    doubt: HandDoubt,
+    digit: int,
+    point: Float[np.ndarray, "3"],
+    share: float,
+    shift: Float[np.ndarray, "10 3"],
+) -> None:
+    """Fill how a point of a digit moves with its knuckle and direction, in their standard deviations [m].
+
+    Args:
+        doubt: What is not known of the hand.
+        digit: Index of the digit.
+        point: From the knuckle [m], times the share.
+        share: Of the point that moves with the digit.
+        shift: Its first six rows are filled.
+    """
+    turns = doubt.directions[digit]
+    shift[:6] = 0.0
+    for i in range(3):
+        shift[i, i] = share * doubt.knuckles[digit]
+    shift[3, 1], shift[3, 2] = -turns[0] * point[2], turns[0] * point[1]
+    shift[4, 0], shift[4, 2] = turns[1] * point[2], -turns[1] * point[0]
+    shift[5, 0], shift[5, 1] = -turns[2] * point[1], turns[2] * point[0]
+
+
+@kernel
+def _spread_keypoints(
+    hand: HandArrays,
+    tips: Float[np.ndarray, "5"],
+    doubt: HandDoubt,
+    posterior: Float[np.ndarray, "26 26"],
+    covariance: Float[np.ndarray, "26 26"],
+    own: Float[np.ndarray, "5 10 26"],
+    whole: Float[np.ndarray, "26"],
+    work: Workspace,
+    spread: Float[np.ndarray, "21"],
+) -> None:
+    """Fill the standard deviation of each keypoint in each direction [m]; arguments as `_add_systematic`.
+
+    A keypoint is off by the pose's error and by the hand's own, which the fit partly makes up for.
+    """
+    total = 0.0
+    for i in range(3):
+        total += covariance[NUM_JOINTS + i, NUM_JOINTS + i]
+    spread[0] = np.sqrt(total / 3.0 + doubt.wrist**2)
+    unknowns, answers = np.empty(_CHAIN, dtype=np.int64), np.empty((_OWN + 1, _CHAIN))
+    jacobian, shift = np.zeros((_CHAIN, 3)), np.zeros((_OWN + 1, 3))
+    point, offset = np.empty(3), np.empty(3)
+    for number in range(6):
+        unknowns[4 + number] = NUM_JOINTS + number
+    for i in range(3):
+        jacobian[4 + i, i] = 1.0
+    for digit in range(len(tips)):
+        base = 1 + 3 * digit
+        for number in range(4):
+            unknowns[number] = 4 * digit + number
+        _answer(posterior, own[digit], whole, unknowns, answers)
+        jacobian[:4], shift[:] = 0.0, 0.0
+        for part in range(4):
+            bone = base + part - 1  # that ends here
+            length = (tips[digit] if part == 3 else hand.offsets[bone + 1, 0]) if part > 0 else 0.0
+            for i in range(3):
+                point[i] = work.origins[base, i]
+                if part > 0:
+                    along = length * work.rotations[bone, i, 0]
+                    point[i] = work.origins[bone, i] + along
+                    shift[5 + part, i] = doubt.bones[digit, 0] * along
+                    shift[_OWN - 1, i] += doubt.bones[digit, 1] * along
+                shift[_OWN, i] = doubt.size * point[i]
+                offset[i] = point[i] - work.origins[base, i]
+            _shift_digit(doubt, digit, offset, 1.0, shift)
+            _move_keypoint(digit, part, point, work, jacobian)
+            total = _keypoint_square(jacobian, unknowns, covariance, answers, shift)
+            beyond = doubt.joints[digit, part // 3]
+            spread[1 + 4 * digit + part] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
+
+
+@kernel
+def _keypoint_square(
+    jacobian: Float[np.ndarray, "10 3"],
+    unknowns: Int[np.ndarray, "10"],
+    covariance: Float[np.ndarray, "26 26"],
+    answers: Float[np.ndarray, "11 10"],
+    shift: Float[np.ndarray, "11 3"],
+) -> float:
+    """Mean square of a keypoint's error, over all directions together [m^2].
+
+    Args:
+        jacobian: Derivatives of the keypoint by the unknowns that move it.
+        unknowns: Which these are.
+        covariance: Of all unknowns, its lower triangle.
+        answers: See `_answer`.
+        shift: How the keypoint of the hand moves by each of its numbers [m].
+    """
+    total, cross = 0.0, np.empty(3)
+    for one in range(_CHAIN):
+        cross[:] = 0.0
+        for number in range(_OWN + 1):
+            for i in range(3):
+                cross[i] -= 2.0 * answers[number, one] * shift[number, i]
+        for other in range(one + 1):
+            share = (1.0 if one == other else 2.0) * covariance[unknowns[one], unknowns[other]]
+            for i in range(3):
+                cross[i] += share * jacobian[other, i]
+        for i in range(3):
+            total += jacobian[one, i] * cross[i]
+    for number in range(_OWN + 1):
+        for i in range(3):
+            total += shift[number, i] ** 2
+    return total
+
+
+@kernel
+def _answer(
+    posterior: Float[np.ndarray, "26 26"],
+    own: Float[np.ndarray, "10 26"],
+    whole: Float[np.ndarray, "26"],
+    unknowns: Int[np.ndarray, "10"],
+    answers: Float[np.ndarray, "11 10"],
+) -> None:
+    """Fill how the fit of some unknowns answers to a digit's own numbers, and to the size (last)."""
+    answers[:] = 0.0
+    for one in range(_CHAIN):
+        for inner in range(_CHAIN):
+            column = unknowns[inner]
+            share = posterior[unknowns[one], column]
+            for number in range(_OWN):
+                answers[number, one] += share * own[number, column]
+        for column in range(NUM_UNKNOWNS):
+            answers[_OWN, one] += posterior[unknowns[one], column] * whole[column]
+
+
+@kernel
+def _move_keypoint(
+    digit: int, part: int, point: Float[np.ndarray, "3"], work: Workspace, jacobian: Float[np.ndarray, "10 3"]
+) -> None:
+    """Fill the derivatives of a digit's keypoint by its hinges and by the wrist's rotation.
+
+    Args:
+        digit: Index of the digit.
+        part: Its joint, 0 to 2, or its tip, 3; ascending, since further hinges are left as they are.
+        point: The keypoint in the wrist's frame [m].
+        work: Its `origins` and `axes` are read.
+        jacobian: Rows of the four hinges, and of the wrist's translation and rotation [m/rad, m/m].
+    """
+    for hinge in range(part + 1 if part > 0 else 0):
+        origin, axis = work.origins[1 + 3 * digit + max(0, hinge - 1)], work.axes[4 * digit + hinge]
+        p, q, r = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
+        jacobian[hinge, 0] = axis[1] * r - axis[2] * q
+        jacobian[hinge, 1] = axis[2] * p - axis[0] * r
+        jacobian[hinge, 2] = axis[0] * q - axis[1] * p
+    jacobian[7, 1], jacobian[7, 2] = -point[2], point[1]
+    jacobian[8, 0], jacobian[8, 2] = point[2], -point[0]
+    jacobian[9, 0], jacobian[9, 1] = -point[1], point[0]
