@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
 from track.association.digit_fit import fit_hypothesis
@@ -24,6 +24,7 @@ from track.kinematics.marker_prediction import MarkerPrediction
 
 IMPOSSIBLE: Final = 1e9
 """Minus the score of a hypothesis that is excluded."""
+_GRID: Final = 5  # angles of each hinge at which distances are taken
 _LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
 _PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
 _START_DISTANCE: Final = float(
@@ -40,19 +41,27 @@ class DigitRanges(NamedTuple):
     """Largest distance [m]."""
 
 
+@kernel
 def digit_ranges(hand: HandArrays) -> DigitRanges:
-    """The distances of a hand's markers over a grid of its hinges."""
-    work = workspace(len(hand.digits))
-    shares = np.linspace(0.0, 1.0, 5)
-    grid = np.stack(np.meshgrid(*[shares] * 4, indexing="ij"), axis=-1).reshape(-1, 4)
-    count = len(hand.digits)
+    """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
+    count, work = len(hand.digits), workspace(len(hand.digits))
     nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
-    for angles in grid:
-        low, high = hand.ranges[:, 0], hand.ranges[:, 1]
-        posed = low + np.tile(angles, len(DIGITS)) * (high - low)
-        compute_markers(hand, posed, work)
-        distances = np.linalg.norm(work.markers[:, None] - work.markers[None], axis=-1)
-        nearest, farthest = np.minimum(nearest, distances), np.maximum(farthest, distances)
+    np.fill_diagonal(nearest, 0.0)
+    angles = np.empty(NUM_JOINTS)
+    for number in range(_GRID**4):
+        for hinge in range(NUM_JOINTS):
+            share = number // _GRID ** (3 - hinge % 4) % _GRID / (_GRID - 1)
+            low, high = hand.ranges[hinge]
+            angles[hinge] = low + share * (high - low)
+        compute_markers(hand, angles, work)
+        for one in range(count):
+            for other in range(one):
+                squared = 0.0
+                for axis in range(3):
+                    squared += (work.markers[one, axis] - work.markers[other, axis]) ** 2
+                distance = np.sqrt(squared)
+                nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
+                farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
     return DigitRanges(nearest, farthest)
 
 

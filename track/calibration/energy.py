@@ -37,7 +37,7 @@ from track.calibration.hand_parameters import (
     shape_at,
     shape_jacobian,
     shape_precision,
-    skeleton_parameters,
+    skeleton_jacobian,
     skinned_shape_jacobian,
     skinning_terms,
 )
@@ -63,7 +63,8 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _REST_SPREAD: Final = np.deg2rad(90.0)  # of an angle around the resting hand's
-_RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
+RELINEARIZE: Final = 0.005
+"""Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
 _STEP: Final = 1e-5  # of finite differences
 _REST: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
 
@@ -121,6 +122,7 @@ class Problem:
         noise: Standard deviation of a marker's coordinates [m].
         robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
             (Geman and McClure 1987).
+        relinearize: Change of a parameter that renews the skin's jacobian.
     """
 
     def __init__(
@@ -132,7 +134,9 @@ class Problem:
         *,
         noise: float,
         robust_scale: float,
+        relinearize: float = RELINEARIZE,
     ) -> None:
+        self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
         self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
         """Markers that are not missing."""
@@ -206,7 +210,7 @@ class Problem:
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(estimate))
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        skeleton = np.ascontiguousarray(shape_jacobian(self.shape, estimate.parameters, skeleton_parameters))
+        skeleton = skeleton_jacobian(self.shape, estimate.parameters)
         by_pose, by_shared = self._marker_jacobians(
             estimate, fit, _part(corners, 0, count), rest[:count], skeleton
         )
@@ -231,12 +235,12 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53).
 
-        The skin is built for every estimate, its derivative only when a parameter has changed by 0.005 or
-        more: that changes the result by less than a micrometer, while four times as much is noticeable.
+        The skin is built for every estimate, its derivative only when a parameter has changed: by 0.005 or
+        more changes the result by less than a micrometer, while four times as much is noticeable.
         """
         if (
             self._surface_jacobian is None
-            or np.abs(estimate.parameters - self._linearized_at).max() > _RELINEARIZE
+            or np.abs(estimate.parameters - self._linearized_at).max() > self._relinearize
         ):
             self._surface_jacobian = shape_jacobian(self.shape, estimate.parameters, rest_vertices)
             self._linearized_at = estimate.parameters

@@ -7,7 +7,7 @@ the digits, girths and the palm's thickness vary in addition, as in `handsim.han
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -83,10 +83,24 @@ def shape_jacobian(
     return jacobian
 
 
-def skeleton_parameters(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B 45"]:
-    """What of shapes determines their skeletons: bone lengths [m], knuckles [m], base angles [rad]."""
-    parts = [(shape.bone_lengths, shape.knuckles, shape.base_angles) for shape in shapes]
-    return np.array(parts).reshape(len(shapes), -1)
+def skeleton_jacobian(start: HandShape, parameters: Float[np.ndarray, "53"]) -> Float[np.ndarray, "45 53"]:
+    """Derivative of what determines a skeleton by the parameters.
+
+    That is, in this order: bone lengths [m], knuckles [m] and base angles [rad], digit by digit.
+
+    Args:
+        start: Shape of zero parameters.
+        parameters: Where to differentiate.
+    """
+    along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
+    lengths = start.bone_lengths.ravel() * along * np.exp(parameters[BONE_LENGTHS])
+    knuckles = start.knuckles * [along, across, across]
+    jacobian = np.zeros((45, NUM_PARAMETERS))
+    jacobian[:15, LENGTH], jacobian[:15, BONE_LENGTHS] = lengths, np.diag(lengths)
+    jacobian[15:30:3, LENGTH] = knuckles[:, 0]
+    jacobian[16:30:3, BREADTH], jacobian[17:30:3, BREADTH] = knuckles[:, 1], knuckles[:, 2]
+    jacobian[15:30, KNUCKLES] = jacobian[30:, DIRECTIONS] = np.eye(15)
+    return jacobian
 
 
 def skinned_shape_jacobian(
@@ -95,7 +109,7 @@ def skinned_shape_jacobian(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> Float[np.ndarray, "T M 3 45"]:
-    """Derivative of skinned points by `skeleton_parameters`, with rest points and poses held fixed.
+    """Derivative of skinned points by the skeleton (`skeleton_jacobian`), rest points and poses held fixed.
 
     A longer bone moves all bones beyond it, in the pose and at rest. Skinning undoes the rest transform, so
     the derivative is the difference of the two.

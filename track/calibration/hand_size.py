@@ -7,7 +7,7 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ _MISSING: Final = 0.2  # share of the markers at most in such a frame
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
 _PATIENCE: Final = 20  # frames with enough points for a hand, but none, after which another size is tried
 _WINDOWS: Final = 8  # parts of a capture that are looked at
-_WINDOW: Final = 30  # frames of each
+_WINDOW: Final = 16  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
 _SLIP_SPREAD, _LIFT_SPREAD = 0.006, 0.002  # [m] of markers around their places, so that tracking finds them
@@ -58,17 +58,7 @@ _REPEATED: Final = 4.0  # a glove that slipped is the same in all frames: they t
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
-
-
-class _Measured(NamedTuple):
-    """Labeled markers, and the hands of mean proportions that fit them best."""
-
-    markers: dict[Side, NDArray[np.float64]]
-    """Of each hand (F, M, 3) [m]; NaN where missing."""
-    measures: tuple[float, float]
-    """Length and breadth [m]."""
-    spread: float
-    """Standard deviation of the length [m]."""
+_SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size has 0.2 mm to spare
 
 
 class SizeFit(NamedTuple):
@@ -131,13 +121,20 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """The hands that are found as hands of a length [m]."""
-    found = _measure_from(length, frames, layout, sides, labeler, config)
-    if found is not None and abs(found.measures[0] - length) > _FAR:  # its own size labels better
-        found = _measure_from(found.measures[0], frames, layout, sides, labeler, config) or found
-    if found is None:
+    start = _hand(length, usual_breadth(length), layout)
+    markers = _label(frames, start, sides, labeler, config)
+    if not markers:
         return None
-    hand, rms = _fit_proportions(found.markers, _hand(*found.measures, layout, "right"))
-    return SizeFit(hand, rms, found.spread)
+    search = _Search(markers, start)
+    found = search.length(usual_breadth, _SHORTEST, _LONGEST)
+    if abs(found - length) > _FAR:  # the labels are better with its own size
+        start = _hand(found, usual_breadth(found), layout)
+        markers = _label(frames, start, sides, labeler, config) or markers
+        search = _Search(markers, start)
+        found = search.length(usual_breadth, _SHORTEST, _LONGEST)
+    measures, spread = search.measures(found)
+    hand, rms = _fit_proportions(_as_right(markers), _hand(*measures, layout))
+    return SizeFit(hand, rms, spread)
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
@@ -152,20 +149,6 @@ def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Sid
     return bool(np.mean(tracked) >= _MOST_FRAMES) if tracked else False
 
 
-def _measure_from(
-    length: float,
-    frames: Sequence[StreamedFrame],
-    layout: MarkerLayout,
-    sides: Sequence[Side],
-    labeler: Labeler,
-    config: TrackerConfig,
-) -> _Measured | None:
-    """What is measured on hands that are labeled as hands of a length [m]."""
-    users = [_hand(length, usual_breadth(length), layout, side) for side in sides]
-    markers = {side: some for side, some in _label(frames, users, labeler, config) if len(some) >= _FEWEST}
-    return _Measured(markers, *_search(markers, users)) if markers else None
-
-
 def usual_breadth(length: float) -> float:
     """The breadth of hands of a length [m]: that of the five sizes, and in proportion beyond them."""
     lengths, breadths = 1e-3 * np.array(sorted(SIZES.values())).T
@@ -173,30 +156,40 @@ def usual_breadth(length: float) -> float:
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
 
-def _hand(length: float, breadth: float, layout: MarkerLayout, side: Side) -> GloveFit:
-    """A hand of mean proportions in a glove as designed; length and breadth in [m]."""
-    return attach(layout, HandModel(shape_from_measures(length, breadth, side=side)))
+def _hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
+    """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
+    return attach(layout, HandModel(shape_from_measures(length, breadth, side="right")))
 
 
 def _label(
-    frames: Sequence[StreamedFrame], users: Sequence[GloveFit], labeler: Labeler, config: TrackerConfig
-) -> Iterator[tuple[Side, Float[np.ndarray, "F M 3"]]]:
-    """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them."""
-    tracker = Tracker(users, labeler, config=config)
-    count = users[0].layout.num_markers
-    found: list[list[NDArray[np.float64]]] = [[] for _ in users]
+    frames: Sequence[StreamedFrame],
+    hand: GloveFit,
+    sides: Sequence[Side],
+    labeler: Labeler,
+    config: TrackerConfig,
+) -> dict[Side, Float[np.ndarray, "F M 3"]]:
+    """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them.
+
+    Hands that few frames show are left out.
+    """
+    tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
+    count = hand.layout.num_markers
+    found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
     in_vain = 0
     for frame in frames:
         if in_vain == _PATIENCE and not any(found):
             break
         in_vain += len(frame.points) >= (1.0 - _MISSING) * count
-        for hand, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
-            if hand.status in _FITTED and len(hand.filled) <= _MISSING * count:
-                markers = hand.markers.copy()
-                markers[hand.filled] = np.nan
+        for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
+            if seen.status in _FITTED and len(seen.filled) <= _MISSING * count:
+                markers = seen.markers.copy()
+                markers[seen.filled] = np.nan
                 some.append(markers)
-    for user, some in zip(users, found, strict=True):
-        yield user.side, _spread_out(np.array(some).reshape(-1, count, 3), _PROPORTION_FRAMES)
+    return {
+        side: _spread_out(np.array(some), _PROPORTION_FRAMES)
+        for side, some in zip(sides, found, strict=True)
+        if len(some) >= _FEWEST
+    }
 
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
@@ -207,40 +200,53 @@ def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return chosen
 
 
-def _search(
-    markers: Mapping[Side, Float[np.ndarray, "F M 3"]], users: Sequence[GloveFit]
-) -> tuple[tuple[float, float], float]:
-    """The likeliest length and breadth [m], and the standard deviation of the length [m].
+def _as_right(markers: Mapping[Side, Float[np.ndarray, "F M 3"]]) -> Float[np.ndarray, "F M 3"]:
+    """The markers of all hands as those of right hands [m]."""
+    return np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
 
-    Few markers fit hands of many sizes, so that the sizes of people count too. Length comes first, then
-    breadth, then length again.
+
+class _Search:
+    """The likeliest length and breadth of hands of mean proportions.
+
+    Few markers fit hands of many sizes, so that the sizes of people count too.
 
     Args:
         markers: Labeled markers of each hand [m]; NaN where missing.
-        users: The hands that they were labeled as.
+        start: The right hand as which they were labeled.
     """
-    layout = users[0].layout
-    few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
-    starts = {hand.side: PoseSolver(hand).solve(few[hand.side]).qpos for hand in users if hand.side in few}
-    seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few.values()])
-    evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
 
-    def cost(length: float, breadth: float) -> float:
-        solvers = {side: PoseSolver(_hand(length, breadth, layout, side)) for side in few}
-        fits = [solvers[side].solve(some, starts[side]).rms for side, some in few.items()]
+    def __init__(self, markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
+        few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
+        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few.values()])
+        self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
+        self._markers, self._layout = _as_right(few), start.layout
+        self._poses = PoseSolver(start).solve(self._markers).qpos
+
+    def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
+        """The likeliest length [m] between two; `breadth` gives the breadth [m] of each."""
+        return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
+
+    def measures(self, length: float) -> tuple[tuple[float, float], float]:
+        """Length and breadth [m], and the standard deviation of the length [m].
+
+        Args:
+            length: The likeliest of hands of the usual breadth [m].
+        """
+        usual = usual_breadth(length)
+        low, high = (factor * usual for factor in _BREADTHS)
+        breadth = _least(lambda tried: self._cost(length, tried), low, high)
+        length = self.length(lambda tried: breadth, 0.95 * length, 1.05 * length)
+        around = [self._cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
+        curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
+        prior = _LENGTH_SPREAD**-2
+        return (length, breadth), (max(curvature - prior, 0.0) / _REPEATED + prior) ** -0.5
+
+    def _cost(self, length: float, breadth: float) -> float:
+        solver = PoseSolver(_hand(length, breadth, self._layout))
         beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
         broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
-        square = float(np.median(np.concatenate(fits))) ** 2
-        return 0.5 * (evidence * square + beyond**2 + broad**2)
-
-    length = _least(lambda tried: cost(tried, usual_breadth(tried)), _SHORTEST, _LONGEST)
-    usual = usual_breadth(length)
-    breadth = _least(lambda tried: cost(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
-    length = _least(lambda tried: cost(tried, breadth), 0.95 * length, 1.05 * length)
-    around = [cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
-    prior = _LENGTH_SPREAD**-2
-    curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
-    return (length, breadth), (max(curvature - prior, 0.0) / _REPEATED + prior) ** -0.5
+        square = float(np.median(solver.solve(self._markers, self._poses).rms)) ** 2
+        return 0.5 * (self._evidence * square + beyond**2 + broad**2)
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
@@ -284,30 +290,33 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
                 third = tried
 
 
-def _fit_proportions(
-    markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit
-) -> tuple[GloveFit, float]:
+def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[GloveFit, float]:
     """One shape for all hands of a user, by a calibration without touches.
 
     What the frames do not tell stays as it was.
 
     Args:
-        markers: Labeled markers of each hand in the glove's order [m]; NaN where missing, at least four seen
-            in every frame.
+        seen: Labeled markers of right hands in the glove's order [m]; NaN where missing, at least four in
+            every frame.
         start: A right hand of about the right length and breadth in the glove as designed.
 
     Returns:
         The right hand in its glove, and the median over frames of the RMS distance of its markers [m].
     """
-    seen = np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
     worn, shape = start.attachment, start.model.shape
     coordinates = nearest_coordinates(worn.points, shape)
     problem = Problem(
-        shape, coordinates, worn.layout.heights, seen, noise=_FIT_NOISE, robust_scale=_ROBUST_SCALE
+        shape,
+        coordinates,
+        worn.layout.heights,
+        seen,
+        noise=_FIT_NOISE,
+        robust_scale=_ROBUST_SCALE,
+        relinearize=_RELINEARIZE,
     )
     problem.position_spread, problem.height_spread = _SLIP_SPREAD, _LIFT_SPREAD
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
-    estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None)
+    estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     return hand, float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))

@@ -279,6 +279,7 @@ def nearest_coordinates(points: Float[np.ndarray, "P 3"], shape: HandShape) -> S
     """Coordinates of points [m] in the wrist's frame, starting from the nearest of all triangles."""
     skin = build_skin(shape)
     middles = skin.points[skin_mesh().faces].mean(axis=1)
-    faces = np.array([((middles - point) ** 2).sum(axis=1).argmin() for point in points], dtype=np.int64)
+    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ points.T  # half the squares, less the points'
+    faces = off.argmin(axis=0)
     start = SkinCoordinates(faces, np.full((len(faces), 3), 1 / 3), np.zeros(len(faces)))
     return project_onto_skin(start, points, skin)

@@ -25,11 +25,17 @@ Progress = Callable[[int, float, float], None]
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _MORE, _LESS, _LEAST_RAISED = 10.0, 0.2, 1e-6  # factors of the damping after a failed step and a good one
 _MOST_TRIALS: Final = 8
-_SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
+SMALL_GAIN: Final = 1e-4
+"""Share of the energy; a step that gains less is the last one."""
 
 
 def levenberg_marquardt(
-    problem: Problem, estimate: Estimate, steps: int, most: int, progress: Progress | None
+    problem: Problem,
+    estimate: Estimate,
+    steps: int,
+    most: int,
+    progress: Progress | None,
+    small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
     """Minimize the energy until it hardly falls, or `most` steps have been made.
 
@@ -39,6 +45,7 @@ def levenberg_marquardt(
         steps: Number of steps made before.
         most: Number of the last step, at most.
         progress: Called after each step.
+        small_gain: Share of the energy; a step that gains less is the last one.
 
     Returns:
         The estimate, its fit, and the number of the last step.
@@ -50,7 +57,7 @@ def levenberg_marquardt(
         steps += 1
         if progress is not None:
             progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
-        if abs(before - fit.cost) < _SMALL_GAIN * before:
+        if abs(before - fit.cost) < small_gain * before:
             break
     return estimate, fit, steps
 

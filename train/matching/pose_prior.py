@@ -152,6 +152,14 @@ def procrustes_errors(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
 ) -> FloatArray:
     """Squared distances (C,) of centered points to mean hands that are moved and turned onto them [m^2]."""
+    return errors_of_products(*products_with_means(cloud, labels, table), False)
+
+
+@kernel
+def products_with_means(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
+) -> tuple[FloatArray, FloatArray]:
+    """Sums of outer products (9, C) of points and markers of mean hands, and of squares (C,) [m^2]."""
     count, size = table.shape[2], 0.0
     product, center, squares = np.zeros((9, count)), np.zeros((3, count)), np.zeros(count)
     for number in range(len(cloud)):
@@ -165,19 +173,30 @@ def procrustes_errors(
                 product[6 + axis, one] += z * mean[one]
                 center[axis, one] += mean[one]
                 squares[one] += mean[one] * mean[one]
-    errors = np.empty(count)
     for one in range(count):
         off = center[0, one] ** 2 + center[1, one] ** 2 + center[2, one] ** 2
-        both = size + squares[one] - off / len(cloud)
-        errors[one] = both - 2.0 * _largest_root(product[:, one], 0.5 * both, _ROUGH)
+        squares[one] = size + squares[one] - off / len(cloud)
+    return product, squares
+
+
+@kernel
+def errors_of_products(
+    product: Float[np.ndarray, "9 C"], squares: Float[np.ndarray, "C"], mirrored: bool
+) -> FloatArray:
+    """See `procrustes_errors`; of the mirror image of the points where `mirrored`."""
+    errors = np.empty(len(squares))
+    for one in range(len(squares)):
+        largest = _largest_root(product[:, one], mirrored, 0.5 * squares[one], _ROUGH)
+        errors[one] = squares[one] - 2.0 * largest
     return errors
 
 
 @kernel
-def _largest_root(product: Float[np.ndarray, "9"], above: float, tolerance: float) -> float:
+def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float, tolerance: float) -> float:
     """Largest eigenvalue of Horn's matrix of a sum of outer products, from a bound above it (Theobald 2005).
 
-    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0.
+    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0; where `mirrored`, that of the product with the
+    other sign of its first row, which is the sign of c1.
     """
     a, b, c, d, e, f, g, h, i = product
     xx, yy, zz = a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i
@@ -185,6 +204,8 @@ def _largest_root(product: Float[np.ndarray, "9"], above: float, tolerance: floa
     total = xx + yy + zz
     c2 = -2.0 * total
     c1 = -8.0 * (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+    if mirrored:
+        c1 = -c1
     c0 = 2.0 * (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) - total * total
     root = above
     for _ in range(_NEWTON_STEPS):
@@ -252,7 +273,7 @@ def residual_of(
             bound += 0.5 * (there * there + cloud[number, axis] * cloud[number, axis])
             for first in range(3):
                 product[first, axis] += cloud[number, first] * there
-    root = _largest_root(product.ravel(), bound, _EXACT)
+    root = _largest_root(product.ravel(), False, bound, _EXACT)
     w, x, y, z = _largest_eigenvector(_quaternion_matrix(product), root)
     rotation = np.array(
         [

@@ -24,11 +24,13 @@ from train.matching.assignment import (
 from train.matching.pose_prior import (
     NEAREST,
     PosePrior,
+    errors_of_products,
     factor_of,
     log_density,
     log_normal,
     means_by_marker,
     procrustes_errors,
+    products_with_means,
     residual_of,
     seen_as_right,
 )
@@ -41,7 +43,7 @@ _MOST: Final = 1 + _MOST_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)  # labelings
 _FARTHEST: Final = 14.0  # cost of a labeling above that of the likeliest [nats, twice]
 _WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
-_NEAR: Final = 80  # components that count for the labelings around the likeliest one
+_NEAR: Final = 24  # components that count for the labelings around the likeliest one
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
 _LEAST: Final = 4  # labeled points of a hand
 _LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
@@ -217,9 +219,10 @@ def _near_components(
     known = np.flatnonzero(labels >= 0)
     known_labels, table = labels[known], means_by_marker(means, np.arange(len(means)))
     best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
+    products, squares = products_with_means(seen_as_right(points[known], False), known_labels, table)
     for mirrored in (False, True):
         cloud = seen_as_right(points[known], mirrored)
-        chosen = np.argsort(procrustes_errors(cloud, known_labels, table))[:_NEAR]
+        chosen = np.argsort(errors_of_products(products, squares, mirrored))[:_NEAR]
         density = log_density(cloud, known_labels, chosen[:NEAREST], means, directions, spreads, log_weights)
         if density > best or not len(near):
             best, near, left = density, chosen, mirrored

@@ -17,7 +17,7 @@ from track.calibration.hand_parameters import (
     shape_at,
     shape_jacobian,
     shape_precision,
-    skeleton_parameters,
+    skeleton_jacobian,
     skinned_shape_jacobian,
     skinning_terms,
 )
@@ -39,6 +39,17 @@ def test_people_differ_by_what_the_prior_says(rng):
     assert 0.08 < whole < 0.15  # log length of a bone
 
 
+def skeleton_of(shape):
+    """What of a shape determines its skeleton, in the order of `skeleton_jacobian`."""
+    return np.concatenate([shape.bone_lengths, shape.knuckles, shape.base_angles]).ravel()
+
+
+def test_the_skeleton_follows_the_parameters(rng):
+    shape, here = sample_shape(rng=rng), 0.02 * rng.standard_normal(NUM_PARAMETERS)
+    quotient = shape_jacobian(shape, here, lambda hands: np.array([skeleton_of(hand) for hand in hands]))
+    np.testing.assert_allclose(skeleton_jacobian(shape, here), quotient, atol=2e-6)
+
+
 def test_points_follow_the_skeleton(rng):
     shape = sample_shape(rng=rng)
     model = HandModel(shape)
@@ -58,7 +69,7 @@ def test_points_follow_the_skeleton(rng):
         return np.einsum("ml,tmli->tmi", weights, carried)
 
     jacobian = skinned_shape_jacobian(model, model.forward_kinematics(qpos), worn.points, weights)
-    here, step = skeleton_parameters([shape])[0], 1e-6
+    here, step = skeleton_of(shape), 1e-6
     for number, nudge in enumerate(step * np.eye(len(here))):
         quotient = (placed(here + nudge) - placed(here - nudge)) / (2 * step)
         np.testing.assert_allclose(jacobian[..., number], quotient, atol=1e-7)
