@@ -202,14 +202,17 @@ class Studio:
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera]) -> Moment:
         """The moment with arms that leave the pictures of these cameras."""
-        there = {
-            number: pose for number in range(len(self._hands)) if (pose := moment.hand(number)) is not None
-        }
-        if not there:
-            return moment
-        lines = [self._hands[number].forearm_line(pose) for number, pose in there.items()]
         found = np.full((len(self._hands), 3), np.nan)
-        found[list(there)] = upper_arms(*map(np.array, zip(*lines, strict=True)), cameras)
+        there, elbows, forearms = [], [], []
+        for number, hand in enumerate(self._hands):
+            pose = moment.hand(number)
+            if pose is not None:
+                elbow, forearm = hand.forearm_line(pose)
+                there.append(number)
+                elbows.append(elbow)
+                forearms.append(forearm)
+        if there:
+            found[there] = upper_arms(np.array(elbows), np.array(forearms), cameras)
         return dataclasses.replace(moment, upper_arms=found)
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -70,7 +70,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
 
 def _spreads(
     take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Any]:
     """Standard deviations of all poses with these labels, by the names of a take's fields."""
     calibrated = are_calibrated(str(take.settings.get("user", "")))
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)

@@ -48,7 +48,8 @@ def calibrate_take(
     Raises:
         CalibrationError: No hand is in the take, or it tells too little of one.
     """
-    shown = [hand for hand in start if _reliable(take, hand.side).mean() > _SHOWN]
+    there = [hand for hand in start if hand.side in take.sides]
+    shown = [hand for hand in there if _reliable(take, hand.side).mean() > _SHOWN]
     if not shown:
         raise CalibrationError(
             f"no {' and no '.join(take.sides)} hand was found in the capture; expected half a minute of one"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -220,15 +221,18 @@ def score_glove(
         known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
         step("labeling")
         score = score_layout(layout, hands, known, rng=rng)
-        trials = try_layout(
-            layout, cameras, known, count=captures, told=lambda words: step(f"trying captures: {words}")
-        )
+        told = functools.partial(_told_capture, step, "trying captures")
+        trials = try_layout(layout, cameras, known, count=captures, told=told)
         score = dataclasses.replace(score, trials=trials)
     _tell(score)
     for number, sentence in enumerate(advice(score), 1):
         print_line(f"{number}. {sentence}")
     write_score_page(page, score, seen_by=f"{seen}, seen by rig {cameras.name}", trained=labeler is not None)
     print_line(f"{page}: the hand with its confusions, markers and joints")
+
+
+def _told_capture(step: Callable[[str], None], what: str, words: str) -> None:
+    step(f"{what}: {words}")
 
 
 def _check_captures(captures: int) -> None:
@@ -344,10 +348,8 @@ def improve_glove(
         for name, tried in (("before", layout), ("after", found)) if captures else ():
             step(f"learning the layout {name}, about a minute")
             known = learned_labeler(tried, cameras)
-            told = f"trying captures {name}"
-            trials[name] = try_layout(
-                tried, cameras, known, count=captures, told=lambda words, told=told: step(f"{told}: {words}")
-            )
+            told = functools.partial(_told_capture, step, f"trying captures {name}")
+            trials[name] = try_layout(tried, cameras, known, count=captures, told=told)
     found.save(out)
     print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}, {_palm_line(layout)}")
     print_line(f"after:  {count} markers, {_worth_line(search.worth)}, {_palm_line(found)}")

@@ -74,7 +74,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     with np.errstate(invalid="ignore"):  # NaN behind the camera
         inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
     points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
-    shadows = shadow_map(points, casting, lamps[0, :3], inside.all(axis=1))
+    shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
     sums = np.zeros((height, width, 4), dtype=np.float32)
     covered = _covered(first)
     for mesh in meshes:
@@ -138,7 +138,7 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 @kernel
 def _covered(first: NDArray[np.int32]) -> Any:
-    """Numbers (N,) of the pixels with a surface in one of their four samples; the nearest face is -1 for none."""
+    """Numbers (N,) of the pixels with a surface in one of their samples (2 H, 2 W), which are -1 for none."""
     height, width = first.shape[0] // 2, first.shape[1] // 2
     covered, count = np.empty(height * width, np.int32), 0
     for row in range(height):

@@ -10,7 +10,7 @@ import numpy as np
 
 from handsim.errors import HandSimError
 from render.skin.atlas import skin_atlas
-from render.skin.fields import bump, noise
+from render.skin.fields import bump, noise, smooth
 from render.skin.forearm import Forearm
 from render.skin.relief import normal_map
 from render.skin.texels import REFERENCE, skin_texels
@@ -78,10 +78,12 @@ def glove_texture(
     hem = bump(behind - look.cuff + 0.004, 0.0015)
     painted = lab + (look.wear * 2.0 * cloth - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     height = look.wear * 1.2e-4 * cloth - 4e-4 * hem
-    covered = (behind < look.cuff).reshape(rows, width, 1)
+    cloth_share = 1.0 - smooth(behind, look.cuff - 0.004, look.cuff + 0.004).reshape(rows, width, 1)
+    covered = cloth_share > 0.5
+    cloth_color = lab_to_srgb(painted.reshape(rows, width, 3)).astype(np.float64)
     rough = np.uint8(round(255.0 * look.roughness))
     return SkinTexture(
-        np.where(covered, lab_to_srgb(painted.reshape(rows, width, 3)), skin.color),
+        np.rint(skin.color + cloth_share * (cloth_color - skin.color)).astype(np.uint8),
         np.where(covered[..., 0], rough, skin.roughness),
         np.where(covered, normal_map(height, side), skin.normals),
     )

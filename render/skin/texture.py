@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from handsim.hand.topology import Side
 
 
+_HEM: Final = 0.004  # [m] that a hem is soft: a texel of the arm is 5 mm long, and less shows its corners
 _CREASE: Final = (-0.006, 0.02)  # [m] behind the wrist, where the palm's skin ends
 _VEIN: Final = 0.0017  # [m] half as wide as a vein
 _UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
@@ -207,8 +208,8 @@ def _nails() -> tuple[_Nail, ...]:
 
 def _paint_nails(paint: _Paint, look: SkinLook) -> None:
     """Nail plates: pinker and smoother than the skin, a pale moon, a whiter free edge, and a dark fold."""
-    bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.35, 0.5, 0.6]
-    bed += np.array([68.0, 12.0, 13.0]) * [0.65, 0.5, 0.4]  # beds hold little pigment, as palms do
+    bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.6, 0.5, 0.6]
+    bed += np.array([68.0, 12.0, 13.0]) * [0.4, 0.5, 0.4]  # beds hold little pigment, as palms do
     for mine, plate, fold, moon in _nails():
         color = (bed + look.nail).astype(np.float32) + moon
         color += np.float32(look.polish) * (np.array(look.polish_color, dtype=np.float32) - color)
@@ -225,10 +226,10 @@ def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     """Cloth from some way behind the wrist on, with folds as darker and lighter bands."""
     positions = skin_texels().positions
     behind = -positions[:, 0] * forearm.length / REFERENCE.length
-    cloth = smooth(behind, forearm.sleeve - 0.0015, forearm.sleeve + 0.0015)
+    cloth = smooth(behind, forearm.sleeve - _HEM, forearm.sleeve + _HEM)
     color = cv2.cvtColor(np.array([[forearm.sleeve_color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
     folds = noise(positions * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
-    hem = bump(behind - forearm.sleeve, 0.0025)
+    hem = bump(behind - forearm.sleeve, _HEM)
     for channel in range(3):
         painted = color[channel] + (4.0 * folds - 9.0 * hem if channel == 0 else 0.0)
         paint.lab[:, channel] += cloth * (painted - paint.lab[:, channel])

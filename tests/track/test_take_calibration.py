@@ -37,7 +37,7 @@ def angle_error(take: Take, truth: Take) -> float:
 
 @pytest.mark.slow
 def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
-    start = [nominal_fit("dense19", "M", "right")]
+    start = [nominal_fit("dense19", "M", side) for side in ("right", "left")]  # the take has a right one
     done = calibrate_take(seen, start, start, None)
     user = kept_user(seen, done, start, "from a test", None)
     (one,) = user.calibrations

@@ -105,6 +105,7 @@ class FrameState(NamedTuple):
         return np.flatnonzero(free)
 
 
+@kernel
 def targets_of(
     points: Float[np.ndarray, "N 3"], markers: Int[np.ndarray, "N"], count: int
 ) -> Float[np.ndarray, "M 3"]:
@@ -116,7 +117,9 @@ def targets_of(
         count: Markers of the layout.
     """
     targets = np.full((count, 3), np.nan)
-    targets[markers[markers >= 0]] = points[markers >= 0]
+    for point in range(len(markers)):
+        if markers[point] >= 0:
+            targets[markers[point]] = points[point]
     return targets
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
@@ -155,14 +155,10 @@ def fit_labels(
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
     while True:
-        labeled = np.flatnonzero(markers >= 0)
         targets = targets_of(points, markers, state.num_markers)
         estimate = state.fit(targets, start, prediction)
-        if len(labeled) == 0:
-            break
-        squares = ((points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
-        squares /= state.variance[markers[labeled]] + _FIT_SPREAD**2
-        if squares.max() < _GATE:
+        worst = _worst_label(points, markers, estimate.positions, state.variance)
+        if worst < 0:
             break
         if estimate.rms > _RESTART_RMS and not restarted:
             restarted = True
@@ -170,9 +166,38 @@ def fit_labels(
             if restart.rms[0] < 0.5 * estimate.rms:
                 start = restart.qpos[0]
                 continue
-        markers[labeled[squares.argmax()]] = -1
+        markers[worst] = -1
         dropped = True
     return frame.with_markers(hand, markers) if dropped else frame, estimate
+
+
+@kernel
+def _worst_label(
+    points: Float[np.ndarray, "P 3"],
+    markers: Int[np.ndarray, "P"],
+    positions: Float[np.ndarray, "M 3"],
+    variance: Float[np.ndarray, "M"],
+) -> int:
+    """The labeled point that is farthest from its fitted marker, if it is outside the gate; else -1.
+
+    Args:
+        points: The frame's points [m].
+        markers: The hand's marker that each of them is, -1 for none.
+        positions: Fitted markers [m].
+        variance: Their variance [m^2].
+    """
+    worst, most = -1, -1.0
+    for point in range(len(markers)):
+        marker = markers[point]
+        if marker < 0:
+            continue
+        square = 0.0
+        for axis in range(3):
+            square += (points[point, axis] - positions[marker, axis]) ** 2
+        square /= variance[marker] + _FIT_SPREAD**2
+        if square > most:
+            worst, most = point, square
+    return worst if most >= _GATE else -1
 
 
 def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:

@@ -89,10 +89,12 @@ def _rows(hand: int) -> slice:
 
 def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
     """Match unlabeled points with the missing markers of a palm."""
-    markers, free = frame.markers(track.hand), np.flatnonzero(frame.unlabeled)
-    missing = track.state.digits < 0
+    free = np.flatnonzero(frame.unlabeled)
+    if not len(free):
+        return frame
+    markers, missing = frame.markers(track.hand), track.state.digits < 0
     missing[markers[markers >= 0]] = False
-    if not missing.any() or len(free) == 0:
+    if not missing.any():
         return frame
     palm = np.flatnonzero(missing)
     log_odds = match_log_odds(

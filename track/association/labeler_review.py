@@ -130,9 +130,9 @@ class LabelerReview:
     def _near(self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64]) -> Bool[np.ndarray, "P"]:
         """Which points without a label may be markers that the hand lacks."""
         near = frame.unlabeled
-        missing = np.ones(track.state.num_markers, dtype=bool)
-        missing[markers[markers >= 0]] = False
         if near.any():
+            missing = np.ones(track.state.num_markers, dtype=bool)
+            missing[markers[markers >= 0]] = False
             offsets = frame.points[near, None] - track.estimate.positions[missing]
             near[near] = (np.linalg.norm(offsets, axis=-1) < _RADIUS).any(axis=1)
         return near
@@ -183,6 +183,8 @@ def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64
     """
     old = frame.time - frame.first_seen >= STRAY_LIFETIME
     rows = np.flatnonzero(old & frame.unlabeled & (named >= 0))
+    if not len(rows):
+        return rows
     points, markers = frame.points[rows], named[rows]
     without = np.linalg.norm(points - track.state.unbiased_positions(track.estimate)[markers], axis=1)
     with_bias = np.linalg.norm(points - track.estimate.positions[markers], axis=1)

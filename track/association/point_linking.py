@@ -112,10 +112,10 @@ class PointLinker:
         Returns:
             The number of each point; a point without an ID in a stream that has them gets a new one.
         """
-        known = np.array([self._numbers.get(number, -1) for number in ids.tolist()], dtype=np.int64)
-        before = np.array(list(labels), dtype=np.int64) if labels else self._last
-        fewest = _LASTING_SHARE * min(len(before), len(ids))
-        if np.isin(before, known).sum() < fewest:
+        again = [self._numbers.get(number, -1) for number in ids.tolist()]
+        known = np.array(again, dtype=np.int64)
+        before = labels.keys() if labels else set(self._last.tolist())
+        if len(before & set(again)) < _LASTING_SHARE * min(len(before), len(ids)):
             known = self._link(points, labels, expected)
         new = np.flatnonzero(known < 0)
         known[new] = self._next + np.arange(len(new))

@@ -64,9 +64,6 @@ class Improvement:
         self._model = HandModel.named("M")
         self._people = WornPlaces(_PEOPLE, _POSES_EACH, layout.radius, rig, rng=rng)
         self._seed = int(rng.integers(2**31))
-        self._spare_digits = True
-        self._most_of_bone = Counter(place.bone for place in layout.markers)
-        self._palm = palm_spread(layout.markers, self._model)
         self._columns = self._people.put_on(layout.markers)
         self.worth = self._judge(self._columns)
         """How good the layout so far is."""
@@ -82,7 +79,6 @@ class Improvement:
         Raises:
             LayoutError: More markers than that are to be kept.
         """
-        self._spare_digits = num_markers >= self._covered(self._start.markers)
         while len(self._columns.places) < num_markers:
             self._take(self._grown())
         while len(self._columns.places) > num_markers:
@@ -107,11 +103,10 @@ class Improvement:
     def smaller(self, fewest: int) -> list[tuple[int, Worth]]:
         """How good the layout is without its least useful markers, one after the other; it stays as it is."""
         kept, found = (self.worth, self._columns), []
-        spare, self._spare_digits = self._spare_digits, False
         while len(self._columns.places) > fewest:
             self._take(self._shrunk())
             found.append((len(self._columns.places), self.worth))
-        self.worth, self._columns, self._spare_digits = *kept, spare
+        self.worth, self._columns = kept
         return found
 
     def _judge(self, columns: Columns) -> Worth:
@@ -125,29 +120,22 @@ class Improvement:
         self.worth, self._columns = worth, columns
 
     def _best(self, layouts: Sequence[Columns]) -> tuple[Worth, Columns | None]:
-        judged = [(self._judge(layout), layout) for layout in layouts if self._is_wearable(layout.places)]
+        judged = [(self._judge(layout), layout) for layout in layouts]
         return min(judged, key=lambda one: one[0].cost) if judged else (self.worth, None)
 
-    def _is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
-        """Whether every digit that had a marker has one, no bone a crowd, and the back enough of them."""
-        bones = Counter(place.bone for place in places)
-        crowded = any(
-            count > max(1, self._most_of_bone[bone])
-            for bone, count in bones.items()
-            if bone != BONE_NAMES[PALM]
-        )
-        if crowded or (self._spare_digits and self._covered(places) < self._covered(self._start.markers)):
-            return False
-        back = min(_ON_BACK, self._most_of_bone[BONE_NAMES[PALM]])
-        if not self._spare_digits:
-            return True
-        enough = palm_spread(places, self._model) <= max(self._palm, _PALM_SURE)
-        return bones[BONE_NAMES[PALM]] >= back and enough
+    def _wearable(self, layouts: Sequence[Columns]) -> list[Columns]:
+        """Layouts in which every digit that has a marker keeps one, no bone a crowd, the palm enough."""
+        return [layout for layout in layouts if self._is_wearable(layout.places)]
 
-    def _covered(self, places: Sequence[MarkerPlace]) -> int:
-        """Digits of the first layout that have a marker."""
-        had = {_digit(place) for place in self._start.markers}
-        return len(had & {_digit(place) for place in places})
+    def _is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
+        """Whether markers may replace those of the layout so far."""
+        now, palm = self._columns.places, BONE_NAMES[PALM]
+        bones, before = (Counter(place.bone for place in some) for some in (places, now))
+        crowded = any(count > max(1, before[bone]) for bone, count in bones.items() if bone != palm)
+        if crowded or not set(map(_digit, now)) <= set(map(_digit, places)):
+            return False
+        least = max(palm_spread(now, self._model), _PALM_SURE)
+        return bones[palm] >= min(_ON_BACK, before[palm]) and palm_spread(places, self._model) <= least
 
     def _shrunk(self) -> list[Columns]:
         """The layout without each of its markers."""
@@ -156,7 +144,8 @@ class Improvement:
         if not free:
             raise LayoutError(f"all {len(places)} markers are to be kept, expected fewer than are left")
         everything = range(len(places))
-        return [self._columns.chosen([one for one in everything if one != number]) for number in free]
+        fewer = [self._columns.chosen([one for one in everything if one != number]) for number in free]
+        return self._wearable(fewer) or fewer  # where there are too few for all digits and the palm
 
     def _grown(self) -> list[Columns]:
         """The layout with another marker at some places."""
@@ -166,7 +155,8 @@ class Improvement:
             return []
         both = self._columns.joined(fresh)
         added = [both.chosen([*range(count), count + one]) for one in range(len(fresh.places))]
-        return [one.renamed(count, self._new_name(one.places[count].bone)) for one in added]
+        named = [one.renamed(count, self._new_name(one.places[count].bone)) for one in added]
+        return self._wearable(named) or named
 
     def _moved(self, number: int) -> list[Columns]:
         """The layout with one marker at some other places."""
@@ -181,7 +171,8 @@ class Improvement:
             both.chosen([*range(number), count + one, *range(number + 1, count)])
             for one in range(len(fresh.places))
         ]
-        return [one.renamed(number, self._name_after(places[number], one.places[number])) for one in moved]
+        named = [one.renamed(number, self._name_after(places[number], one.places[number])) for one in moved]
+        return self._wearable(named)
 
     def _put_on(self, places: Sequence[MarkerPlace]) -> Columns | None:
         try:

@@ -69,7 +69,8 @@ class Trial:
     @property
     def right(self) -> Float[np.ndarray, "M"]:
         """Share of each marker's slots that are right, the mean of both methods."""
-        return np.mean([self.slots[name] for name in METHODS], axis=0)
+        share: Float[np.ndarray, "M"] = np.mean([self.slots[name] for name in METHODS], axis=0)
+        return share
 
     @property
     def worst(self) -> int:

@@ -54,8 +54,6 @@ class OscEncoder:
                 contents.append(_floats(f"{address}/wrist", hand.position, hand.quaternion))
                 contents.append(_floats(f"{address}/angles", hand.angles))
                 contents.append(_floats(f"{address}/positions", hand.positions.ravel()))
-                contents.append(_floats(f"{address}/angle_spread", hand.angle_spread))
-                contents.append(_floats(f"{address}/position_spread", hand.position_spread))
         for body in message.bodies:
             address = f"/handsim/body/{_part(body.name)}"
             contents.append(_strings(f"{address}/status", [body.status.value]))

@@ -7,6 +7,7 @@ marker-frames, and what it tells of points.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -193,7 +194,8 @@ def _free_views(
         # A rig has two cameras at least: where one is left, it comes with another that is cut off again.
         some = few if len(few) >= FEWEST_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
         middle = scene.hands[0].qpos[:, :3].mean(axis=0)
-        rig = CameraRig("candidates", [_WIDE.at(look_at(one, middle)) for one in some])
+        views = [_WIDE.at(look_at(one, middle)) for one in some]
+        rig = CameraRig("candidates", [replace(one, name=f"{number}") for number, one in enumerate(views)])
         sight = SceneSight(scene, rig)
         radii = marker_radii(scene, OPTICS)
         visible = sight.visible_markers(OPTICS.partial * radii, rng=rng)

@@ -82,9 +82,10 @@ def test_a_signal_whose_exception_is_lost_comes_again():
     assert caught.value.number == signal.SIGTERM
 
 
-def test_an_interrupt_while_compiled_code_is_left_is_no_mistake_of_ours(monkeypatch, capsys):
+@pytest.mark.parametrize("error", [SystemError("returned a result"), ImportError("initialization failed")])
+def test_an_interrupt_in_compiled_code_is_no_mistake_of_ours(error, monkeypatch, capsys):
     def interrupted(*_: object) -> int:
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        raise error from KeyboardInterrupt()
 
     monkeypatch.setattr(command, "_dispatch", interrupted)
     assert command.run({}, []) == 130

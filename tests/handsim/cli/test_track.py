@@ -109,7 +109,7 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert lines[0] == f"{out}: {FRAMES} frames, 0.5 s at 120 Hz"
     assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
     assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
-    assert lines[3].endswith("points are not markers") and lines[4].endswith(" ms per frame")
+    assert "points are not markers" in lines[3] and lines[4].endswith(" ms per frame")
     take, truth = load_take(out), load_take(capture.with_suffix(".truth.npz"))
     assert take.sides == ("right", "left")
     assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"

