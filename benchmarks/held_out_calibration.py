@@ -57,7 +57,7 @@ def angle_error(take: Take, truth: Take, side: Side) -> float:
 def run_capture(truth: Take, seconds: float) -> list[list[float]]:
     """The figures of `NAMES` for each hand of a simulated capture."""
     count = round(seconds * RATE)
-    seen, layout = truth.cut(0, count - 1), truth.hands[0].layout
+    seen, layout = truth.cut(0, count), truth.hands[0].layout
     before = measure_hands(seen, layout, hands=truth.sides)
     user = calibrate(seen, layout, hands=truth.sides)
     takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands)]

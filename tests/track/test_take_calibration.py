@@ -26,7 +26,7 @@ def truth() -> Take:
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Take:
-    return truth.cut(0, FRAMES - 1)
+    return truth.cut(0, FRAMES)
 
 
 def angle_error(take: Take, truth: Take) -> float:
@@ -73,7 +73,7 @@ def test_a_take_is_calibrated_on_itself(seen):
         seen, hands=["right"], calibrate=True, progress=lambda *values: steps.append(values)
     )
     assert angle_error(second, seen) < 0.6 * angle_error(first, seen)
-    assert np.nanmedian(second.rms) < 0.5 * np.nanmedian(first.rms)
+    assert np.nanmedian(second.rms) < 0.8 * np.nanmedian(first.rms)
     assert second.settings["user"].startswith("calibrated on the take itself, ")
     assert steps[0] == (1, FRAMES) and steps.count((FRAMES, FRAMES)) == 2
 
