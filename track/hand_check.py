@@ -36,6 +36,8 @@ _NEAR: Final = 0.04  # [m] from a hand's points, where a point without a label c
 _PENALTY: Final = 3.0  # log-odds of such a point, and of a marker that is not seen
 _FOUND: Final = 0.6  # share of the frames in which hands are found that fit
 _MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # of such hands, for each of their markers
+_MOST_HIDDEN: Final = 0.35  # of hands all of whose markers are seen at times, as where they hide each other
+_FEW_NEAR: Final = 2.5  # points near hands that ghosts are
 _MOST_RMS: Final = 0.004  # [m] of such hands
 _LEAST_FOUND: Final = 0.5  # share of the frames in which what is named is found
 _BETTER: Final = 1.15  # as large must its log-odds be
@@ -144,6 +146,7 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
     score = HandInitializer([HandState(hands[0])], labeler).score
     found = {hand.side: 0 for hand in hands}
     rms, missing, near, count, log_odds = [], [], [], 0, 0.0
+    unseen = {hand.side: set(range(markers)) for hand in hands}
     for frame in frames:
         tracked = tracker.step(frame.points, frame.ids, frame.time)
         there = [one for one in tracked.hands if one.status in (Status.TRACKED, Status.INITIALIZED)]
@@ -153,14 +156,16 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             found[hand.side] += 1
             rms.append(hand.rms)
             missing.append(len(hand.filled))
+            unseen[hand.side] &= {int(marker) for marker in hand.filled}
             near.append(int((distances_to_nearest(free, hand.markers) < _NEAR).sum()))
             odds = score(markers - missing[-1], hand.rms)
             log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
+    all_seen = not any(unseen[side] for side, times in found.items() if times)
     is_good = (
         count >= _FOUND * len(frames)
         and float(np.median(rms)) <= _MOST_RMS
-        and float(np.mean(missing)) <= _MOST_MISSING * markers
-        and float(np.mean(near)) <= _MOST_NEAR * markers
+        and float(np.mean(missing)) <= (_MOST_HIDDEN if all_seen else _MOST_MISSING) * markers
+        and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
     )
     return _Fit(log_odds / len(frames), found, count, is_good)
 
