@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-MOST_LEVELS = 8
+MOST_LEVELS = 11
 LOADERS = {"handsim/cli/command_table.py", "handsim/_lazy.py"}
 
 
@@ -51,7 +51,7 @@ def test_no_circle_among_modules(graph):
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_rooms_stand_on_few_levels(package, graph):
-    """The rooms of a package (its direct children) import each other one way, over at most eight levels."""
+    """The rooms of a package (its direct children) import each other one way, over at most eleven levels."""
     imports: dict[str, set[str]] = defaultdict(set)
     for module in graph.modules:
         if not module.startswith(f"{package}."):

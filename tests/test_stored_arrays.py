@@ -58,4 +58,8 @@ def test_rows_and_hands_of_a_training_set(folder: Path) -> None:
 @pytest.mark.parametrize("file", ["tracked.npz", "take.truth.npz"])
 def test_arrays_of_a_take(file: str, folder: Path) -> None:
     found = arrays(folder / file)
+    spreads = {name: found.pop(name) for name in ("angle_spread", "keypoint_spread") if name in found}
+    frames, hands = found["status"][1]
+    told = {"angle_spread": ("f4", (frames, hands, 20)), "keypoint_spread": ("f4", (frames, hands, 21))}
+    assert spreads == (told if file == "tracked.npz" else {})
     assert found == stated("## Takes", "\0", {**ONE_CAPTURE, "N": found["points"][1][1]})

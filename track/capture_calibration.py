@@ -7,10 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from handsim.errors import HandSimWarning
-from track.calibration.hand_size import sample_frames
 from track.capture_tracking import track_capture
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_size import sample_frames
 from track.setup import AnyHands, TrackerSetup, as_designed, found_user
 from track.streams.frame_source import checked_frames
 from track.take_calibration import CalibrationProgress, calibrate_take, kept_user, leaves_markers

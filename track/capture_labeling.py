@@ -21,10 +21,10 @@ from track.association.initialization import FEWEST_POINTS
 from track.association.point_linking import change_of_distances
 from track.association.single_frames import label_alone
 from track.both_directions import label_both_ways
-from track.calibration.hand_size import sample_frames
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands
+from track.hand_size import sample_frames
 from track.setup import AnyHands, choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler

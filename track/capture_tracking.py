@@ -17,10 +17,10 @@ from gloves.takes.take import Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
 from track.bodies.body_file import AnyBody
 from track.calibration.frames import CalibrationError
-from track.calibration.hand_size import sample_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.corrected_take import correct_take
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_size import sample_frames
 from track.recorder import TakeRecorder
 from track.setup import AnyHands, TrackerSetup, as_designed
 from track.sinks.addresses import SinkGroup

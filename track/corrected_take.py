@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
 from gloves.takes.take import LOST, Take, labeled_markers
-from handsim.hand.keypoints import NUM_KEYPOINTS
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.pose_solver import AnglePrior, PoseSolver
 from track.kinematics.pose_spread import SpreadModel
@@ -68,9 +67,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
     return CorrectedTake(corrected, int(about.sum()), int(about.any(axis=1).sum()), pins.unfitting)
 
 
-def _spreads(
-    take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]
-) -> dict[str, Any]:
+def _spreads(take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]) -> dict[str, Any]:
     """Standard deviations of all poses with these labels, by the names of a take's fields."""
     calibrated = are_calibrated(str(take.settings.get("user", "")))
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)

@@ -22,8 +22,8 @@ from handsim.hand.topology import Side
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer
 from track.association.point_groups import distances_to_nearest
-from track.calibration.hand_size import fit_size
 from track.given import designed_glove
+from track.hand_size import fit_size
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
@@ -136,7 +136,7 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
 
 def _measured_fit(frames: Sequence[StreamedFrame], layout: MarkerLayout, labeler: Labeler) -> _Fit:
     """How well the hands of a glove fit some frames that they are measured in."""
-    size = fit_size(frames, layout, layout.sides, labeler)
+    size = fit_size(frames, layout, layout.sides, labeler, is_quick=True)
     return _Fit() if size is None else _fit(frames, size.hands(layout.sides), labeler)
 
 

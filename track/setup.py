@@ -18,10 +18,10 @@ from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
-from track.calibration.hand_size import fit_size, sample_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.hand_check import check_hands
+from track.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
 from track.user import MEASURED, User, as_user, checked_sides, nominal_user

@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.keypoints import NUM_KEYPOINTS
-from handsim.hand.topology import NUM_JOINTS, Side
+from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
 
 
 class Status(Enum):

@@ -20,8 +20,7 @@ from gloves.takes.take import keypoints_of
 from handsim.errors import FileError
 from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write
-from handsim.hand.keypoints import NUM_KEYPOINTS
-from handsim.hand.topology import NUM_JOINTS, Side
+from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
 
 SIDES: Final[tuple[Side, ...]] = ("right", "left")
 """The hands of every capture, in the order of labels and arrays."""

@@ -14,9 +14,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.hand.keypoints import NUM_KEYPOINTS
 from handsim.hand.records import HAND_DTYPE
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
+from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, NUM_QPOS
 
 
 class Column(NamedTuple):

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
-from handsim.hand.topology import DIGITS, PALM, bones_of
+from handsim.hand.topology import DIGITS, NUM_KEYPOINTS, PALM, bones_of
 
 _PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
 KEYPOINT_NAMES: Final[tuple[str, ...]] = (
     "wrist",
     *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
 )
-NUM_KEYPOINTS: Final = len(KEYPOINT_NAMES)
 KEYPOINT_BONES: Final[tuple[int, ...]] = (
     PALM,
     *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),

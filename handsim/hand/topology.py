@@ -78,6 +78,8 @@ JOINTS: Final[tuple[Joint, ...]] = tuple(
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS: Final = len(JOINTS)
 NUM_QPOS: Final = 7 + NUM_JOINTS
+NUM_KEYPOINTS: Final = 1 + 4 * len(DIGITS)
+"""Of the wrist, and of three joints and the tip of each digit."""
 
 
 def bones_of(digit: str) -> tuple[int, int, int]:

@@ -19,10 +19,10 @@ from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
 from handsim.hand.topology import Side
 from handsim.space.cameras import CameraRig
-from track.calibration.hand_size import sample_frames
 from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
 from track.config import BOTH
+from track.hand_size import sample_frames
 from track.setup import measured_user
 from track.streams.frame_source import checked_frames
 from train.evaluation.metrics import LabelCounts

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.keypoints import NUM_KEYPOINTS
 from handsim.hand.shape import ADULTS
-from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
+from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.levenberg_marquardt import MARKER_NOISE, invert_positive

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
-from handsim.hand.keypoints import NUM_KEYPOINTS
+from handsim.hand.topology import NUM_KEYPOINTS
 
 ABSENT: Final = -1
 _WRIST: Final = 0

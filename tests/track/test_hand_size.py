@@ -12,7 +12,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from handsim.hand.topology import DIGITS
 from poses.motion.motions import sample_motion
-from track.calibration.hand_size import _PRECISION, _least, fit_size, sample_frames, usual_breadth
+from track.hand_size import _PRECISION, _least, fit_size, sample_frames, usual_breadth
 from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

@@ -90,7 +90,12 @@ def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
 
 
 def fit_size(
-    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
+    frames: Sequence[StreamedFrame],
+    layout: MarkerLayout,
+    sides: Sequence[Side],
+    labeler: Labeler,
+    *,
+    is_quick: bool = False,
 ) -> SizeFit | None:
     """The size and proportions of the hands in some frames.
 
@@ -99,13 +104,14 @@ def fit_size(
         layout: The glove that the hands wear.
         sides: Which hands.
         labeler: Labeler of the glove.
+        is_quick: Whether hands are looked for as adults' alone, and not a second time by weaker evidence.
 
     Returns:
         The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
     usual = TrackerConfig()
-    for config in (usual, _LENIENT):
-        for length in _LENGTHS:
+    for config in (usual,) if is_quick else (usual, _LENIENT):
+        for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is not None and (config is usual or _is_found(fit, frames, sides, labeler)):
                 return fit
