@@ -14,7 +14,7 @@ from track.hand_size import sample_frames
 from track.setup import AnyHands, TrackerSetup, as_designed, found_user
 from track.streams.frame_source import checked_frames
 from track.take_calibration import CalibrationProgress, calibrate_take, kept_user, leaves_markers
-from track.user import User
+from track.user import MEASURED, User
 
 
 def calibrate(
@@ -68,7 +68,7 @@ def calibrate(
         take = labeled(hands=[one.hand for one in done])
         done = calibrate_take(take, start, user, told)
     name = Path(capture).name if isinstance(capture, str | Path) else "a capture"
-    notes = f"calibrated from {name}, {user.notes.removeprefix('auto, ') or user} to begin with"
+    notes = f"calibrated from {name}, {user.notes.removeprefix(MEASURED) or user} to begin with"
     found = kept_user(take, done, user, notes, told)
     for one in found.calibrations:
         if not one.is_better:

@@ -28,6 +28,7 @@ from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
+from track.user import MEASURED
 
 Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
@@ -137,7 +138,7 @@ def _calibrated(
     except CalibrationError as error:
         warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
         return setup
-    notes = f"calibrated on the take itself, {user.notes.removeprefix('auto, ') or user} to begin with"
+    notes = f"calibrated on the take itself, {user.notes.removeprefix(MEASURED) or user} to begin with"
     found = kept_user(take, done, user, notes, told)
     better = {hand.side: hand for hand in found}
     hands = tuple(better.get(hand.side, hand) for hand in user)

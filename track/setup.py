@@ -184,7 +184,8 @@ def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
     )
     for number in range(3):  # initialized, tracked, and labeled again
         ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
-        tracker.step(points, ids, 0.01 * number)
+        for hand in tracker.step(points, ids, 0.01 * number).hands:
+            _ = hand.angle_spread
     unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
     for cloud in unsure:  # labels that a pose has to verify
         labeler.label_frames([cloud])

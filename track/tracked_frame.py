@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -25,7 +27,15 @@ class Status(Enum):
     """There is no pose."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+Spreads = tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]
+"""Standard deviation of each joint angle [rad], and of each keypoint in each direction [m]."""
+
+
+def _unknown_spreads() -> Spreads:
+    return np.full(NUM_JOINTS, np.nan), np.full(NUM_KEYPOINTS, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
 class TrackedHand:
     """One hand in one frame."""
 
@@ -39,10 +49,22 @@ class TrackedHand:
     """The labeled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
     filled: Int[np.ndarray, "F"]
     """Indices of the markers that are filled in from the pose."""
-    angle_spread: Float[np.ndarray, "20"] = field(default_factory=lambda: np.full(NUM_JOINTS, np.nan))
-    """Standard deviation of each joint angle [rad]; NaN where the hand is lost or it is not known."""
-    keypoint_spread: Float[np.ndarray, "21"] = field(default_factory=lambda: np.full(NUM_KEYPOINTS, np.nan))
-    """Standard deviation of each keypoint in each direction [m]; NaN as of the angles."""
+    find_spreads: Callable[[], Spreads] = field(default=_unknown_spreads, repr=False)
+    """Computes the standard deviations: only where they are asked for, since a frame has little time."""
+
+    @property
+    def angle_spread(self) -> Float[np.ndarray, "20"]:
+        """Standard deviation of each joint angle [rad]; NaN where the hand is lost or it is not known."""
+        return self._spreads[0]
+
+    @property
+    def keypoint_spread(self) -> Float[np.ndarray, "21"]:
+        """Standard deviation of each keypoint in each direction [m]; NaN as of the angles."""
+        return self._spreads[1]
+
+    @cached_property
+    def _spreads(self) -> Spreads:
+        return self.find_spreads()
 
     @property
     def has_pose(self) -> bool:

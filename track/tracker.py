@@ -323,4 +323,4 @@ def _tracked_hand(
     present[own[labeled]] = True
     filled = np.flatnonzero(~present)
     spreads = state.pose_spread(frame.time)
-    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, *spreads)
+    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)

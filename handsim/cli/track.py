@@ -149,9 +149,10 @@ def _track_file(
 def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
     """Print what was tracked, and warn of what looks wrong; `seconds` is the time of the median frame."""
     from track.take_summary import summarize, suspicions
+    from track.user import MEASURED
 
     take, frames = tracked.take, tracked.num_frames
-    _, measured, size = take.settings["user"].partition("auto, ")
+    _, measured, size = take.settings["user"].partition(MEASURED)
     lines = [f"size of the hands: {size}"] if measured else []
     if take.settings["user"].startswith("calibrated on"):
         lines = take.settings["user"].split("; ")

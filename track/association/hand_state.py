@@ -7,6 +7,8 @@ the pose and its bias, which is nearly as accurate for an uncalibrated hand as f
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -25,6 +27,7 @@ from track.kinematics.joint_prior import JointPrior, predict_joints, resting_cov
 from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import SpreadModel
+from track.tracked_frame import Spreads
 
 # Process model.
 _LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand
@@ -221,12 +224,11 @@ class HandState:
         )
         return confirmed, confirmed._replace(joint_prior=self._resting_prior)
 
-    def pose_spread(self, time: float) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]:
-        """Standard deviations of the pose's joint angles [rad] and keypoints [m] at a time [s]."""
+    def pose_spread(self, time: float) -> Callable[[], Spreads]:
+        """What computes the standard deviations of this pose at a time [s], whatever the hand does later."""
         assert self.qpos is not None
-        unseen = np.maximum(time - self._last_label, 0.0)[None]
-        angles, keypoints = self._spread_model.spreads(self.qpos[None], unseen, np.sqrt(self._usual_square))
-        return angles[0], keypoints[0]
+        unseen = np.maximum(time - self._last_label, 0.0)
+        return partial(self._spread_model.of_pose, self.qpos.copy(), unseen, np.sqrt(self._usual_square))
 
     @property
     def spread(self) -> float | None:

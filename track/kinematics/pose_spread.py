@@ -114,10 +114,7 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
         digits: Digit of each marker, -1 for the palm.
         noise: Standard deviation of a marker around its place, from frame to frame [m].
     """
-    before, counts = (
-        measured_doubt(digits),
-        np.array([(digits == digit).sum() for digit in range(len(DIGITS))]),
-    )
+    before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
     places = np.where(single, 0.5 * _PLACE, _CALIBRATED_PLACE * noise * few)
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
@@ -146,6 +143,13 @@ class SpreadModel:
         self._hand, self._is_calibrated = hand_arrays(fit), is_calibrated
         self._tips, self._measured = tip_lengths(fit), measured_doubt(self._hand.digits)
 
+    def of_pose(
+        self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
+    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]:
+        """Those of one pose; see `spreads`."""
+        angles, keypoints = self.spreads(qpos[None], unseen[None], rms)
+        return angles[0], keypoints[0]
+
     def spreads(
         self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
@@ -168,6 +172,7 @@ def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:
     return np.array([fit.model.skeleton.lengths[bones_of(digit)[-1]] for digit in DIGITS])
 
 
+@kernel
 def pose_spreads(
     hand: HandArrays,
     tips: Float[np.ndarray, "5"],
@@ -187,22 +192,6 @@ def pose_spreads(
         unseen: Time since each marker was last seen [s]; infinite if it never was.
     """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
-    _fill_spreads(hand, tips, prior, doubt, qpos, unseen, angles, keypoints)
-    return angles, keypoints
-
-
-@kernel
-def _fill_spreads(
-    hand: HandArrays,
-    tips: Float[np.ndarray, "5"],
-    prior: Float[np.ndarray, "20 20"],
-    doubt: HandDoubt,
-    qpos: Float[np.ndarray, "T 27"],
-    unseen: Float[np.ndarray, "T M"],
-    angles: Float[np.ndarray, "T 20"],
-    keypoints: Float[np.ndarray, "T 21"],
-) -> None:
-    """Fill the standard deviations of `pose_spreads`."""
     count = unseen.shape[1]
     work, weights = workspace(count), np.empty(count)
     posterior, covariance = np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
@@ -225,6 +214,7 @@ def _fill_spreads(
         for hinge in range(NUM_JOINTS):
             angles[frame, hinge] = np.sqrt(covariance[hinge, hinge])
         _spread_keypoints(hand, tips, doubt, posterior, covariance, own, whole, work, keypoints[frame])
+    return angles, keypoints
 
 
 @kernel

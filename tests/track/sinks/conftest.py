@@ -33,7 +33,7 @@ def tracked_hand(side, rng, *, lost: bool = False) -> TrackedHand:
         np.full(count, np.nan if lost else spread) for count, spread in ((20, 0.1), (21, 0.002))
     )
     nothing = np.zeros((19, 3)), np.zeros(0, dtype=int)
-    return TrackedHand(side, status, qpos, 0.001, *nothing, angles, keypoints)
+    return TrackedHand(side, status, qpos, 0.001, *nothing, lambda: (angles, keypoints))
 
 
 def make_message(number: int = 0, *, lost: bool = False, seed: int = 0, points: int = 5) -> LiveMessage:
