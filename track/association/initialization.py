@@ -40,10 +40,13 @@ SPARE_POINTS: Final = 6
 CUTS: Final = 12
 """Directions along which a group is cut, even over half a sphere."""
 CUTS_PER_FRAME: Final = 6
-"""Directions tried in a frame of a capture in motion: with all, touching hands would take 20 ms."""
+"""Directions tried in a frame of a capture in motion; with all, hands that touch would take twice as long."""
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
-_MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
+_FIRST_CLOUDS: Final = 5  # labeled together: the whole group and two cuts; mostly one of them is enough
+_FIRST_FITS: Final = 2  # of these, the most confident first
+_MOST_FITS: Final = 8  # of the others
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
+_MORE_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
 _LEAST_KEPT: Final = 0.75  # share of the labels that a robust fit keeps of a hand; a mirrored one loses more
 _POSE_WEIGHT: Final = 0.25  # log-odds of a pose for each squared deviation beyond the usual
@@ -143,11 +146,13 @@ class HandInitializer:
         if len(hands) != 2:
             return hands
         one, two = hands
-        exchanged = [
-            self._trim(self._first_fit(index, points, labels), points)
-            for index, labels in ((two.index, one.labels), (one.index, two.labels))
-        ]
-        found = [hand for hand in exchanged if hand is not None]
+        first = (
+            self._first_fit(two.index, points, one.labels),
+            self._first_fit(one.index, points, two.labels),
+        )
+        if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
+            return hands
+        found = [hand for fit in first if (hand := self._trim(fit, points)) is not None]
         better = sum(hand.score for hand in found) > one.score + two.score
         return found if len(found) == 2 and better else hands
 
@@ -183,37 +188,65 @@ class HandInitializer:
     def _best(
         self, points: NDArray[np.float64], group: NDArray[np.int64], hands: Sequence[int]
     ) -> InitializedHand | None:
-        """The hand with the best score in a group."""
+        """The hand with the best score in a group, or the first that is certain."""
         clouds = self._cut(points, group, max(self._states[index].num_markers for index in hands))
-        labelings = self._labeler.label_frames([points[cloud] for cloud in clouds])
-        confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
         best: InitializedHand | None = None
-        for number in np.argsort(confidence)[::-1][:_MOST_FITS]:
+        waiting: list[tuple[float, NDArray[np.int64]]] = []
+        for some, most in ((clouds[:_FIRST_CLOUDS], _FIRST_FITS), (clouds[_FIRST_CLOUDS:], _MOST_FITS)):
+            waiting += self._labeled(points, some) if some else []
+            waiting.sort(key=lambda labeled: labeled[0])
+            for _ in range(min(most, len(waiting))):
+                _, labels = waiting.pop()
+                best = self._better(best, points, group, labels, hands)
+                if best is not None and best.score > _CERTAIN_SCORE * self._states[best.index].num_markers:
+                    return best
+        return best
+
+    def _labeled(
+        self, points: NDArray[np.float64], clouds: Sequence[NDArray[np.int64]]
+    ) -> list[tuple[float, NDArray[np.int64]]]:
+        """The confidence of each cloud's labels in all, and a label for every point."""
+        labeled = []
+        for cloud, one in zip(
+            clouds, self._labeler.label_frames([points[cloud] for cloud in clouds]), strict=True
+        ):
             labels = np.full(len(points), -1)
-            labels[clouds[number]] = labelings[number].labels
-            fits = [self._first_fit(index, points, labels) for index in hands]
-            for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
-                if best is not None and _is_mirrored(first, best):
-                    continue
-                hand = self._improve(first, points, group)
-                if hand is not None and (best is None or hand.score > best.score):
-                    best = hand
-            if best is not None:
-                certain = _CERTAIN_SCORE * self._states[best.index].num_markers
-                if best.score > certain:
-                    break
+            labels[cloud] = one.labels
+            labeled.append((float(one.confidence[one.labels >= 0].sum()), labels))
+        return labeled
+
+    def _better(
+        self,
+        best: InitializedHand | None,
+        points: NDArray[np.float64],
+        group: NDArray[np.int64],
+        labels: NDArray[np.int64],
+        hands: Sequence[int],
+    ) -> InitializedHand | None:
+        """The best hand so far, or one of these labels with a better score."""
+        fits = [self._first_fit(index, points, labels) for index in hands]
+        for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
+            if best is not None and _is_mirrored(first, best):
+                continue
+            hand = self._improve(first, points, group)
+            if hand is not None and (best is None or hand.score > best.score):
+                best = hand
         return best
 
     def _cut(
         self, points: NDArray[np.float64], group: NDArray[np.int64], markers: int
     ) -> list[NDArray[np.int64]]:
-        """The group, and its halves along each direction if it has points of more than one hand."""
+        """The group, and its halves along each direction if it has points of more than one hand.
+
+        Halves along the direction in which the group is longest come first.
+        """
         clouds = [group]
         if len(group) > markers + SPARE_POINTS:
             half = len(group) // 2
-            for number in range(self._cuts):
-                direction = self._directions[_STRIDE * (self._first_cut + number) % CUTS]
-                order = group[np.argsort(points[group] @ direction)]
+            numbers = _STRIDE * (self._first_cut + np.arange(self._cuts)) % CUTS
+            along = points[group] @ self._directions[numbers].T
+            for number in np.argsort(-along.std(axis=0)):
+                order = group[np.argsort(along[:, number])]
                 clouds += [order[:half], order[half:]]
         return clouds
 
@@ -291,7 +324,9 @@ class HandInitializer:
             return None
         state = self._states[index]
         targets = targets_of(points, labels, state.num_markers)
-        return self._scored(index, state.solver.solve(targets[None], near.qpos), labels)
+        return self._scored(
+            index, state.solver.solve(targets[None], near.qpos, iterations=_MORE_STEPS), labels
+        )
 
     def _scored(self, index: int, fit: PoseFit, labels: NDArray[np.int64]) -> InitializedHand:
         """A fit with its score; a hand that was seen lately must fit as well as then."""
