@@ -9,6 +9,8 @@ DEVELOPER := $(VENV)/.developer
 DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Commands that tests start would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs clean drawing

@@ -273,6 +273,7 @@ def paper(speeds: Speeds) -> None:
 
 
 def commands(speeds: Speeds) -> None:
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # users have compiled modules after the first run
     with tempfile.TemporaryDirectory() as folder:
         runs = [["label", "--help"]]
         for frames in (24, 1200):
