@@ -249,7 +249,8 @@ class Tracker:
         initialized = self._initializer.initialize(frame.points[free], lost)
         for found in initialized:
             frame, outcomes = self._start(frame, outcomes, found, free)
-        self._attempt_wait = 0.0 if initialized else self._longer_wait()
+        goes_on = bool(initialized) or self._initializer.is_searching(lost)
+        self._attempt_wait = 0.0 if goes_on else self._longer_wait()
         self._last_attempt, self._attempt_points = frame.time, len(free)
         return frame, outcomes
 
@@ -284,11 +285,12 @@ class Tracker:
                 self._last_sound[hand] = frame.time
             if frame.time - self._last_sound[hand] < self.config.doubt_time:
                 continue
-            self._last_sound[hand] = frame.time
             least_score = self._initializer.score(count, state.rms) + _REPLACEMENT_MARGIN
             for again in self._initializer.initialize(frame.points[free], (hand,)):
                 if again.score > least_score:
                     frame, outcomes = self._start(frame, outcomes, again, free)
+            if not self._initializer.is_searching((hand,)):
+                self._last_sound[hand] = frame.time
         return frame, outcomes
 
     def _start(

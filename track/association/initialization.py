@@ -37,14 +37,12 @@ FEWEST_POINTS: Final = 4
 """Least number of labeled points of a hand; a pose needs as many."""
 SPARE_POINTS: Final = 6
 """Points beyond a hand's markers from which on a group may be two hands that touch."""
-CUTS: Final = 12
-"""Directions along which a group is cut, even over half a sphere."""
-CUTS_PER_FRAME: Final = 6
-"""Directions tried in a frame of a capture in motion; with all, hands that touch would take twice as long."""
+_CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
+_CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
-_FIRST_CLOUDS: Final = 5  # labeled together: the whole group and two cuts; mostly one of them is enough
-_FIRST_FITS: Final = 2  # of these, the most confident first
-_MOST_FITS: Final = 8  # of the others
+_FIRST_CUTS: Final = 2  # tried together; mostly one of them is enough
+_LAST_TURN: Final = _CUTS_OF_SEARCH - _FIRST_CUTS  # number of the call in which a search ends
+_MOST_FITS: Final = 2  # labeled clouds that are fitted at a time, the most confident ones
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
 _MORE_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
@@ -78,6 +76,18 @@ class InitializedHand:
     """See `HandInitializer.score`."""
 
 
+@dataclass(slots=True)
+class _Search:
+    """Where a search for some hands among points of more than one stands."""
+
+    turn: int = 0
+    """Number of calls before this one."""
+    best_turn: int = 0
+    """The one that gave the best hand so far, though none that is certain."""
+    score: float = -np.inf
+    """Of that hand."""
+
+
 class HandInitializer:
     """Initializes hands without any history.
 
@@ -85,7 +95,9 @@ class HandInitializer:
         states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
-        cuts: Directions along which a group is cut in one call; the next ones follow in the next call.
+        at_once: Look at a group of points along all directions in one call. Otherwise a call looks along one
+            or two, and the next calls, a frame later each, along others, until a hand is certain or all were
+            tried: no frame waits for a search.
     """
 
     def __init__(
@@ -94,9 +106,10 @@ class HandInitializer:
         labeler: Labeler,
         config: TrackerConfig = TrackerConfig(),  # noqa: B008
         *,
-        cuts: int = CUTS_PER_FRAME,
+        at_once: bool = False,
     ) -> None:
-        self._cuts, self._first_cut = cuts, 0
+        self._at_once, self._first_cut = at_once, 0
+        self._searches: dict[tuple[int, ...], _Search] = {}
         self._states = states
         self._labeler = labeler
         self._config = config
@@ -105,8 +118,8 @@ class HandInitializer:
         self._prior = resting_prior()
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
-        spread = np.arange(CUTS) + 0.5
-        height, azimuth = 1.0 - spread / CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
+        spread = np.arange(_CUTS) + 0.5
+        height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
@@ -117,12 +130,16 @@ class HandInitializer:
             points: Points without a label [m].
             hands: Indices of the hands that are looked for.
         """
+        search = self._searches.pop(tuple(hands), _Search())
         initialized: list[InitializedHand] = []
+        cut = False
         for group in self._groups(points, hands):
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
             while missing:
-                hand = self._best(points, rest, missing)
+                cuts = self._cuts_of(points[rest], missing)
+                cut |= len(cuts) > 0
+                hand = self._best(points, rest, missing, cuts, search)
                 if hand is None:
                     break
                 initialized.append(hand)
@@ -132,8 +149,16 @@ class HandInitializer:
         initialized = self._sides_checked(initialized, points)
         for hand in initialized:
             self._attempts[hand.index] = 0
-        self._first_cut += self._cuts
+        if cut and not initialized and search.turn < _LAST_TURN and not self._at_once:
+            search.turn += 1
+            self._searches[tuple(hands)] = search
+        else:
+            self._first_cut += _CUTS_OF_SEARCH
         return initialized
+
+    def is_searching(self, hands: Sequence[int]) -> bool:
+        """Whether the last call for some hands left directions for the next one."""
+        return tuple(hands) in self._searches
 
     def _sides_checked(
         self, hands: list[InitializedHand], points: Float[np.ndarray, "N 3"]
@@ -186,68 +211,87 @@ class HandInitializer:
         return max(FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
-        self, points: NDArray[np.float64], group: NDArray[np.int64], hands: Sequence[int]
+        self,
+        points: NDArray[np.float64],
+        group: NDArray[np.int64],
+        hands: Sequence[int],
+        cuts: NDArray[np.int64],
+        search: _Search,
     ) -> InitializedHand | None:
-        """The hand with the best score in a group, or the first that is certain."""
-        clouds = self._cut(points, group, max(self._states[index].num_markers for index in hands))
+        """The first hand of a group that is certain, or the best one after the last of the cuts."""
+        if not len(cuts):
+            return self._better(None, points, group, [group], hands)
         best: InitializedHand | None = None
-        waiting: list[tuple[float, NDArray[np.int64]]] = []
-        for some, most in ((clouds[:_FIRST_CLOUDS], _FIRST_FITS), (clouds[_FIRST_CLOUDS:], _MOST_FITS)):
-            waiting += self._labeled(points, some) if some else []
-            waiting.sort(key=lambda labeled: labeled[0])
-            for _ in range(min(most, len(waiting))):
-                _, labels = waiting.pop()
-                best = self._better(best, points, group, labels, hands)
-                if best is not None and best.score > _CERTAIN_SCORE * self._states[best.index].num_markers:
-                    return best
-        return best
+        for turn in range(len(cuts) - _FIRST_CUTS + 1) if self._at_once else [search.turn]:
+            best = self._better(best, points, group, self._clouds(points, group, cuts, turn), hands)
+            if best is not None and self._is_certain(best):
+                return best
+        if self._at_once:
+            return best
+        if best is not None and best.score > search.score:
+            search.score, search.best_turn = best.score, search.turn
+        if search.turn < _LAST_TURN or search.score == -np.inf:
+            return None
+        if search.best_turn == search.turn:
+            return best
+        return self._better(best, points, group, self._clouds(points, group, cuts, search.best_turn), hands)
 
     def _labeled(
         self, points: NDArray[np.float64], clouds: Sequence[NDArray[np.int64]]
-    ) -> list[tuple[float, NDArray[np.int64]]]:
-        """The confidence of each cloud's labels in all, and a label for every point."""
-        labeled = []
-        for cloud, one in zip(
-            clouds, self._labeler.label_frames([points[cloud] for cloud in clouds]), strict=True
-        ):
-            labels = np.full(len(points), -1)
-            labels[cloud] = one.labels
-            labeled.append((float(one.confidence[one.labels >= 0].sum()), labels))
-        return labeled
+    ) -> list[NDArray[np.int64]]:
+        """A label for every point by each cloud, the cloud of most confidence in all first."""
+        labelings = self._labeler.label_frames([points[cloud] for cloud in clouds])
+        confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
+        labeled = np.full((len(clouds), len(points)), -1)
+        for row, cloud, one in zip(labeled, clouds, labelings, strict=True):
+            row[cloud] = one.labels
+        return [labeled[number] for number in np.argsort(confidence)[::-1]]
 
     def _better(
         self,
         best: InitializedHand | None,
         points: NDArray[np.float64],
         group: NDArray[np.int64],
-        labels: NDArray[np.int64],
+        clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
     ) -> InitializedHand | None:
-        """The best hand so far, or one of these labels with a better score."""
-        fits = [self._first_fit(index, points, labels) for index in hands]
-        for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
-            if best is not None and _is_mirrored(first, best):
-                continue
-            hand = self._improve(first, points, group)
-            if hand is not None and (best is None or hand.score > best.score):
-                best = hand
+        """The best hand so far, or one of these clouds of a group with a better score."""
+        for labels in self._labeled(points, clouds)[:_MOST_FITS]:
+            fits = [self._first_fit(index, points, labels) for index in hands]
+            for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
+                if best is not None and _is_mirrored(first, best):
+                    continue
+                hand = self._improve(first, points, group)
+                if hand is not None and (best is None or hand.score > best.score):
+                    best = hand
+            if best is not None and self._is_certain(best):
+                break
         return best
 
-    def _cut(
-        self, points: NDArray[np.float64], group: NDArray[np.int64], markers: int
-    ) -> list[NDArray[np.int64]]:
-        """The group, and its halves along each direction if it has points of more than one hand.
+    def _is_certain(self, hand: InitializedHand) -> bool:
+        """Whether a hand fits so well that no other cloud need be tried."""
+        return hand.score > _CERTAIN_SCORE * self._states[hand.index].num_markers
 
-        Halves along the direction in which the group is longest come first.
-        """
-        clouds = [group]
-        if len(group) > markers + SPARE_POINTS:
-            half = len(group) // 2
-            numbers = _STRIDE * (self._first_cut + np.arange(self._cuts)) % CUTS
-            along = points[group] @ self._directions[numbers].T
-            for number in np.argsort(-along.std(axis=0)):
-                order = group[np.argsort(along[:, number])]
-                clouds += [order[:half], order[half:]]
+    def _cuts_of(self, points: NDArray[np.float64], hands: Sequence[int]) -> NDArray[np.int64]:
+        """Directions along which a group is cut if it has points of more than one hand, the longest first."""
+        if len(points) <= max(self._states[index].num_markers for index in hands) + SPARE_POINTS:
+            return np.empty(0, dtype=np.int64)
+        count = _CUTS if self._at_once else _CUTS_OF_SEARCH
+        numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
+        return numbers[np.argsort(-(points @ self._directions[numbers].T).std(axis=0))]
+
+    def _clouds(
+        self,
+        points: NDArray[np.float64],
+        group: NDArray[np.int64],
+        cuts: NDArray[np.int64],
+        turn: int,
+    ) -> list[NDArray[np.int64]]:
+        """The clouds of a turn: the whole group and its halves along the first cuts, then one cut a turn."""
+        clouds = [group] if turn == 0 else []
+        for cut in cuts[:_FIRST_CUTS] if turn == 0 else cuts[turn + _FIRST_CUTS - 1 : turn + _FIRST_CUTS]:
+            order = group[np.argsort(points[group] @ self._directions[cut])]
+            clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
     def _first_fit(

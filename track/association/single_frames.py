@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from gloves.fit import GloveFit
 from track.association.hand_state import HandState
 from track.association.initialization import (
-    CUTS,
     FEWEST_POINTS,
     SPARE_POINTS,
     HandInitializer,
@@ -53,7 +52,7 @@ def label_alone(
         labeler: Labeler of their glove.
         told: Called with the number of frames that are done.
     """
-    finder = HandInitializer([HandState(hand) for hand in hands], labeler, cuts=CUTS)
+    finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []
     for points in frames:
         found.append(finder.initialize(points, range(len(hands))))
