@@ -120,7 +120,7 @@ def _odd_tensor(value: Any, rng: np.random.Generator) -> Any:
         lambda: value[None],
         lambda: value.flatten()[:1],
         lambda: torch.full_like(value, 1) * _FLOATS[int(rng.integers(len(_FLOATS)))],
-        lambda: value.flatten()[:1].expand(int(10 ** rng.uniform(3.0, 12.0))),
+        lambda: torch.zeros(1, dtype=value.dtype).expand(int(10 ** rng.uniform(3.0, 12.0))),
         lambda: torch.zeros(1).expand(value.shape),
         lambda: torch.zeros(()),
         lambda: torch.zeros(0),

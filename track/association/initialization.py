@@ -56,7 +56,7 @@ _FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its
 _USUAL_SPREAD: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
 _SUPPOSED: Final = 6.0  # coordinates that this spread counts for
 _MOST_MARKERS: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
-_CERTAIN_SCORE: Final = 6.5  # log-odds per marker after which no further cloud is tried
+_CERTAIN_SCORE: Final = 5.5  # log-odds per marker after which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
@@ -136,16 +136,18 @@ class HandInitializer:
         for group in self._groups(points, hands):
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
+            here: list[InitializedHand] = []
             while missing:
                 cuts = self._cuts_of(points[rest], missing)
                 cut |= len(cuts) > 0
                 hand = self._best(points, rest, missing, cuts, search)
                 if hand is None:
                     break
-                initialized.append(hand)
+                here.append(hand)
                 rest = rest[hand.labels[rest] < 0]
                 missing.remove(hand.index)
             self._attempts[missing] += 1
+            initialized += self._divided(here, points, group)
         initialized = self._sides_checked(initialized, points)
         for hand in initialized:
             self._attempts[hand.index] = 0
@@ -325,6 +327,19 @@ class HandInitializer:
                 break
             hand = self._trim(self._refit(index, points, labels, hand.fit), points)
         return hand
+
+    def _divided(
+        self, hands: list[InitializedHand], points: NDArray[np.float64], group: NDArray[np.int64]
+    ) -> list[InitializedHand]:
+        """Hands of one group, each labeled once more among the points that the others leave.
+
+        The first one may have points of the others, such as a thumb's.
+        """
+        for number, hand in enumerate(hands if len(hands) > 1 else ()):
+            others = [other.labels[group] >= 0 for other in hands if other is not hand]
+            again = self._better(hand, points, group, [group[~np.any(others, axis=0)]], (hand.index,))
+            hands[number] = again or hand
+        return hands
 
     def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
         """Drop the worst label while that improves the score; None where it is no hand."""
