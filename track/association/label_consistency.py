@@ -23,6 +23,7 @@ _EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset of
 _EXCHANGE_CONFIDENCE: Final = 0.5
 _FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker beside its own spread
 _RESTART_RMS: Final = 0.004  # [m] beyond which a fit is tried again from shapes instead of the prediction
+_RESTART_STEPS: Final = 8  # from each starting pose; the fit goes on from there
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
 
 
@@ -162,7 +163,7 @@ def fit_labels(
             break
         if estimate.rms > _RESTART_RMS and not restarted:
             restarted = True
-            restart = state.solver.solve(targets[None])
+            restart = state.solver.solve(targets[None], iterations=_RESTART_STEPS)
             if restart.rms[0] < 0.5 * estimate.rms:
                 start = restart.qpos[0]
                 continue
