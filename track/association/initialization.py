@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.topology import DIGITS, NUM_JOINTS
 from poses.shapes.library import LIBRARIES, gestures_of
 from track.association.assignment import match_log_odds, match_points, peak_log_odds
 from track.association.frame_state import targets_of
 from track.association.hand_state import HandState
-from track.association.point_groups import linked_groups, longest_links
+from track.association.point_groups import distances_to_nearest, linked_groups, longest_links
 from track.config import TrackerConfig
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.pose_solver import PoseFit, PoseSolver
@@ -42,6 +42,7 @@ _CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; th
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
 _FIRST_CUTS: Final = 2  # tried together; mostly one of them is enough
 _LAST_TURN: Final = _CUTS_OF_SEARCH - _FIRST_CUTS  # number of the call in which a search ends
+_CROSSED: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
 _MOST_FITS: Final = 2  # labeled clouds that are fitted at a time, the most confident ones
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
 _MORE_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
@@ -147,7 +148,7 @@ class HandInitializer:
                 rest = rest[hand.labels[rest] < 0]
                 missing.remove(hand.index)
             self._attempts[missing] += 1
-            initialized += self._divided(here, points, group)
+            initialized += self._uncrossed(self._divided(here, points, group), points)
         initialized = self._sides_checked(initialized, points)
         for hand in initialized:
             self._attempts[hand.index] = 0
@@ -340,6 +341,35 @@ class HandInitializer:
             again = self._better(hand, points, group, [group[~np.any(others, axis=0)]], (hand.index,))
             hands[number] = again or hand
         return hands
+
+    def _uncrossed(self, hands: list[InitializedHand], points: NDArray[np.float64]) -> list[InitializedHand]:
+        """Two hands, with the points of a digit exchanged where both together fit better so.
+
+        A thumb fits the other hand's palm nearly as well as its own where hands touch.
+        """
+        if len(hands) != 2:
+            return hands
+        one, two = hands
+        digits = self._states[one.index].solver.hand.digits
+        for digit in range(len(DIGITS)):
+            ours, theirs = (
+                np.flatnonzero((hand.labels >= 0) & (digits[hand.labels] == digit)) for hand in (one, two)
+            )
+            if not len(ours) or not len(theirs):
+                continue
+            if distances_to_nearest(points[ours], points[theirs]).min() > _CROSSED:
+                continue
+            first, second = one.labels.copy(), two.labels.copy()
+            first[ours], second[theirs] = -1, -1
+            first[theirs], second[ours] = two.labels[theirs], one.labels[ours]
+            changed = [
+                self._trim(self._refit(hand.index, points, labels, hand.fit), points)
+                for hand, labels in ((one, first), (two, second))
+            ]
+            found = [hand for hand in changed if hand is not None]
+            if len(found) == 2 and sum(hand.score for hand in found) > one.score + two.score:
+                one, two = found
+        return [one, two]
 
     def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
         """Drop the worst label while that improves the score; None where it is no hand."""
