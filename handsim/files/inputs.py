@@ -6,11 +6,12 @@ import hashlib
 import os
 import stat
 from pathlib import Path
-from typing import Final
-
-from upath import UPath
+from typing import TYPE_CHECKING, Final
 
 from handsim.errors import HandSimError
+
+if TYPE_CHECKING:  # object stores' code takes as long to load as a capture to read
+    from upath import UPath
 
 _KINDS: Final = (
     (stat.S_ISFIFO, "a pipe"),
