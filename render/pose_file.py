@@ -15,8 +15,7 @@ from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWar
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
 from handsim.hand.model import join_qpos
-from handsim.hand.records import HAND_DTYPE, unpack_hand
-from handsim.hand.shape import HandShape, shape_from_measures
+from handsim.hand.shape import HAND_DTYPE, HandShape, shape_from_measures, unpack_hand
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
 from handsim.motion_files.joint_table import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
@@ -268,7 +267,7 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
     if "hands" in arrays:
         hands = np.atleast_1d(arrays["hands"])
         if hands.dtype != HAND_DTYPE or hands.ndim != 1 or not 1 <= len(hands) <= MOST_PEOPLE:
-            raise ArgumentError("hands are not records of handsim.hand.records.HAND_DTYPE")
+            raise ArgumentError("hands are not records of handsim.hand.shape.HAND_DTYPE")
         return tuple(unpack_hand(hand) for hand in hands)
     if "hand_size" not in arrays:
         return None

@@ -15,9 +15,8 @@ from handsim._version import __version__
 from train.config import CNNConfig, Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption, right_hands
-from train.data.mapped_rows import MappedRows
-from train.data.shards import Manifest
-from train.evaluation.labeler_evaluation import Report, evaluate_markers, paper_report
+from train.data.shards import Manifest, MappedRows
+from train.labeler_evaluation import Report, evaluate_markers, paper_report
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler, labeler_of

@@ -87,12 +87,6 @@ def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
     return packed
 
 
-def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndarray, "*batch C"]:
-    """Inverse of `pack_cameras`."""
-    bits: NDArray[np.bool_] = (packed[..., None] >> np.arange(num_cameras, dtype=np.uint32)) & 1 == 1
-    return bits
-
-
 @kernel
 def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
     """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.

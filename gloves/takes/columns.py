@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.hand.records import HAND_DTYPE
+from handsim.hand.shape import HAND_DTYPE
 from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, NUM_QPOS
 
 

@@ -11,10 +11,9 @@ from jaxtyping import Float
 from handsim._checks import check_array, check_type
 from handsim.hand.capsules import Capsules, build_capsules
 from handsim.hand.contact import penetration_depth
-from handsim.hand.kinematics import bone_transforms
 from handsim.hand.mjcf import build_spec
 from handsim.hand.shape import SIZES, HandShape, named_shape
-from handsim.hand.skeleton import Skeleton, build_skeleton
+from handsim.hand.skeleton import Skeleton, bone_transforms, build_skeleton
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import HandSurface, build_surface
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side

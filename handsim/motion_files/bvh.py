@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
-from handsim.motion_files.local_poses import CHILDREN, local_rotations
-from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_bodies, posed_hands
+from handsim.motion_files.motion import (
+    CHILDREN,
+    Motion,
+    PosedHand,
+    file_axes,
+    local_rotations,
+    posed_bodies,
+    posed_hands,
+)
 from handsim.space.transforms import UpAxis, euler_angles
 
 ROOT: Final = "world_cm"

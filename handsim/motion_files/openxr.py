@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.motion_files.local_poses import smooth_quaternions
-from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_hands
+from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_hands, smooth_quaternions
 from handsim.space.transforms import UpAxis
 
 JOINTS: Final[tuple[str, ...]] = (

@@ -20,7 +20,6 @@ from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, PALM, Side
-from handsim.motion_files.local_poses import local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals
 from handsim.motion_files.motion import (
     SKIN,
@@ -30,9 +29,11 @@ from handsim.motion_files.motion import (
     PosedBody,
     PosedHand,
     changes,
+    local_rotations,
     posed_bodies,
     posed_hands,
     seconds_of,
+    smooth_quaternions,
 )
 from handsim.space.transforms import UpAxis
 

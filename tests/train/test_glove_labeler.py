@@ -10,11 +10,11 @@ import pytest
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning, LayoutError, WeightsError
-from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler
+from train.any_layout.learned_gloves import fine_tuned_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import OwnLabeler
-from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_inference import TrainedSetLabeler
 
 
 @pytest.fixture

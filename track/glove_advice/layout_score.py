@@ -17,7 +17,7 @@ from track.glove_advice.trials import Trial
 from train.data.augmentation import Corruption, corrupt
 from train.data.batches import paper_corruption
 from train.evaluate import evaluate_labeler
-from train.evaluation.labeler_evaluation import Report, evaluate_clouds
+from train.labeler_evaluation import Report, evaluate_clouds
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 

@@ -13,10 +13,9 @@ from handsim.hand.topology import NUM_QPOS
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
-from track.viewer.recordings.recording import Recording, ShownFrame
-from track.viewer.recordings.takes import shown_body
-from track.viewer.scene.frame_view import FrameView
-from track.viewer.scene.stage import set_stage
+from track.viewer.frame_view import FrameView
+from track.viewer.recordings import Recording, ShownFrame, shown_body
+from track.viewer.stage import set_stage
 from track.viewer.timeline import PICTURES
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from track.viewer.recordings.recording import Recording, ShownFrame
+from track.viewer.recordings import Recording, ShownFrame
 
 if TYPE_CHECKING:
     from viser import GuiButtonHandle, GuiFolderHandle, GuiUplotHandle, ViserServer, uplot

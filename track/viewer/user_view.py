@@ -11,9 +11,9 @@ import numpy as np
 from gloves.fit import GloveFit, nominal_fit
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
-from track.viewer.scene.hand_skin import HandSkin
-from track.viewer.scene.point_balls import PointBalls
-from track.viewer.scene.stage import set_stage
+from track.viewer.hand_skin import HandSkin
+from track.viewer.point_balls import PointBalls
+from track.viewer.stage import set_stage
 
 if TYPE_CHECKING:
     from viser import FrameHandle, GuiCheckboxHandle, GuiEvent, ViserServer

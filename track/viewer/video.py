@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from track.viewer.recordings.recording import Recording
-from track.viewer.scene.point_balls import GHOST_COLOR, label_colors
+from track.viewer.point_balls import GHOST_COLOR, label_colors
+from track.viewer.recordings import Recording
 
 _RATE: Final = 30.0  # [Hz] at most
 

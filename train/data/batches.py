@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from handsim.hand.topology import SIDES
 from train.data.augmentation import Cloud, Corruption, corrupt
-from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import OwnCorruption, draw_cloud
+from train.data.shards import MappedRows
 
 
 class Weights(NamedTuple):

@@ -26,8 +26,7 @@ from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
-from train.labelers.set_inference import weight_shapes
-from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_inference import TrainedSetLabeler, weight_shapes
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:

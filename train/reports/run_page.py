@@ -11,9 +11,9 @@ import numpy as np
 
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.app.page import Section, write_page
-from train.evaluation.labeler_evaluation import Report
-from train.evaluation.metrics import LEAST_SURE, percent, reliability
 from train.history import History
+from train.labeler_evaluation import Report
+from train.metrics import LEAST_SURE, percent, reliability
 from train.reports import hand_plot as _hand_plot
 from train.reports import run_plots as _run_plots
 from train.reports.flat_hand import flat_hand

@@ -13,8 +13,7 @@ from handsim.app.page import Section, write_page
 from handsim.space.cameras import CameraRig
 from train.reports.plot_style import BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
 from train.rig_advice.forecast import CameraLoss, Forecast
-from train.rig_advice.rig_score import RigScore, sentences
-from train.rig_advice.volume_map import GRID, VolumeMap
+from train.rig_advice.rig_score import GRID, RigScore, VolumeMap, sentences
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

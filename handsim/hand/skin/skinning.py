@@ -18,12 +18,12 @@ def skin_frames(
     rest_transforms: Float[np.ndarray, "L 4 4"],
     transforms: Float[np.ndarray, "T L 4 4"],
 ) -> Float[np.ndarray, "T V 3"]:
-    """What `surface.linear_blend_skinning` computes, for weights in descending order.
+    """Points attached at rest, carried by the bones.
 
     Args:
         points: Rest positions, in the frame of `rest_transforms` [m].
         bone_indices: The bones that move each point.
-        bone_weights: Their shares; the first zero ends a point's list.
+        bone_weights: Their shares in descending order; the first zero ends a point's list.
         rest_transforms: Bones at rest.
         transforms: Bones in every frame, in any one frame of reference.
 
@@ -42,14 +42,7 @@ def _skin(
     weights: Float[np.ndarray, "V 4"],
     motion: Float[np.ndarray, "T L 3 4"],
 ) -> Any:
-    """Skinned positions (T, V, 3) [m].
-
-    Args:
-        points: Rest positions (V, 3) [m].
-        bones: The bones that move each point (V, 4).
-        weights: Their shares (V, 4), in descending order; the first zero ends a point's list.
-        motion: Transforms (T, L, 3, 4) from the rest pose to each frame.
-    """
+    """Skinned positions (T, V, 3) [m] by transforms from the rest pose to each frame."""
     skinned = np.empty((len(motion), len(points), 3))
     for t in range(len(motion)):
         for v in range(len(points)):

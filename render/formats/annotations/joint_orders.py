@@ -92,20 +92,6 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
     return ordered
 
 
-def from_order(points: Float[np.ndarray, "*batch n k"], name: str) -> Float[np.ndarray, "*batch 21 k"]:
-    """The inverse of `to_order`: NaN for those of ours that the other order has not.
-
-    Raises:
-        ArgumentError: The order is unknown, or it has another number of points.
-    """
-    order = np.array(joint_order(name))
-    points = _rows(points, len(order), f"joints in the order '{name}'")
-    known = np.flatnonzero(order != ABSENT)
-    ours = np.full((*points.shape[:-2], NUM_KEYPOINTS, points.shape[-1]), np.nan, dtype=points.dtype)
-    ours[..., order[known], :] = points[..., known, :]
-    return ours
-
-
 def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:
     points = np.asarray(points)
     if points.ndim < 2 or points.shape[-2] != count:

@@ -8,9 +8,9 @@ import pytest
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.skin.skinning import skin_frames
-from handsim.hand.skin.surface import linear_blend_skinning
 from handsim.hand.topology import NUM_JOINTS
 from handsim.space.transforms import random_quaternions
+from tests.handsim.hand.skin.blending import blend_skin
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -24,7 +24,7 @@ def test_every_vertex_agrees_with_plain_skinning(side, rng):
     )
     surface = model.surface
     rest = (surface.vertices, surface.bone_indices, surface.bone_weights, model.rest_transforms)
-    plain = linear_blend_skinning(*rest, model.forward_kinematics(qpos))
+    plain = blend_skin(*rest, model.forward_kinematics(qpos))
     np.testing.assert_allclose(skin_frames(*rest, model.forward_kinematics(qpos)), plain, atol=1e-14)
     np.testing.assert_array_equal(model.skin(qpos), skin_frames(*rest, model.forward_kinematics(qpos)))
 

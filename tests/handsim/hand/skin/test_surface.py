@@ -15,11 +15,14 @@ from handsim.hand.shape import (
     shape_from_measures,
 )
 from handsim.hand.skeleton import build_skeleton
+from handsim.hand.skin.cage_topology import cage_topology
+from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import (
     HandSurface,
     build_surface,
-    linear_blend_skinning,
+    cage_weights,
     rest_vertices,
+    strongest_weights,
     vertex_normals,
 )
 from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES
@@ -57,9 +60,8 @@ def rest(shape: HandShape) -> np.ndarray:
 
 def posed(shape: HandShape, degrees: list[list[float]]) -> np.ndarray:
     skin = build_surface(shape)
-    return linear_blend_skinning(
-        skin.vertices, skin.bone_indices, skin.bone_weights, rest(shape), forward(shape, degrees)
-    )
+    bones = forward(shape, degrees)[None]
+    return skin_frames(skin.vertices, skin.bone_indices, skin.bone_weights, rest(shape), bones)[0]
 
 
 def digit_faces(skin: HandSurface, digit: int) -> np.ndarray:
@@ -260,8 +262,8 @@ def test_posed_skin_has_no_spikes_and_few_folds(shape, pose):
 def test_rest_transforms_leave_the_skin_where_it_is():
     shape = named_shape("M")
     skin, transforms = build_surface(shape), rest(shape)
-    still = linear_blend_skinning(skin.vertices, skin.bone_indices, skin.bone_weights, transforms, transforms)
-    assert_allclose(still, skin.vertices, atol=1e-12)
+    still = skin_frames(skin.vertices, skin.bone_indices, skin.bone_weights, transforms, transforms[None])
+    assert_allclose(still[0], skin.vertices, atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -273,7 +275,7 @@ def test_skinning_is_rigid_for_a_rigid_hand_and_takes_batches(seed):
     moves = np.tile(np.eye(4), (3, 1, 1))
     moves[:, :3, :3] = [euler_matrix(angles) for angles in rng.uniform(-3, 3, (3, 3))]
     moves[:, :3, 3] = rng.standard_normal((3, 3))
-    result = linear_blend_skinning(
+    result = skin_frames(
         skin.vertices[:50],
         skin.bone_indices[:50],
         skin.bone_weights[:50],
@@ -288,10 +290,10 @@ def test_skinning_is_rigid_for_a_rigid_hand_and_takes_batches(seed):
 def test_skinning_against_the_plain_formula():
     rng = np.random.default_rng(1)
     points, indices = rng.standard_normal((7, 3)), rng.permuted(np.tile(np.arange(16), (7, 1)), axis=1)[:, :4]
-    weights = rng.dirichlet(np.ones(4), 7)
+    weights = -np.sort(-rng.dirichlet(np.ones(4), 7), axis=1)
     transforms = np.tile(np.eye(4), (2, 16, 1, 1))
     transforms[..., :3, 3] = rng.standard_normal((2, 16, 3))
-    result = linear_blend_skinning(points, indices, weights, transforms[0], transforms[1])
+    result = skin_frames(points, indices, weights, transforms[0], transforms[1:])[0]
     motion = transforms[1] @ np.linalg.inv(transforms[0])
     for point, bones, shares, got in zip(points, indices, weights, result, strict=True):
         wanted = sum(
@@ -314,3 +316,23 @@ def test_many_skins_at_once_are_those_of_each_alone():
     together = rest_vertices(EXTREME_SHAPES)
     for shape, vertices in zip(EXTREME_SHAPES, together, strict=True):
         assert_array_equal(vertices, build_surface(shape.with_side("right")).vertices)
+
+
+def test_cage_shares_sum_to_one_and_every_bone_moves_something():
+    topology = cage_topology()
+    weights = cage_weights(topology)
+    assert weights.shape == (topology.num_vertices, NUM_BONES)
+    assert weights.min() >= 0.0
+    assert_allclose(weights.sum(axis=1), 1.0)
+    assert (weights.max(axis=0) > 0.9).all()
+
+
+def test_strongest_keeps_the_four_largest_in_order():
+    weights = np.zeros((2, NUM_BONES))
+    weights[0, [3, 5, 7, 9, 11]] = [0.1, 0.4, 0.2, 0.25, 0.05]
+    weights[1, 2] = 1.0
+    indices, shares = strongest_weights(weights)
+    assert indices[0].tolist() == [5, 9, 7, 3]
+    assert_allclose(shares[0], np.array([0.4, 0.25, 0.2, 0.1]) / 0.95)
+    assert indices[1, 0] == 2
+    assert_allclose(shares[1], [1.0, 0.0, 0.0, 0.0])

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from train.config import TrainConfig, batch_recipe
 from train.data.batches import Part, draw_batch
-from train.data.mapped_rows import MappedRows
-from train.data.shards import Dataset, row_dtype
+from train.data.shards import Dataset, MappedRows, row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset

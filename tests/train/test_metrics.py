@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.evaluation.metrics import LabelCounts, macro_f1, percent
+from train.metrics import LabelCounts, macro_f1, percent
 
 
 def _one_each(pairs):

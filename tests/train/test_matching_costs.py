@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.held_out import held_out_markers
 from train.config import CNNConfig
-from train.evaluation.labeler_evaluation import paper_report
+from train.labeler_evaluation import paper_report
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler, prepare_network
 from train.run_result import choose_costs
-from train.simulation.held_out import held_out_markers
 
 NAMES = tuple(f"marker{label}" for label in range(19))
 

@@ -16,8 +16,8 @@ from gloves.takes.take import Take
 from train.data.augmentation import Cloud, Corruption
 from train.data.batches import paper_corruption
 from train.data.own_corruption import OwnCorruption, draw_cloud
-from train.evaluation.metrics import LabelCounts, error_without, expected_calibration_error
 from train.labelers.protocol import Labeler
+from train.metrics import LabelCounts, error_without, expected_calibration_error
 
 _CHUNK: Final = 4096
 
@@ -27,7 +27,7 @@ class Report:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.metrics` the expected
+    """Shares in [0, 1], see `train.metrics`; and from `train.metrics` the expected
     calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
@@ -38,7 +38,7 @@ class Report:
     right: Bool[np.ndarray, "N"]
     """Whether that label is right."""
     numbers: dict[str, int] = field(default_factory=dict)
-    """Slots, points, occlusions and ghosts counted, see `train.evaluation.metrics.LabelCounts.numbers`."""
+    """Slots, points, occlusions and ghosts counted, see `train.metrics.LabelCounts.numbers`."""
 
 
 def evaluate_markers(

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from track.viewer.recordings.recording import Recording, ShownBody, ShownFrame
-from track.viewer.scene.hand_skin import HandSkin
-from track.viewer.scene.point_balls import PointBalls
-from track.viewer.scene.rig_view import show_rig
+from track.viewer.hand_skin import HandSkin
+from track.viewer.point_balls import PointBalls
+from track.viewer.recordings import Recording, ShownBody, ShownFrame
+from track.viewer.stage import show_rig
 
 if TYPE_CHECKING:
     from viser import (

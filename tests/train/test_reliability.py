@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from train.evaluation.metrics import BINS, error_without, expected_calibration_error, reliability
+from train.metrics import BINS, error_without, expected_calibration_error, reliability
 
 points = st.integers(1, 60).flatmap(
     lambda count: st.tuples(

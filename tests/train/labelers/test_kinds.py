@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.held_out import held_out_markers
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
 from train.glove_labeler import load_labeler
-from train.labelers import batch_network
+from train.labelers import kinds
 from train.labelers.kinds import labeler_of, new_network
-from train.simulation.held_out import held_out_markers
 
 NAMES = tuple(f"m{number}" for number in range(19))
 
@@ -36,14 +36,14 @@ def test_batches_give_the_labels_of_clouds_alone(clouds):
 def test_a_copy_on_another_device_gives_the_same(clouds, monkeypatch):
     expected = drawn_cnn().label_frames(clouds[:8])
     other = torch.device("cpu", 0)  # which is another name than that of the network's device
-    monkeypatch.setattr(batch_network, "batch_device", lambda: other)
+    monkeypatch.setattr(kinds, "batch_device", lambda: other)
     assert same_labels(drawn_cnn().label_frames(clouds[:8]), expected)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_gpu_gives_the_labels_of_the_cpu(clouds, monkeypatch):
     on_gpu = drawn_cnn().label_frames(clouds)
-    monkeypatch.setattr(batch_network, "batch_device", lambda: torch.device("cpu"))
+    monkeypatch.setattr(kinds, "batch_device", lambda: torch.device("cpu"))
     assert same_labels(on_gpu, drawn_cnn().label_frames(clouds))
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from gloves.captures.collection import read_markers
-from gloves.captures.formats import write_capture
+from gloves.captures.formats import read_markers, write_capture
 from handsim.errors import CaptureError
 
 NAMES = ("ThumbTip", "IndexTip", "PinkyTip")
