@@ -72,7 +72,6 @@ def write_skin(path: Path, model: HandModel) -> None:
 
     Args:
         path: The file, .glb, .obj, .ply or .stl.
-        model: The hand.
 
     Raises:
         OSError: The file cannot be written.

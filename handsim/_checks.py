@@ -21,7 +21,6 @@ def check_type(
     """Refuse an argument of another type; the one check of all public functions.
 
     Args:
-        name: The argument.
         value: What was given for it.
         kinds: The types that it may have; a bool is none of them unless it is named.
         expected: What is wanted, in words, such as "a MarkerLayout, or the name or path of one".

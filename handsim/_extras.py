@@ -15,7 +15,6 @@ def import_extra(module: str, what: str, extra: str) -> Any:
     """A module of an optional package.
 
     Args:
-        module: Its name.
         what: What needs it, for the message.
         extra: The extra of handsim that brings it.
 

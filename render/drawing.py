@@ -98,10 +98,6 @@ def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | 
 class Drawing:
     """A subject before its cameras: draws any of its frames.
 
-    Args:
-        subject: What is drawn.
-        config: How it is drawn.
-
     Raises:
         HandSimError: The subject has no motion to blur, or no camera has a hand in its picture.
     """
@@ -209,14 +205,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
 ) -> Studio:
-    """A studio of one person, whose looks are drawn.
-
-    Args:
-        hands: The person's hands.
-        config: How they are dressed and drawn.
-        bodies: Rigid bodies beside them.
-        rng: Source of the looks.
-    """
+    """A studio of one person, whose looks are drawn."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     painter = choose_painter(config.with_chosen_painter().painter)
@@ -233,9 +222,7 @@ def sample_choices(
     """Random choices of a picture.
 
     Args:
-        config: What to choose from.
         skin: See `sample_surroundings`.
-        rng: Source of the choices.
         size: Of the picture [px].
         around: Positions that a background of several cameras is around [m].
     """

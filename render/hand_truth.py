@@ -32,9 +32,7 @@ def hand_truth(
 
     Args:
         figure: The hand.
-        qpos: Pose of the hand.
         number: Index of the hand among those in the picture.
-        camera: The camera.
         pictures: Depth and parts of that camera.
         recorded: Whether to compute the vertices, else there are none.
     """

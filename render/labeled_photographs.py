@@ -90,7 +90,6 @@ def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Genera
     """A square around a hand, resampled; what is outside of the photograph has the color of its border.
 
     Args:
-        hand: The hand.
         size: Side of the square [px].
         share: Of the side that the labeled keypoints span.
         rng: Source of where in the square the hand is.

@@ -171,8 +171,6 @@ class _Telling:
     Args:
         folder: Where workers of this machine leave their `_DRAWN` files.
         count: Pictures that are there already.
-        total: All pictures.
-        progress: Who is told.
     """
 
     def __init__(self, folder: Path, count: int, total: int, progress: Progress | None) -> None:

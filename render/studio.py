@@ -114,7 +114,6 @@ class Studio:
 
     Args:
         hands: The hands, in the order of the takes.
-        people: Appearance of each hand.
         bodies: The rigid bodies, in the order of the takes.
         body_colors: Color of each of them, sRGB in [0, 1].
         passes: Some of `PASSES`.
@@ -154,7 +153,6 @@ class Studio:
 
         Args:
             moment: Poses of the studio's hands and bodies.
-            camera: The camera.
             choices: All other choices.
             recorded: Whether the frame has its choices as JSON and the hands' vertices, which take time.
 

@@ -208,7 +208,6 @@ def subject_of_poses(
         person: Which of the people is in each frame (T,); when not given, a number of people is distributed
             at random, and of hands there is one, or one for each frame.
         glove: Marker layout on the hands, where they wear gloves.
-        seed: Seed of the people.
 
     Raises:
         ArgumentError: An array has another shape or impossible numbers, or the arguments do not fit together.

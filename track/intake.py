@@ -63,7 +63,6 @@ class Intake:
         """Check the next frame.
 
         Args:
-            points: Points [m].
             ids: Their IDs; -1 where there is none, None where the stream has none.
             time: Time stamp of the frame [s].
 
@@ -116,11 +115,7 @@ class Intake:
 
 
 def _numbers(name: str, values: ArrayLike, kind: type) -> NDArray[Any]:
-    """An array of a kind of numbers.
-
-    Raises:
-        ArgumentError: The values are no numbers.
-    """
+    """An array of a kind of numbers; an `ArgumentError` if the values are none."""
     try:
         return np.asarray(values, dtype=kind)
     except (TypeError, ValueError, OverflowError) as error:

@@ -40,11 +40,7 @@ _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
 
 
 class TakeRecorder:
-    """Records tracked frames; `take` gives the take so far at any time.
-
-    Args:
-        tracker: The tracker, for its hands and bodies.
-    """
+    """Records tracked frames; `take` gives the take so far at any time."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands

@@ -168,10 +168,6 @@ def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
     """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
 
     Otherwise the first frames of a stream would have to wait.
-
-    Args:
-        hands: The user's hands.
-        labeler: Labeler of their glove.
     """
     tracker = Tracker(hands, labeler)
     qpos = np.zeros((len(hands), NUM_QPOS))

@@ -55,12 +55,7 @@ def evaluate_markers(
 
 
 def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
-    """Label clouds whose truth is known, and count errors.
-
-    Args:
-        labeler: The labeler to evaluate.
-        cloud: Clouds of hands [m].
-    """
+    """Label clouds whose truth is known, and count errors."""
     count = LabelingCount(labeler)
     count.add_cloud(cloud)
     return count.report()

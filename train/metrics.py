@@ -130,7 +130,6 @@ def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]
 
     Args:
         confidence: Confidence of each label, 0 to 1; a bin includes its lower edge, the last one also 1.
-        right: Which labels are right.
     """
     index = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
     count = np.bincount(index, minlength=BINS)
@@ -144,7 +143,6 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 
     Args:
         confidence: Confidence of each label, 0 to 1.
-        right: Which labels are right.
     """
     if not len(confidence):
         return float("nan")
@@ -162,7 +160,6 @@ def error_without(
 
     Args:
         confidence: Confidence of each label, 0 to 1.
-        right: Which labels are right.
         share: Share of the points to leave out, rounded to whole points.
     """
     kept = len(confidence) - round(share * len(confidence))

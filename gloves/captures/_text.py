@@ -118,7 +118,6 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
     Quotes in a file with tabs count only where the first cell of the file is quoted.
 
     Args:
-        lines: Lines of a file.
         separator: What separates their cells.
         first: Number of the first one in the file.
         wider: Whether rows may have more cells than the line above them.

@@ -31,7 +31,6 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a C3D file; points with a negative residual are missing.
 
     Args:
-        data: The file.
         tell: Called with a sentence where no unit is stated, or where the file contradicts itself.
 
     Raises:

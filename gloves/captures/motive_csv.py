@@ -90,8 +90,6 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
     """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells.
 
     Args:
-        path: Where to write.
-        capture: What to write.
         title: The file name whose stem is the take's name (`path` may be a temporary one).
 
     Raises:
@@ -129,11 +127,7 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
 
 
 def _types_and_names(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
-    """Type and name of each column, from the header rows between line 1 and the axes.
-
-    Raises:
-        CaptureError: There are no such rows.
-    """
+    """Type and name of each column, from the header rows between line 1 and the axes."""
     filled = [row for row in rows if any(row)]
     # Without labels the first row says 'Marker' itself, behind two blank cells.
     if len(filled) > 2 and not any(filled[0][:2]) and set(filled[0]) & _TYPES:

@@ -46,7 +46,6 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     Medians over the frames decide, since strays of a real system lie anywhere.
 
     Args:
-        clouds: Points of each frame [m].
         only_wide: Ask only whether they span more than a room, since they may be parts of one frame.
     """
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
@@ -99,7 +98,6 @@ def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     """Refuse clouds that are not in meters.
 
     Args:
-        clouds: Points of each frame [m].
         only_wide: See `unit_fault`.
 
     Raises:
@@ -131,7 +129,6 @@ def check_place(capture: Capture, farthest: float) -> None:
     """Tell of points so far from the origin that they will be left out.
 
     Args:
-        capture: Positions [m].
         farthest: From this coordinate on a point is left out [m].
 
     Raises:

@@ -86,11 +86,7 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
-    """Where the position of each trajectory begins.
-
-    Raises:
-        CaptureError: The row does not begin as one of axes does, or names none.
-    """
+    """Where the position of each trajectory begins, by the row of axes."""
     if axes[0].lower() not in _FIRST_CELLS:
         raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
     columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]

@@ -46,15 +46,7 @@ def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
 
 @kernel
 def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
-    """Whether the line from `start` to `end`, each (3,) [m], meets a triangle.
-
-    Args:
-        start: One end of the line.
-        end: The other end.
-        vertices: The mesh (V, 3) [m].
-        nodes: `faces`, `first` and `skip` of the tree.
-        boxes: Low and high corner of each node (N, 6) [m].
-    """
+    """Whether the line from `start` to `end`, each (3,) [m], meets a triangle of the tree."""
     faces, first, skip = nodes
     px, py, pz = start[0], start[1], start[2]
     d = (end[0] - px, end[1] - py, end[2] - pz)

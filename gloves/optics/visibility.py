@@ -33,7 +33,6 @@ def free_rays(
         markers: Marker centers in the world [m].
         cameras: Camera positions in the world [m].
         segments: Both ends of every capsule's axis in the world [m].
-        radii: Capsule radii [m].
     """
     free = np.ones((*markers.shape[:2], len(cameras)), dtype=np.bool_)
     _keep_free(markers, cameras, segments, radii, free)
@@ -52,9 +51,7 @@ def visible_cameras(
     Args:
         markers: Marker centers in the world [m].
         normals: Outward unit directions of the skin under the markers.
-        rig: The cameras.
         segments: Both ends of every capsule's axis in the world [m].
-        radii: Capsule radii [m].
     """
     seen = facing_cameras(markers, normals, rig)
     _keep_free(markers, rig.positions, segments, radii, seen)
@@ -69,7 +66,6 @@ def facing_cameras(
     Args:
         markers: Marker centers in the world [m].
         normals: Outward unit directions of the surface under the markers.
-        rig: The cameras.
     """
     seen: NDArray[np.bool_] = _facing(
         np.ascontiguousarray(markers, dtype=np.float64),
@@ -89,14 +85,7 @@ def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
 
 @kernel
 def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
-    """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.
-
-    Args:
-        markers: Marker centers (T, M, 3) [m]; what is NaN is in no view.
-        normals: Outward unit directions (T, M, 3).
-        cameras: `CameraArrays` of C cameras.
-        facing: Cosine of the largest angle of facing.
-    """
+    """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`."""
     frames, count = markers.shape[:2]
     seen = np.empty((frames, count, len(cameras.sizes)), dtype=np.bool_)
     for c in range(len(cameras.sizes)):

@@ -52,7 +52,6 @@ def read_archive(
     """Read what `write_archive` wrote, or what has been recorded of it until now.
 
     Args:
-        path: The file.
         unpack: Makes the content from header and arrays; an exception means that they are damaged.
 
     Raises:

@@ -92,7 +92,6 @@ def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArr
     """Values as an array of a column's type.
 
     Args:
-        column: The column.
         values: What is to be kept in it.
         sizes: The number that each letter stands for.
 

@@ -127,7 +127,6 @@ def find_pins(
         corrections: In the order in which they were made.
         points: Observed points [m], NaN where a column has no point.
         ids: The system's ID of each point, -1 where it has none.
-        label_names: Name of each label.
 
     Raises:
         CaptureError: A span is not within the frames, a label is unknown, or two points of a frame have one

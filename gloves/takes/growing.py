@@ -167,7 +167,6 @@ class GrownArchive:
     """Reads an archive that grew, or still grows, up to its last whole block.
 
     Args:
-        path: The file.
         check: Whether checksums are compared.
 
     Raises:
@@ -292,7 +291,6 @@ def finish_archive(
 
     Args:
         grown: The archive.
-        path: The .npz file.
         header: The header, as JSON.
         told: Called after every part.
 

@@ -148,7 +148,6 @@ def check_worker(worker: str, threads: int, found: dict[str, str], expected: dic
     """Refuse a worker that other bytes may come from.
 
     Args:
-        worker: Its address.
         threads: The number of its threads; jobs take a process each.
         found: Its versions of packages.
         expected: The versions that it must have.

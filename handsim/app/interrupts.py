@@ -21,7 +21,6 @@ class Stopped(KeyboardInterrupt):
     """A command was asked to end.
 
     Args:
-        number: The signal.
         kept: What is kept and how to go on, a sentence without a capital and a period.
     """
 
@@ -86,12 +85,7 @@ class _Block:
 
 
 class _Persistent(Stopped):
-    """A `Stopped` that comes again when it is lost, until a block is left.
-
-    Args:
-        number: The signal.
-        block: The block.
-    """
+    """A `Stopped` that comes again when it is lost, until a block is left."""
 
     def __init__(self, number: int, block: _Block) -> None:
         super().__init__(number)

@@ -98,9 +98,7 @@ class Output:
 
         Args:
             name: The settings file.
-            settings: What decides the content.
             noun: What the folder holds, for messages.
-            error: Class of the error.
             grows: A setting that may be larger than before.
             result: A file that is true for the old settings only.
 
@@ -130,7 +128,6 @@ class Output:
         """A job that writes to the claimed folder.
 
         Args:
-            make: What to do.
             last: Patterns of the files that say that a job is finished, whose content is then complete.
         """
         name = self._claimed[0]

@@ -26,9 +26,6 @@ _DAMAGE: Final = (
 def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     """All arrays of an `.npz`, by name.
 
-    Args:
-        path: A regular file.
-
     Raises:
         ValueError: Not an archive of plain arrays, a header that does not fit its bytes, or far more bytes
             than such a file may hold.

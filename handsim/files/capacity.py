@@ -20,7 +20,6 @@ def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type
         needed: Bytes still to be written.
         what: What needs them, for the message, in the plural.
         remedy: What to do beside freeing space, as in `ask for fewer frames`.
-        error: Class of the error.
     """
     there = folder.absolute()
     while not there.exists():

@@ -26,8 +26,6 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
     A path that does not exist, or is a folder, is left to whoever opens it.
 
     Args:
-        path: The file.
-        error: What to raise, in one sentence.
         most: Largest size [bytes]; any when None.
 
     Raises:
@@ -50,8 +48,6 @@ def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None
     """The bytes of a regular file.
 
     Args:
-        path: The file.
-        error: What to raise, in one sentence.
         most: Largest size [bytes]; any when None.
 
     Raises:

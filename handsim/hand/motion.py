@@ -122,7 +122,6 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 
     Args:
         times: Time of each frame [s], increasing.
-        rate: Frames per second [Hz].
 
     Raises:
         ArgumentError: The rate is not positive, or there would be too many frames.

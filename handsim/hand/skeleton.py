@@ -73,7 +73,6 @@ def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Floa
     """`T_world_bone` of every bone in every frame.
 
     Args:
-        skeleton: The hand's bones.
         qpos: Wrist position [m], wrist orientation (wxyz, normalized here), joint angles [rad].
     """
     transforms: NDArray[np.float64] = pose_bones(

@@ -40,9 +40,7 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things.
 
     Args:
-        path: A .bvh file.
         motion: What to write, at a steady rate.
-        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.

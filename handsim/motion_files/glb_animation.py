@@ -55,11 +55,6 @@ _MOST: Final = (1 << 32) - 1  # bytes that the header can state
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things; a motion of one frame is written as a pose, without an animation.
 
-    Args:
-        path: A .glb file.
-        motion: What to write.
-        up: The axis of its world that points up.
-
     Raises:
         OSError: The file cannot be written.
         ArgumentError: The file would be larger than a .glb can be.

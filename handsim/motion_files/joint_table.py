@@ -52,9 +52,6 @@ def read_joint_csv(path: Path) -> JointTable:
 
     Further columns, such as the positions of joints, are passed over; columns may come in any order.
 
-    Args:
-        path: A .csv file.
-
     Raises:
         CaptureError: The file cannot be read, lacks a column, or a cell is not what its column holds.
     """
@@ -107,8 +104,6 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as text, UTF-8, with nine digits.
 
     Args:
-        path: A .csv file.
-        motion: What to write.
         up: Of no effect: the axes are the take's.
 
     Raises:
@@ -130,8 +125,6 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as Apache Parquet.
 
     Args:
-        path: A .parquet file.
-        motion: What to write.
         up: Of no effect: the axes are the take's.
 
     Raises:
@@ -172,8 +165,6 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the angles of all hands.
 
     Args:
-        path: A .mot file.
-        motion: What to write.
         up: Of no effect: the axes are the take's.
 
     Raises:

@@ -18,7 +18,6 @@ def corner_normals(
     """Outward unit normal at each corner of each face: of the faces there that meet at less than 40 degrees.
 
     Args:
-        vertices: Positions [m].
         faces: Triangles, counter-clockwise from outside.
     """
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
@@ -40,7 +39,6 @@ def split_vertices(
     """Vertices with one normal each.
 
     Args:
-        faces: Triangles.
         normals: The normals at their corners.
 
     Returns:

@@ -50,8 +50,6 @@ def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
     Args:
         path: A .json file, by custom `.openxr.json`.
-        motion: What to write.
-        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
@@ -81,10 +79,6 @@ def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:
     """`T_world_joint` of OpenXR's joints, in our world [m].
-
-    Args:
-        model: The hand.
-        qpos: Its poses.
 
     Raises:
         ArgumentError: `qpos` is not (T, 27) or not finite.

@@ -43,11 +43,6 @@ _AROUND: Final = 0.03  # [m] of skin around keypoints
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things.
 
-    Args:
-        path: A .usda or .usdc file.
-        motion: What to write.
-        up: The axis of its world that points up.
-
     Raises:
         OSError: The file cannot be written.
         HandSimError: usd-core is not installed.

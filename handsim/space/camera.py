@@ -148,8 +148,6 @@ def pinhole(
     """A camera without distortion.
 
     Args:
-        name: Its name.
-        size: Width and height [px].
         focal: Focal length [px].
         center: Principal point [px]; the picture's center when not given.
     """

@@ -218,7 +218,6 @@ def check_outside(
     """Refuse a rig with a camera inside or near an object or a hand.
 
     Args:
-        rig: The cameras.
         points: The object's vertices, or other points of it, in all frames [m]; NaN points are left out.
         clearance: Smallest distance of a camera from any of them [m].
         what: Name of the object, for the message.
@@ -243,7 +242,6 @@ def check_outside_volume(
     """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
 
     Args:
-        rig: The cameras.
         center: Middle of the cube in the world [m].
         half_side: Half its side [m].
         clearance: Smallest distance of a camera from the cube [m].

@@ -225,7 +225,6 @@ def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
 
     Args:
         wrists: Orientations (T, 3, 3) and positions (T, 3) [m] of the wrist.
-        angles: The digit's joint angles (T, 4) [rad].
         parts: The `Digit`.
     """
     posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((4, 3))

@@ -65,7 +65,6 @@ def keep_apart(
     Args:
         holder: The hand with the object.
         other: The hand to stay clear of.
-        obj: The object.
         held: Motion of hand and object before they are drawn back.
         other_motion: Motion of the other hand.
         direction: Unit directions to draw back in.

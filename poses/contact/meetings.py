@@ -38,11 +38,7 @@ def play_meeting(
     """One interaction from coming together to letting go; None when this draw is not valid.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         name: One of `INTERACTIONS`.
-        config: Speeds and times.
-        rng: Source of all randomness.
     """
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
@@ -68,11 +64,8 @@ def draw_poses(
     """Valid single poses of several interactions, the roles drawn once for each.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         counts: Names out of `INTERACTIONS`, each with a number of poses to draw; those that are not valid are
             left out.
-        rng: Source of all randomness.
     """
     draws = [_draw(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")

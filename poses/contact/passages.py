@@ -97,12 +97,8 @@ def path_between(
     """Frames from one pose to another by way of one where the hands are apart; None when not valid.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         start: Where the path begins, one frame.
         end: Where it ends, one frame.
-        config: Speeds and times.
-        rng: Source of all randomness.
     """
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)

@@ -66,9 +66,7 @@ def pointing_path(
     Args:
         positions: Possible targets, moving in the world [m].
         outward: Unit directions from which each can be reached.
-        rate: Frames per second [Hz].
         config: Distances, times and speeds; the defaults if not given.
-        rng: Source of all randomness.
     """
     config = config or PointingConfig()
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")

@@ -73,9 +73,7 @@ def sample_two_hand_motion(
         right: A right hand.
         left: A left hand; it may be another person's.
         duration: How long [s]; each motion has `round(duration * rate) + 1` frames.
-        config: Speeds and positions; human ones by default.
         interactions: Names out of `INTERACTIONS`; all of them when not given.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
@@ -105,8 +103,6 @@ def sample_two_hand_poses(
     Args:
         right: A right hand.
         left: A left hand; it may be another person's.
-        count: How many.
-        rng: Source of all randomness.
 
     Returns:
         qpos of the right hand and of the left one.

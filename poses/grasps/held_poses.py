@@ -46,11 +46,8 @@ def sample_held_poses(
     """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
 
     Args:
-        model: The hand.
-        obj: The object it holds.
         hold: A settled grasp of the object by this hand.
         count: Number of variants, B.
-        rng: Source of all randomness.
 
     Returns:
         Joint angles [rad], and `T_wrist_object` [m].

@@ -59,11 +59,7 @@ def sample_object_motion(
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
     Args:
-        model: The hand.
-        obj: The object it holds.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and positions; human ones by default.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: The duration is not positive.

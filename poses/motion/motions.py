@@ -78,8 +78,6 @@ def motion_through(
     Args:
         model: The hand; a shape or the name of a size is a right one.
         poses: Joint angles [rad], at least two poses.
-        config: Speeds and positions; human ones by default.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There are fewer than two poses, or one is not valid on this hand.

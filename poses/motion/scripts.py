@@ -58,7 +58,6 @@ def scripted_motion(
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
         config: Speeds and positions; human ones by default. Except for "free",
             `durations` and `hold` are those of the script.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There is no such script, or the duration is not positive or less than a step.

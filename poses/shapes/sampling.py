@@ -51,7 +51,6 @@ def mixed_angles(model: HandModel, num_poses: int, *, rng: np.random.Generator) 
     Args:
         model: The hand; these angles are the same for every hand.
         num_poses: Number of poses, T.
-        rng: Source of all randomness.
 
     Returns:
         Joint angles [rad], inside ranges and couplings; digits may still touch.

@@ -66,7 +66,6 @@ def thumb_contact(
 
     Args:
         model: The hand; a shape or the name of a size is a right one.
-        angles: Joint angles [rad].
         finger: "index", "middle", "ring" or "little".
 
     Raises:
@@ -230,13 +229,7 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
 def _overlaps(
     segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
 ) -> Any:
-    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart.
-
-    Args:
-        segments: Both ends of every axis (T, K, 2, 3) [m].
-        radii: Capsule radii (K,) [m].
-        pairs: Indices of two capsules each (P, 2).
-    """
+    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart."""
     overlaps = np.empty((len(segments), len(pairs)))
     for frame in range(len(segments)):
         for pair in range(len(pairs)):

@@ -128,9 +128,7 @@ class Viewpoints:
     """Cameras of every frame.
 
     Args:
-        config: Placement of the cameras.
         take: The take whose hands they look at.
-        rng: Source of all random choices.
     """
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
@@ -232,11 +230,7 @@ def _largest(
 ) -> _Path:
     """The first of some cameras that shows hands as large as asked for; if none does, the best of them.
 
-    Args:
-        config: What is asked for.
-        framing: The hands.
-        ways: Directions (T, 3) of a camera from the hands; the first is taken where hands have one distance.
-        rng: Source of the distances.
+    Of the directions (T, 3) the first is taken where hands have one distance.
     """
     best, chosen = np.inf, None
     for directions in ways:
@@ -454,7 +448,6 @@ def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> Non
 
     Args:
         name: Their file or names, for messages.
-        cameras: The cameras.
         take: The take; keypoints of all frames are projected, and hidden ones count.
 
     Raises:
@@ -505,7 +498,6 @@ def around_hands(
         keypoints: Of all hands, in the world [m].
         qpos: Their poses; the camera is not behind their forearms.
         share: Of the picture's shorter side that the keypoints span.
-        rng: Source of the place.
     """
     center = 0.5 * (keypoints.min(axis=0) + keypoints.max(axis=0))
     along = quaternion_matrix(qpos[:, 3:7])[..., 0]

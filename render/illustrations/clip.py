@@ -48,7 +48,6 @@ def write_clip(
     Args:
         path: The file, .mp4.
         frames: The fields of a `ClipFrame` each.
-        rate: Frames per second [Hz].
         shown: Points in the world that the view shows [m].
         radius: Radius of the points [m].
 
@@ -78,8 +77,6 @@ def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:
     """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out.
 
     Args:
-        frame: What to draw.
-        view: From where.
         radius: Radius of the points [m].
     """
     hands = tuple(PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all())

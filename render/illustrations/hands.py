@@ -64,8 +64,6 @@ def draw_row(
     Args:
         hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
         direction: Direction of view.
-        covering: Bare skin or a dark glove.
-        width: Width of the picture [px].
     """
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
@@ -108,7 +106,6 @@ def draw_gloves(fits: Sequence[GloveFit], *, columns: int = 4, width: int = 2000
     Args:
         fits: Hands in their gloves, at least one.
         columns: Gloves per row.
-        width: Width of the picture [px].
     """
     spread = join_qpos(gesture("spread")[None])[0]
     cells = [(f"{fit.layout.name}: {fit.layout.num_markers}", fit, spread) for fit in fits]
@@ -140,7 +137,6 @@ def draw_glove(
     """A glove on a flat hand from several sides, with the names of the markers that each side shows.
 
     Args:
-        fit: The hand in the glove.
         sides: Some of `SIDES_OF_HAND`.
         height: Height of the hand's pictures [px].
     """
@@ -175,10 +171,6 @@ def draw_camera(
     """The view of one camera of a rig, zoomed in: seen markers green, hidden ones as red rings.
 
     Args:
-        fit: The hand in the glove.
-        qpos: Its pose.
-        rig: The cameras.
-        camera: Index of the camera.
         size: Width and height of the picture without names [px].
 
     Returns:
@@ -229,7 +221,6 @@ def draw_labels(
         hand: The hand behind the points, drawn faintly on the labeled side.
         points: All points of the frame [m], ghosts among them.
         labels: Marker of each point in `layout`, -1 for a ghost.
-        layout: The glove.
         size: Width and height of one side without names [px].
     """
     ghost = labels < 0

@@ -217,8 +217,6 @@ def render_rgb(
     """Color picture, sRGB.
 
     Args:
-        scene: What to draw.
-        size: Width and height [px].
         behind: Picture behind the scene; the scene's background when not given.
 
     Raises:
@@ -239,10 +237,6 @@ def render_rgb(
 def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
     """Depth picture: distance along the camera's axis [m] at each pixel's center, 0 where there is nothing.
 
-    Args:
-        scene: What to draw.
-        size: Width and height [px].
-
     Raises:
         ArgumentError: No picture has that size.
     """
@@ -261,7 +255,6 @@ def unoccluded(
 
     Args:
         depth: The picture [m], 0 where there is nothing.
-        view: Its camera.
         points: Points in the world [m].
         slack: How far behind the first surface a point still counts [m], such as a marker's radius.
     """

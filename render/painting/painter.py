@@ -38,7 +38,6 @@ def paint(
 
     Args:
         camera: A pinhole camera.
-        drawn: The surfaces.
         lighting: Light in the camera's axes.
         painter: What paints; both give nearly the same picture.
 
@@ -91,13 +90,7 @@ def put_before(
 
 @kernel
 def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
-    """See `put_before`.
-
-    Args:
-        painted: Colors and coverage (P, 4).
-        background: sRGB from 0 to 255 (P, 3).
-        mixed: Written (P, 3).
-    """
+    """Write painted colors with coverage (P, 4) over a background; see `put_before`."""
     for pixel in range(len(mixed)):
         clear = 1.0 - painted[pixel, 3] / _WHITE
         for channel in range(3):

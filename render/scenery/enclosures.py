@@ -99,7 +99,6 @@ def draw_surroundings(background: Background, enclosure: Enclosure, camera: Came
 
     Args:
         background: Its kind, colors and seed.
-        enclosure: The box.
         camera: A camera inside it, with any lens.
 
     Raises:

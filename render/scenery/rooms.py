@@ -63,12 +63,7 @@ class _Boxes(NamedTuple):
 
 
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
-    """A random room from a random position, linear light.
-
-    Args:
-        size: Width and height [pixels].
-        seed: Seed of the random choices.
-    """
+    """A random room from a random position, linear light."""
     width, height = size
     scene = _scene(seed)
     rays = _rays(width, height, *scene.lens)
@@ -261,13 +256,7 @@ def _cast(
 
 @kernel
 def _nearest_box(inverse: NDArray[np.float64], offsets: NDArray[np.float64], distance: float) -> Any:
-    """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
-
-    Args:
-        inverse: One over the ray's unit direction (3,).
-        offsets: Low and high corners of boxes (B, 2, 3) from the ray's origin [m].
-        distance: Largest distance [m].
-    """
+    """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none."""
     nearest, face = -1, 0
     for box in range(len(offsets)):
         enter, leave, side = -np.inf, np.inf, 0

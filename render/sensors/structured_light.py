@@ -65,7 +65,6 @@ def measure(
         cosines: Of the angles between normals and the rays that come back; None: all surfaces face.
         noise: The sensor.
         focal: The camera's horizontal focal length [px].
-        rng: Randomness.
     """
     scale = np.float32(noise.baseline * focal)
     with np.errstate(divide="ignore"):

@@ -66,7 +66,6 @@ def measure(
         cosines: Of the angles between normals and the rays that come back; None: all surfaces face.
         reflectance: Share of light that surfaces send back; None: all are white walls.
         noise: The sensor.
-        rng: Randomness.
     """
     there = depth > 0.0
     measured = _mixed(depth, noise, rng=rng)

@@ -51,7 +51,6 @@ class PosableSkin:
     """The drawn skin of one person's hand.
 
     Args:
-        model: The hand.
         forearm: The forearm behind it.
         bony: Factor on what joints make of the skin around them, see `render.skin.flexion`; 0 for the hand
             model's own surface.
@@ -102,7 +101,6 @@ class PosableSkin:
         """The skin in one pose.
 
         Args:
-            qpos: The pose.
             upper_arm: Unit direction of the upper arm in the world; without it the arm is straight and short.
 
         Raises:
@@ -178,12 +176,6 @@ def _occluded_share(
     """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
 
     The inner loop has no branches and writes one array, so that it is compiled into vector instructions.
-
-    Args:
-        points: Positions (V, 3) [m].
-        normals: Unit normals (V, 3).
-        segments: Ends of the capsules (K, 2, 3) [m].
-        radii: Radii of the capsules (K,) [m].
     """
     count = len(points)
     x, y, z = _columns(points)

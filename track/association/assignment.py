@@ -24,9 +24,6 @@ def match_log_odds(
     """Log-odds of each point being a marker rather than a stray.
 
     Args:
-        points: Points [m].
-        positions: Predicted positions of markers [m].
-        covariances: Covariances of these [m^2].
         stray_density: Density of points that are no marker [1/m^3].
     """
     innovation = points[:, None] - positions
@@ -89,7 +86,6 @@ def assign_jointly(
     """Assign points to digits: the best combination of hypotheses of all digits that share points.
 
     Args:
-        candidates: Candidate points of each digit.
         hypotheses: The best assignment of every set of them, digit by digit.
         markers: Markers of each digit, counted through the hands; -1 where there are fewer.
         assigned: Marker of each point, -1 for none; overwritten.

@@ -79,7 +79,6 @@ class HandInitializer:
     """Initializes hands without any history.
 
     Args:
-        states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
         cuts: Directions along which a group is cut in one call; the next ones follow in the next call.

@@ -54,9 +54,7 @@ class PointHistory:
         """The next frame with the labels and the evidence that its points carry over.
 
         Args:
-            points: The points [m].
             ids: The stream's IDs, -1 for none.
-            time: Time of the frame [s].
             expected: Predicted position of the marker of each label [m]; NaN where there is none.
         """
         if time - self._last_time > self._silence:
@@ -103,7 +101,6 @@ class PointLinker:
         """Number the points of the next frame, as the stream does where most of its IDs last.
 
         Args:
-            points: The points [m].
             ids: The stream's IDs, -1 for none.
             labels: Label of the numbers that had one in the last frame. Where there are any, the IDs of these
                 count: ghosts have short lives.

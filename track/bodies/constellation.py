@@ -76,11 +76,7 @@ def _fit_pose(
     assignment: NDArray[np.int64],
     pose: NDArray[np.float64],
 ) -> tuple[int, float, float]:
-    """Fit the pose (7,), overwritten, to all assigned points, three at least.
-
-    Returns:
-        Number of assigned points, sum of squared residuals and largest of them [m^2].
-    """
+    """Fit the pose to all assigned points; their number, and sum and largest of their squares [m^2]."""
     target, count = np.full_like(positions, np.nan), 0
     for marker in range(len(positions)):
         if assignment[marker] >= 0:
@@ -312,7 +308,6 @@ def predict_pose(
     Args:
         pose: Pose now (7,).
         velocity: Linear [m/s] and angular [rad/s] velocity in world axes (6,).
-        seconds: Time [s].
     """
     later = pose.copy()
     later[:3] += seconds * velocity[:3]

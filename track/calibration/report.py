@@ -90,15 +90,7 @@ def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
 def _learned(
     squares: NDArray[np.float64], variances: NDArray[np.float64], axes: int, spread: float, usual: float
 ) -> float:
-    """A spread [m] of offsets from zero.
-
-    Args:
-        squares: Estimated offsets, squared, summed over the axes (M,) [m^2].
-        variances: Their posterior variances, summed over the axes (M,) [m^2].
-        axes: Number of axes.
-        spread: The spread before [m].
-        usual: Of gloves [m].
-    """
+    """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
     return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
 

@@ -179,10 +179,8 @@ def displace_markers(
 
     Args:
         worn: The glove as designed.
-        shape: The hand's shape.
         distance: Length of each marker's displacement, in a random direction [m].
         lift: Standard deviation of its height above the skin [m].
-        rng: Source of all randomness.
     """
     steps = rng.normal(size=worn.points.shape)
     steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
@@ -229,7 +227,6 @@ def project_onto_skin(
     Args:
         coordinates: Where to begin.
         targets: The points, in the wrist's frame [m].
-        skin: The hand's skin.
     """
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)

@@ -40,11 +40,9 @@ def levenberg_marquardt(
     """Minimize the energy until it hardly falls, or `most` steps have been made.
 
     Args:
-        problem: The data.
         estimate: Where to start.
         steps: Number of steps made before.
         most: Number of the last step, at most.
-        progress: Called after each step.
         small_gain: Share of the energy; a step that gains less is the last one.
 
     Returns:
@@ -81,7 +79,6 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 
     Args:
         right: A right hand in the same glove.
-        problem: The data.
         estimate: Shape and markers.
     """
     shape = shape_at(problem.shape, estimate.parameters)
@@ -94,7 +91,6 @@ def eliminate_poses(
     """Schur complement of the poses.
 
     Args:
-        equations: Normal equations of all unknowns.
         damping: Added to the diagonal of the poses' blocks, as a share of it.
 
     Returns:

@@ -55,9 +55,7 @@ class Improvement:
 
     Args:
         layout: Where to begin.
-        rig: The cameras.
         keep: Names of markers that stay where they are.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin of somebody, or a name to keep is none of the layout's.
@@ -97,12 +95,7 @@ class Improvement:
             self._take(self._shrunk())
 
     def search(self, seconds: float, told: Callable[[Worth], None]) -> None:
-        """Move markers while time lasts.
-
-        Args:
-            seconds: How long [s].
-            told: Called after every step.
-        """
+        """Move markers while time lasts."""
         places, until = self._columns.places, time.monotonic() + seconds
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
         while free and time.monotonic() < until:
@@ -281,8 +274,6 @@ def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
     """Label a layout with the network for any layout, without verification by a pose, and count.
 
     Args:
-        people: Who wears it.
-        layout: Its columns.
         seed: Of losses and ghosts: the same for layouts that are compared.
     """
     network = shipped_network()

@@ -66,7 +66,6 @@ def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
 
     Args:
         places: Markers of a layout.
-        model: A hand.
 
     Returns:
         Infinite with fewer than three markers on the palm, or three in a line.

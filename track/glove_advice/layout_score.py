@@ -57,8 +57,6 @@ def score_layout(
     """Label and count what a rig sees of gloved hands.
 
     Args:
-        layout: The glove.
-        hands: Hands that wear it.
         labeler: A labeler of this layout; `train.any_layout.layout_labeler.LayoutLabeler` needs no training.
         rng: Order of points, and the random parts of the paper's recipe.
     """

@@ -39,10 +39,7 @@ def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: b
     """Write the page: one HTML file with its pictures inside.
 
     Args:
-        path: The file.
-        score: What is known of the layout.
         seen_by: Whose motion was seen by which rig, in words.
-        trained: Whether the labeler was trained on the layout.
     """
     layout, frames = score.layout, score.observed.num_frames
     sections = [
@@ -176,7 +173,6 @@ def draw_joints(figure: Figure, hand: FlatHand, joints: Float[np.ndarray, "20"])
 
     Args:
         figure: Where to draw, of `SIZE`.
-        hand: Hand and markers.
         joints: Standard deviation of each joint [rad].
     """
     from matplotlib.cm import ScalarMappable

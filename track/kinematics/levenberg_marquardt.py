@@ -46,7 +46,6 @@ def levenberg_marquardt(
     """Bring a pose to a minimum of its cost.
 
     Args:
-        hand: The hand and its glove.
         target: Markers in the world [m]; NaN where missing.
         qpos: Pose to start from, overwritten.
         prior_mean: Mean of the prior, a pose.
@@ -54,9 +53,7 @@ def levenberg_marquardt(
             [1/rad^2, 1/m^2, 1/rad^2]; zero where there is no prior.
         robust_scale: Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for
             plain least squares.
-        most_steps: Steps at most.
         small_gain: Expected decrease of the cost from which on a step is the last one.
-        work: Buffers, overwritten.
 
     Returns:
         The cost (squared standard deviations), and how many steps were tried.
@@ -95,9 +92,7 @@ def marker_residuals(
     """Forward kinematics, and the residuals of the markers in the wrist's frame.
 
     Args:
-        hand: The hand and its glove.
         target: Markers in the world [m]; NaN where missing.
-        qpos: The pose.
         work: Filled as by `compute_markers`, and `residuals` too.
     """
     compute_markers(hand, qpos[7:], work)
@@ -184,13 +179,7 @@ def _linearize(
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
     """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
 
-    Args:
-        skyline: First column of each row, see `HandArrays`.
-        damping: Share of the diagonal that is added to it.
-        work: `normal` and `gradient` are read.
-
-    Returns:
-        The expected decrease of the cost; a negative number when the matrix has no factor.
+    Returns the expected decrease of the cost; a negative number when the matrix has no factor.
     """
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):

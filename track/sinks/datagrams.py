@@ -99,8 +99,6 @@ class DatagramSink:
     """Sends datagrams to one address and never waits: what the network does not take is dropped and counted.
 
     Args:
-        host: Name or address of the receiver.
-        port: Its UDP port.
         header: Makes the datagram of a header.
         frame: Makes the datagram of a frame.
 
@@ -159,9 +157,6 @@ def document_sink(host: str, port: int, encode: Encode, *, points: bool) -> Data
     """A sink of documents.
 
     Args:
-        host: Name or address of the receiver.
-        port: Its UDP port.
-        encode: Makes bytes of a document.
         points: Whether the points are sent too.
 
     Raises:

@@ -112,11 +112,7 @@ def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, t
 
 
 def _frame_at(recording: Recording, time: float, name: str) -> int:
-    """The frame that is nearest to a time [s].
-
-    Raises:
-        ArgumentError: The time lies outside.
-    """
+    """The frame that is nearest to a time [s]; an `ArgumentError` if it lies outside."""
     begin, end = float(recording.times[0]), float(recording.times[-1])
     nearest = int(np.argmin(np.abs(recording.times - time)))
     if not begin - _ROUNDED <= time <= end + _ROUNDED:
@@ -176,8 +172,6 @@ def show_recording(
     """Put a recording into a page, with its timeline.
 
     Args:
-        server: Where the page is.
-        recording: What is shown.
         corrector: Where its labels can be corrected: the tracked take that the recording shows.
         first: The frame that is shown first.
 

@@ -28,7 +28,6 @@ class Corrector:
 
     Args:
         path: The take's file; the corrections beside it are read.
-        take: What is in it.
 
     Raises:
         CaptureError: The corrections cannot be read, or cannot be meant for this take.
@@ -76,7 +75,6 @@ class Corrector:
 
         Args:
             frame: A frame in which the point is there.
-            column: Its column in that frame.
             span: The first and the last frame in which the label is right.
             label: Name of its marker, or `NO_MARKER`.
 

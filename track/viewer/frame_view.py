@@ -28,12 +28,7 @@ _RAY_COLOR: Final = (235, 170, 60)
 
 
 class FrameView:
-    """The scene of a recording, with switches of what is shown.
-
-    Args:
-        server: Where the page is.
-        recording: What is shown.
-    """
+    """The scene of a recording, with switches of what is shown."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording = server, recording

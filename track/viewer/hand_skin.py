@@ -28,7 +28,6 @@ class HandSkin:
     So a hand that moves as a whole sends two small messages, and a bone that keeps its place none.
 
     Args:
-        server: Where the page is.
         name: Of the node in the scene.
         color: Of the skin, 0 to 255; that of the hand's side when None.
         opacity: Less than 1 for skin that one sees through.

@@ -26,9 +26,6 @@ class LabelEditor:
     """The folder of the panel in which labels are corrected, and a halo around the chosen point.
 
     Args:
-        server: Where the page is.
-        recording: What is shown.
-        corrector: The take that it shows.
         changed: Called when the take has changed.
     """
 

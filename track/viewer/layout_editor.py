@@ -33,10 +33,7 @@ class LayoutEditor:
     """The markers of a layout on one hand.
 
     Args:
-        server: Where the page is.
-        path: The layout's file.
         layout: What it says.
-        model: The hand.
         out: Where the changed layout is saved.
     """
 

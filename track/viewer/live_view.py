@@ -29,12 +29,7 @@ _TEXT_EVERY: Final = 0.2  # [s]
 
 
 class LiveRecording(Recording):
-    """The frames of a tracker that runs: there is only the newest one.
-
-    Args:
-        tracker: The tracker.
-        rig: The cameras, where they are known.
-    """
+    """The frames of a tracker that runs: there is only the newest one."""
 
     def __init__(self, tracker: Tracker, rig: CameraRig | None = None) -> None:
         self._hands = tracker.hands
@@ -77,13 +72,7 @@ class LiveRecording(Recording):
 
 
 class LiveView:
-    """Shows the newest frame of a tracker from a thread of its own; frames in between are left out.
-
-    Args:
-        server: Where the page is.
-        tracker: The tracker.
-        rig: The cameras, where they are known.
-    """
+    """Shows the newest frame of a tracker from a thread of its own; frames in between are left out."""
 
     def __init__(self, server: ViserServer, tracker: Tracker, rig: CameraRig | None = None) -> None:
         self._server, self._recording = server, LiveRecording(tracker, rig)

@@ -36,9 +36,7 @@ class PointBalls:
     """Up to `most` balls at once, all in one message a frame.
 
     Args:
-        server: Where the page is.
         name: Of the node in the scene.
-        label_names: Name of each label.
         most: Number of balls.
         radius: Of a ball [m].
     """

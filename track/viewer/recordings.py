@@ -68,14 +68,9 @@ class Recording(ABC):
 
     Args:
         times: Time of each frame [s], increasing.
-        label_names: Name of each label.
         most_points: The largest number of points in a frame.
-        radius: Radius of a marker [m].
         bodies: The rigid bodies, in the order of `ShownFrame.bodies`.
-        rig: The cameras, where they are known.
-        curves: What to plot over time.
         doubts: Spans of frames that deserve a look, the most doubtful first.
-        has_hands: Whether there are hands in any frame.
         has_filled: Whether there are points that were not seen.
     """
 
@@ -112,7 +107,6 @@ class TakeRecording(Recording):
     """A take: labels, poses and status as they were simulated or tracked.
 
     Args:
-        take: The take.
         rig: The cameras; those that the take names, if they come with handsim, when None.
     """
 
@@ -191,12 +185,7 @@ def rig_of_settings(rig: object) -> CameraRig | None:
 
 
 class CaptureRecording(Recording):
-    """A marker file: named trajectories in color, the others gray.
-
-    Args:
-        capture: The file's content.
-        rig: The cameras, where they are known.
-    """
+    """A marker file: named trajectories in color, the others gray."""
 
     def __init__(self, capture: Capture, rig: CameraRig | None = None) -> None:
         self._positions = capture.positions

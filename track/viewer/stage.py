@@ -27,7 +27,6 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
     """Light, ground and the first look at some points [m]; NaN points are left out.
 
     Args:
-        server: Where the page is.
         points: What shall be in view.
         ground: Height of the ground [m]; below the points when None.
     """
@@ -76,8 +75,6 @@ def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> Non
     """The cameras as frusta, each with its number on the first one's side.
 
     Args:
-        server: Where the page is.
-        rig: The cameras.
         scale: Size of a frustum [m].
     """
     quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
@@ -99,12 +96,7 @@ def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> Non
 
 
 def show_volume(server: ViserServer, rig: CameraRig) -> None:
-    """The cube that wrists move in, and dots that tell how many cameras see a place.
-
-    Args:
-        server: Where the page is.
-        rig: The cameras.
-    """
+    """The cube that wrists move in, and dots that tell how many cameras see a place."""
     center = np.array(ROOM_CENTER)
     server.scene.add_line_segments(
         "/volume", points=box_edges(center - _HALF_SIDE, center + _HALF_SIDE), colors=(40, 120, 60)

@@ -25,10 +25,6 @@ _BEFORE: Final = (150, 150, 150)
 
 class UserView:
     """Hands of a user's file, flat and side by side; lines lead from the designed markers to the real ones.
-
-    Args:
-        server: Where the page is.
-        hands: The user's hands.
     """
 
     def __init__(self, server: ViserServer, hands: Sequence[GloveFit]) -> None:

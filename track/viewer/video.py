@@ -28,7 +28,6 @@ def write_video(
 
     Args:
         path: The file, .mp4.
-        recording: What is shown.
         shown: Points [m] that the view holds.
         write_clip: What draws and encodes the pictures, `render.illustrations.clip.write_clip`.
         progress: Called after each picture with the number of pictures and of all.

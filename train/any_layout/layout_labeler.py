@@ -46,8 +46,6 @@ class LayoutLabeler:
     """Labels a glove that no network was trained on.
 
     Args:
-        layout: The glove.
-        network: The network.
         distances: What the network gets of the layout, see `mean_features`.
         prior: What it knows of hands as wholes.
     """
@@ -67,7 +65,6 @@ class LayoutLabeler:
         """The shipped network with what a few seconds of simulation tell of a layout.
 
         Args:
-            layout: The glove.
             num_poses: Poses from which the layout is known.
             seed: Of those poses.
 
@@ -171,11 +168,6 @@ def sample_worn_markers(
     layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T M 3"]:
     """Markers [m] of right hands in valid poses; every hundred are another person, whose glove has slipped.
-
-    Args:
-        layout: The glove.
-        num_frames: Number of poses.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin.

@@ -54,7 +54,6 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
     """The labeler of a glove, learned within a minute the first time and read within a second from then on.
 
     Args:
-        layout: The glove.
         rig: Cameras that see it while it is learned.
 
     Raises:
@@ -127,10 +126,8 @@ def fine_tuned_labeler(
     """A labeler for any layout that has learned more of this one.
 
     Args:
-        layout: The glove.
         rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
         num_clouds: Clouds to learn from, of two thirds as many frames.
-        seed: Of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin.

@@ -87,7 +87,6 @@ def draw_batch(
     Args:
         rows: Rows of a training set, see `train.data.shards.row_dtype`.
         recipe: Size of the batch, and how to corrupt it.
-        rng: Source of all randomness.
     """
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)

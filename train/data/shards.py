@@ -305,11 +305,7 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
 
 
 def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """A memory-mapped list of records of this type.
-
-    Raises:
-        DatasetError: The file holds something else.
-    """
+    """A memory-mapped list of records of this type; a `DatasetError` if the file holds something else."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)

@@ -41,10 +41,8 @@ class TrainedSetLabeler:
     """The set labeler with weights, ready to use.
 
     Args:
-        config: Size of the network.
         weights: Its weights; later changes of them have no effect.
         prior: What it knows of hands as wholes.
-        marker_names: Markers in label order.
     """
 
     def __init__(
@@ -112,7 +110,6 @@ class CloudScorer:
     """Scores of one cloud without padding.
 
     Args:
-        config: Size of the network.
         weights: Its weights, of the names and shapes of `weight_shapes`.
     """
 
@@ -219,15 +216,7 @@ def _score(
     rounds: _Rounds,
     ends: _Ends,
 ) -> tuple[Floats, Floats]:
-    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels.
-
-    Args:
-        points: Points [m].
-        centers: Distances around which the bumps stand [m].
-        sharpness: Of the bumps, -0.5 over their squared width [1/m^2].
-        rounds: Weights of the rounds.
-        ends: Weights of the other layers.
-    """
+    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels; bumps stand around `centers` [m]."""
     count, width = len(points), ends.embed.weight.shape[2]
     bits = np.empty(max(len(centers) * count * count, 2 * width * count), dtype=np.int32)
     scale = bits.view(np.float32)

@@ -186,11 +186,7 @@ def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _check_shapes(tensors: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse tensors that are not those of a network.
-
-    Raises:
-        ValueError: One lacks, is too many, or has another shape.
-    """
+    """Refuse tensors that are not those of a network, by a `ValueError`."""
     for name, shape in expected.items():
         if name not in tensors:
             raise ValueError(f"it lacks {name}")

@@ -133,11 +133,9 @@ def _shortest_path(
 ) -> tuple[float, int, int, int]:
     """The shortest path by reduced costs from a point to a free label, or to a point that may be a ghost.
 
-    The last four arrays are overwritten: length to each label, the point before it, whether it was reached,
-    and the reached labels in their order.
-
-    Returns:
-        Its length, the number of reached labels, the free label or -1, and the point that is a ghost then.
+    Returns its length, the number of reached labels, the free label or -1, and the point that is a ghost
+    then. The last four arrays are overwritten: length to each label, the point before it, whether it was
+    reached, and the reached labels in their order.
     """
     shortest[:] = np.inf
     reached[:] = False

@@ -67,7 +67,6 @@ def draw_hand(
 
     Args:
         figure: Where to draw, of `HAND_SIZE`.
-        hand: Hand and markers.
         names: Markers in label order.
         accuracy: Slot accuracy of each, 0 to 1.
         arrows: From what points are to what they were called, the most frequent first.
@@ -164,7 +163,6 @@ def place_names(
     """Centers of the names [points], each placed in turn where it overlaps least with what is there.
 
     Args:
-        names: What to write.
         dots: Markers [points].
         curves: Points along the arrows [points].
         size: Width and height of the picture [points].

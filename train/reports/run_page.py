@@ -29,7 +29,6 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: Re
     Args:
         out: The run's folder; an older page there is replaced.
         card: The run's model card, see `train.loop.train_labeler`.
-        history: Loss and accuracy over the run.
         report: Evaluation on held-out frames with the paper's corruption.
 
     Returns:

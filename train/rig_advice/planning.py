@@ -65,8 +65,6 @@ def view_candidates(
     """Cast the lines of sight from every marker to every candidate, once for candidates at one position.
 
     Args:
-        scenes: Hands at work.
-        candidates: The cameras.
         rng: Source of visible spots, and of the marker-frames whose error is looked at.
     """
     centers_of = np.stack([one.T_world_camera[:3, 3] for one in candidates])
@@ -90,7 +88,6 @@ class Planning:
     """Cameras chosen among candidates.
 
     Args:
-        views: What each candidate sees.
         positions: Where each is [m].
         kept: Candidates that are chosen before and stay.
     """
@@ -261,14 +258,9 @@ def plan(
     Args:
         num_cameras: Cameras of the rig, with those that are kept.
         room: Width, depth and height of the room or truss [m].
-        mounts: What cameras can hang on.
-        layout: The glove.
         center: Middle of the volume that hands work in [m].
-        sides: Its sides [m].
         camera: What every new camera is, but for its pose.
         kept: Cameras that stay.
-        name: Of the rig.
-        told: Called with what is going on.
         seed: Of people and motion.
 
     Raises:

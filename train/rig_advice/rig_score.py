@@ -93,10 +93,8 @@ def score_rig(
     """Forecast what a rig makes of hands at work, without each of its cameras too.
 
     Args:
-        rig: The cameras.
         work: Scenes of each kind of work.
         center: Middle of the volume that is mapped [m].
-        sides: Its sides [m].
         seed: Of what is random in seeing and losing.
 
     Raises:
@@ -244,9 +242,6 @@ def map_volume(
 
     Args:
         scenes: Whose hands, and their poses.
-        rig: The cameras.
-        center: Middle of the volume [m].
-        sides: Its sides [m].
         rng: Chooses the poses.
     """
     points = cube_points(center, sides, GRID)

@@ -63,11 +63,6 @@ def simulate_calibration(
 ) -> Take:
     """What cameras see of a user who makes a calibration capture with one hand or both.
 
-    Args:
-        hands: One or two hands in their gloves.
-        config: What the user does.
-        rng: Source of all randomness.
-
     Raises:
         ArgumentError: There are no hands or more than two.
         PoseError: A hand finds no way from its touches to free motion.
@@ -83,11 +78,6 @@ def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
     """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
-
-    Args:
-        hands: One or two hands in their gloves.
-        config: What the user does.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There are no hands or more than two.
@@ -112,9 +102,7 @@ def calibration_angles(
     """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
 
     Args:
-        model: The hand.
         config: How many rounds, and how long the free motion is.
-        rng: Source of all randomness.
 
     Raises:
         PoseError: This hand finds no way from its touches to free motion.

@@ -68,14 +68,12 @@ def sample_frame_scene(
     """A random scene that fills a number of rows; where the hands cannot do it, one of a hand alone.
 
     Args:
-        models: A person's left and right hand.
         num_rows: Rows to fill; two hands share them.
         scenes: How often each kind of scene is drawn.
         poses: How single hands are posed.
         volume: Half side of the cube the wrist is in [m].
         sampler: Draws the poses of single hands instead.
         redrawn: Counts the scenes that became one of a hand alone, by reason.
-        rng: Source of all randomness.
     """
     shares = np.array(dataclasses.astuple(scenes))
     kind = int(rng.choice(len(shares), p=shares / shares.sum()))

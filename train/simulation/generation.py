@@ -113,12 +113,10 @@ def make_dataset(
     """As `generate_dataset`.
 
     Args:
-        config: What to make.
         out: Folder to make it in; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. A set
             there may have fewer frames and must have the same settings else.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
-        progress: Called after every shard.
 
     Returns:
         The manifest, which is also the file `manifest.json` beside the `.npy` shards; `Dataset(out)` reads

@@ -79,10 +79,8 @@ def sample_scene_motion(
     """Random motion of a right and a left hand, and of the object that the right hand holds.
 
     Args:
-        kind: What the hands do.
         fits: A right and a left hand in their gloves.
         num_frames: Frames at `RATE`.
-        rng: Source of all randomness.
 
     Raises:
         PoseError: These hands cannot do this: they do not grasp the object, say.

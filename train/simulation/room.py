@@ -31,9 +31,7 @@ def record_take(
     Args:
         scene: What moves: T frames of one or more gloved hands and perhaps an object.
         rig: C cameras around them.
-        config: Noise, losses, strays and mirror images.
         settings: Kept in the take as they are.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: A camera stands in the hands.
@@ -54,12 +52,8 @@ def pack_take(
     """A take of points triangulated from light sources, in columns and with IDs that do not tell the marker.
 
     Args:
-        scene: What moves.
         sources: What shines.
-        rig: The cameras.
-        config: Noise and losses.
         settings: Kept in the take as they are.
-        rng: Source of all randomness.
     """
     optics = config.optics
     found = reconstruct(

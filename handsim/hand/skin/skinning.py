@@ -22,7 +22,6 @@ def skin_frames(
 
     Args:
         points: Rest positions, in the frame of `rest_transforms` [m].
-        bone_indices: The bones that move each point.
         bone_weights: Their shares in descending order; the first zero ends a point's list.
         rest_transforms: Bones at rest.
         transforms: Bones in every frame, in any one frame of reference.

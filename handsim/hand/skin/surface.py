@@ -183,12 +183,7 @@ def vertex_normals(
 
 @kernel
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """See `vertex_normals`; zero for a vertex without faces.
-
-    Args:
-        vertices: Positions (V, 3) [m].
-        faces: Triangles (F, 3).
-    """
+    """See `vertex_normals`; zero for a vertex without faces."""
     normals = np.zeros_like(vertices)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

@@ -48,7 +48,6 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
     """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them.
 
     Args:
-        camera: The stream's camera.
         T_world_device: Pose of what the sample's cameras are fixed to.
     """
     K, lens = camera.K, camera.lens
