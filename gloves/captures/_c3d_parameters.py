@@ -42,12 +42,7 @@ class Parameters:
 
     @staticmethod
     def parse(data: bytes, start: int, tell: Tell) -> Parameters:
-        """Read the records from byte `start`; nothing outside the file is ever touched.
-
-        Args:
-            data: The file, of at least one block.
-            start: Where the parameter section begins.
-            tell: Called where the last record points behind the section.
+        """Read the records from byte `start` of a file of at least one block; nothing outside it is touched.
 
         Raises:
             CaptureError: The section makes no sense, or a parameter of points is damaged.

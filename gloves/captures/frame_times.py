@@ -70,13 +70,9 @@ def check_same_rate(name: str, rate: float, other_name: str, other: float) -> No
 def timed_positions(
     positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, tell: Callable[[str], None]
 ) -> tuple[Float[np.ndarray, "T N 3"], float]:
-    """Positions of all frames from the first to the last, and their rate [Hz].
+    """Positions of all frames from the first to the last [m], and their rate [Hz].
 
-    Args:
-        positions: Of the frames that are there [m].
-        stated: What the file says of their times.
-        tell: Called with a sentence where frames are missing, which are NaN, or where the rate is stated
-            by the times alone.
+    Frames that are missing are NaN, and told, as is a rate that is stated by the times alone.
 
     Raises:
         CaptureError: Rate, times and numbers contradict each other, or there are fewer frames than stated.

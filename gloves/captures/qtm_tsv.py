@@ -34,10 +34,7 @@ _UNIT: Final = "mm"  # the only one that QTM writes
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers in the bytes of a Qualisys TSV with 3D data.
-
-    Args:
-        tell: Called with a sentence where frames are missing, or there are more than stated.
+    """The markers in the bytes of a Qualisys TSV with 3D data; frames that are missing or too many are told.
 
     Raises:
         CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.

@@ -46,10 +46,8 @@ _KEYS: Final = (
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a TRC file.
 
-    Args:
-        data: The file. Cells are separated by tabs, or by commas or semicolons where the first line is.
-        tell: Called with a sentence for what is suspicious: missing frames, or a rate that only the column of
-            times states.
+    Cells are separated by tabs, or by commas or semicolons where the first line is. Missing frames are told,
+    and a rate that only the column of times states.
 
     Raises:
         CaptureError: Not a TRC, header or last row cut, unknown units, a cell that is not a number, or rate,

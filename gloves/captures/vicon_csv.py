@@ -48,9 +48,7 @@ def vicon_sections(lines: list[bytes]) -> dict[str, int]:
 def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The trajectories in the bytes of a Vicon CSV, labeled or not.
 
-    Args:
-        data: The file; its cells are separated by commas, semicolons or tabs.
-        tell: Called with a sentence where no unit of length is stated, or frames are missing.
+    Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
 
     Raises:
         CaptureError: Not such an export, without trajectories, cut, or with a cell that is not a number.

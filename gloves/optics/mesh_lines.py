@@ -13,14 +13,9 @@ _PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes a
 
 @kernel
 def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
-    """Refit every box to its triangles; written out, because loops over axes take longer.
+    """Refit every box (N, 6) [m] to its triangles; written out, because loops over axes take longer.
 
-    Args:
-        vertices: The mesh (V, 3) [m].
-        skip: `MeshTree.skip` (N,).
-        spots: `MeshTree.spots`, the vertices of the leaves.
-        start: `MeshTree.spots_start` (N + 1,).
-        boxes: Low and high corner of each node (N, 6) [m], overwritten.
+    `skip`, `spots` and `start` are those of the `MeshTree`, the vertices those of the mesh (V, 3) [m].
     """
     for back in range(len(skip)):
         node = len(skip) - 1 - back

@@ -24,15 +24,10 @@ def free_rays(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which straight lines from marker to camera meet no capsule.
+    """Which straight lines from marker to camera, in the world [m], meet no capsule.
 
-    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than
-    its radius, so one distance between two segments decides it.
-
-    Args:
-        markers: Marker centers in the world [m].
-        cameras: Camera positions in the world [m].
-        segments: Both ends of every capsule's axis in the world [m].
+    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than its
+    radius, so one distance between two segments decides it.
     """
     free = np.ones((*markers.shape[:2], len(cameras)), dtype=np.bool_)
     _keep_free(markers, cameras, segments, radii, free)

@@ -63,10 +63,7 @@ def interrupt_flag(*, again: bool = True) -> Iterator[InterruptFlag]:
     """Within the block the first signal to end raises nothing; the yielded flag says whether it came.
 
     An exception from a signal can be lost: compiled code that calls back into Python swallows it. Only the
-    main thread gets signals; in other threads the flag stays down.
-
-    Args:
-        again: Whether a second signal raises.
+    main thread gets signals; in other threads the flag stays down. A second signal raises where `again`.
     """
     flag = InterruptFlag(again=again)
     with _handled(flag.note, ENDING):

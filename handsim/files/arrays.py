@@ -56,11 +56,7 @@ def check_members(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array in an `.npy`, whose header must state exactly its bytes.
-
-    Args:
-        file: At its beginning; read up to the end of the header.
-        size: Number of its bytes.
+    """Shape and type of the array in an `.npy` of `size` bytes, whose header must state exactly these.
 
     Raises:
         ValueError: It does not, or the array holds Python objects.

@@ -13,10 +13,9 @@ _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
-    """Refuse work that the disk has no space for.
+    """Refuse work that the disk has no space for; the folder need not exist yet.
 
     Args:
-        folder: Where files will be; it need not exist yet.
         needed: Bytes still to be written.
         what: What needs them, for the message, in the plural.
         remedy: What to do beside freeing space, as in `ask for fewer frames`.
@@ -33,16 +32,7 @@ def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type
 
 
 def check_memory(needed: int, what: str, remedy: str) -> None:
-    """Refuse work that the machine has no memory for.
-
-    Args:
-        needed: Bytes that will be held at a time.
-        what: What needs them, for the message, in the plural.
-        remedy: What to do, as in `ask for fewer frames`.
-
-    Raises:
-        ArgumentError: The machine has less than that free.
-    """
+    """Refuse work that the machine has no memory for by an `ArgumentError`; words as for `check_free`."""
     free = available_bytes()
     if needed > free:
         raise ArgumentError(

@@ -89,14 +89,7 @@ def bounding_spheres(
     centers: Float[np.ndarray, "K 3"],
     sizes: Float[np.ndarray, "K"],
 ) -> None:
-    """Write the bounding spheres of one frame's capsules.
-
-    Args:
-        segments: Both ends of every axis (K, 2, 3) [m].
-        radii: Capsule radii (K,) [m].
-        centers: Where the spheres' centers go (K, 3) [m].
-        sizes: Where the spheres' radii go (K,) [m].
-    """
+    """Write the bounding spheres of one frame's capsules: centers (K, 3) and sizes (K,), their radii [m]."""
     for k in range(len(radii)):
         squared = 0.0
         for i in range(3):

@@ -107,14 +107,7 @@ class HandModel:
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
-    """A hand as it is, of a shape, or a right one of a size by its name.
-
-    Args:
-        model: The hand, its measures [m], or XS, S, M, L or XL.
-
-    Raises:
-        ArgumentError: It is none of these.
-    """
+    """A hand as it is, of measures, or a right one of size XS, S, M, L or XL; else an `ArgumentError`."""
     if isinstance(model, HandModel):
         return model
     if isinstance(model, HandShape):

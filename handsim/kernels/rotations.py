@@ -14,15 +14,7 @@ from handsim.kernels.kernel import kernel
 
 @kernel
 def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float, y: float, z: float) -> None:
-    """Write the rotation matrix of a unit quaternion.
-
-    Args:
-        matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
-        w: Real part.
-        x: First imaginary part.
-        y: Second imaginary part.
-        z: Third imaginary part.
-    """
+    """Write the rotation of a unit quaternion to the upper left 3x3 block of a matrix or transform."""
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = (
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),

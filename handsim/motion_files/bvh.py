@@ -37,14 +37,7 @@ _POSITIONS: Final = "Xposition Yposition Zposition"
 
 
 def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things.
-
-    Args:
-        motion: What to write, at a steady rate.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write hands and things, of a motion at a steady rate; an `OSError` if the file cannot be written."""
     turn = file_axes(up)
     columns = [np.zeros((len(motion.times), 6))]
     lines = [f"ROOT {ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]

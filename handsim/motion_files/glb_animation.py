@@ -86,7 +86,7 @@ class _Scene:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
-        """The whole file."""
+        """The whole file, of JSON without its arrays; an `ArgumentError` if a .glb cannot be so large."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": f"handsim {__version__}"},
             "scene": 0,

@@ -101,10 +101,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as text, UTF-8, with nine digits.
-
-    Args:
-        up: Of no effect: the axes are the take's.
+    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is.
 
     Raises:
         OSError: The file cannot be written.
@@ -122,10 +119,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as Apache Parquet.
-
-    Args:
-        up: Of no effect: the axes are the take's.
+    """Write the table as Apache Parquet, in the take's axes whatever `up` is.
 
     Raises:
         OSError: The file cannot be written.
@@ -162,10 +156,7 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
 
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the angles of all hands.
-
-    Args:
-        up: Of no effect: the axes are the take's.
+    """Write the angles of all hands, in the take's axes whatever `up` is.
 
     Raises:
         OSError: The file cannot be written.

@@ -36,10 +36,7 @@ def corner_normals(
 def split_vertices(
     faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
 ) -> tuple[Int[np.ndarray, "W"], Float[np.ndarray, "W 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices with one normal each.
-
-    Args:
-        normals: The normals at their corners.
+    """Vertices with one normal each, from triangles with one at each corner.
 
     Returns:
         The old vertex of each new one, its normal, and the triangles of the new ones.

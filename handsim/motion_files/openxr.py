@@ -46,14 +46,7 @@ _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the joints of all hands.
-
-    Args:
-        path: A .json file, by custom `.openxr.json`.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the joints of all hands as JSON, by custom to a name that ends in `.openxr.json`."""
     tracks = tuple(posed_hands(motion))
     header = {
         "format": "XR_EXT_hand_tracking joints by handsim",

@@ -69,11 +69,8 @@ def sample_two_hand_motion(
 ) -> tuple[HandMotion, HandMotion]:
     """Random smooth motion of two hands through a series of interactions, valid at every frame.
 
-    Args:
-        right: A right hand.
-        left: A left hand; it may be another person's.
-        duration: How long [s]; each motion has `round(duration * rate) + 1` frames.
-        interactions: Names out of `INTERACTIONS`; all of them when not given.
+    It has `round(duration * rate) + 1` frames, and the interactions are all of `INTERACTIONS` when not given.
+    The left hand may be another person's.
 
     Raises:
         ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
@@ -98,14 +95,7 @@ def sample_two_hand_motion(
 def sample_two_hand_poses(
     right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
-    """Single poses of two hands that touch or nearly do, each drawn on its own, all valid.
-
-    Args:
-        right: A right hand.
-        left: A left hand; it may be another person's.
-
-    Returns:
-        qpos of the right hand and of the left one.
+    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid.
 
     Raises:
         ArgumentError: The count is not positive, or the hands are not a right and a left one.

@@ -114,9 +114,6 @@ def object_penetration(
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch.
 
-    Args:
-        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad].
-
     Raises:
         ArgumentError: The arrays have different numbers of frames, or another shape.
     """

@@ -58,8 +58,7 @@ def sample_object_motion(
 ) -> tuple[HandMotion, BodyMotion]:
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
-    Args:
-        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
+    It has `round(duration * rate) + 1` frames.
 
     Raises:
         ArgumentError: The duration is not positive.

@@ -70,14 +70,10 @@ def motion_through(
     *,
     rng: np.random.Generator,
 ) -> HandMotion:
-    """Smooth motion of one hand from each of the given poses to the next, valid at every frame.
+    """Smooth motion of one hand from each of the given poses [rad] to the next, valid at every frame.
 
     It begins in the first pose and rests for a moment at each later one; durations and the wrist's path are
-    random.
-
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        poses: Joint angles [rad], at least two poses.
+    random. A shape or the name of a size is a right hand.
 
     Raises:
         ArgumentError: There are fewer than two poses, or one is not valid on this hand.

@@ -62,11 +62,9 @@ class ThumbContact:
 def thumb_contact(
     model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
 ) -> ThumbContact:
-    """The nearest points of thumb and finger, touching or not.
+    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not.
 
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        finger: "index", "middle", "ring" or "little".
+    A shape or the name of a size is a right hand.
 
     Raises:
         ArgumentError: There is no such finger, or `angles` is not (T, 20).
