@@ -16,7 +16,6 @@ from train.any_layout.layout_labeler import (
     save_layout_network,
     shipped_network,
 )
-from train.any_layout.learned_gloves import fine_tuned_labeler
 from train.data.augmentation import Corruption
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
@@ -51,9 +50,7 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     assert equal.mean() > 0.97  # the two know the layout from other poses
 
 
-def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 192, "seed": 0})
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, quickly_learned):
     layout = load_layout("starter6")
     layout.save(tmp_path / "mine.toml")
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):

@@ -15,20 +15,15 @@ from train.data.augmentation import Corruption
 from train.evaluate import evaluate_labeler
 from train.labelers.storage import learned_folder
 
+pytestmark = pytest.mark.usefixtures("own_cache")
 CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
-
-
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 64, "seed": 0})
 
 
 def never(*_args, **_options):
     raise AssertionError("it was learned again")
 
 
-def test_a_glove_is_learned_once(monkeypatch):
+def test_a_glove_is_learned_once(quickly_learned, monkeypatch):
     layout = load_layout("starter6")
     assert not is_learned(layout)
     first = learned_labeler(layout)
@@ -43,7 +38,7 @@ def test_a_glove_is_learned_once(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_damaged_file_is_learned_anew():
+def test_a_damaged_file_is_learned_anew(quickly_learned):
     layout = load_layout("starter6")
     learned_labeler(layout)
     (file,) = learned_folder().iterdir()
@@ -53,14 +48,14 @@ def test_a_damaged_file_is_learned_anew():
 
 
 @pytest.mark.slow
-def test_the_least_recently_used_go(monkeypatch):
+def test_the_least_recently_used_go(quickly_learned, monkeypatch):
     monkeypatch.setattr(learned_gloves, "MOST", 1)
     for name in ("starter6", "tips8"):
         learned_labeler(load_layout(name))
     assert not is_learned(load_layout("starter6")) and is_learned(load_layout("tips8"))
 
 
-def test_a_cache_that_cannot_be_written_costs_no_labels(monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_written_costs_no_labels(quickly_learned, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert learned_labeler(load_layout("starter6")).label_frames([CLOUD])[0].labels.shape == (8,)
@@ -85,7 +80,7 @@ def test_a_glove_of_tips_is_labeled_better_after_some_steps():
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_labeler():
+def test_the_same_seed_gives_the_same_labeler(quickly_learned):
     layout = load_layout("starter6")
     one, other = (fine_tuned_labeler(layout, num_clouds=192, seed=3) for _ in range(2))
     for name, value in one.network.state_dict().items():
