@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.record import describe
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
 from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig

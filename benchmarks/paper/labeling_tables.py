@@ -16,8 +16,8 @@ from rich.table import Table
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from benchmarks.record import Figures, save_figures
+from gloves.captures.capture import count_gaps, run_lengths
 from gloves.captures.formats import find_captures, read_markers
-from gloves.captures.gaps import count_gaps, run_lengths
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError

@@ -14,8 +14,7 @@ from handsim.hand.contact import penetration_depth
 from handsim.hand.mjcf import build_spec
 from handsim.hand.shape import SIZES, HandShape, named_shape
 from handsim.hand.skeleton import Skeleton, bone_transforms, build_skeleton
-from handsim.hand.skin.skinning import skin_frames
-from handsim.hand.skin.surface import HandSurface, build_surface
+from handsim.hand.skin.surface import HandSurface, build_surface, skin_frames
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
 
 if TYPE_CHECKING:

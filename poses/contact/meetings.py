@@ -12,7 +12,7 @@ from handsim.hand.model import HandModel, join_qpos
 from poses.contact.contact_closing import NEAREST, close_fingers, first_contact, smooth_above
 from poses.contact.interactions import Meeting, Sketch, draw_variant, meet, sketch_meeting
 from poses.contact.passages import Passage, TwoHandConfig, join_passages, placed_qpos, valid_frames
-from poses.motion.minimum_jerk import minimum_jerk
+from poses.motion.paths import minimum_jerk
 
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
 _FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]

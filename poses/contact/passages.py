@@ -14,7 +14,7 @@ from handsim._checks import check_number, check_span
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rotation_quaternions
-from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
+from poses.motion.paths import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes.validity import is_valid, sample_valid_angles
 
 MAX_OVERLAP: Final = 0.001

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from handsim._checks import check_number, check_span
-from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
+from poses.motion.paths import PEAK_SPEED, minimum_jerk
 
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""

@@ -24,7 +24,7 @@ from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
 from poses.contact.meetings import draw_poses, play_meeting
 from poses.contact.passages import Passage, TwoHandConfig, join_passages, path_between
-from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
+from poses.motion.paths import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
 
 __all__ = [

@@ -18,9 +18,8 @@ from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_JOINTS
-from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion, with_wrist
-from poses.motion.rest_paths import can_be_left
+from poses.motion.paths import MotionConfig, can_be_left
 from poses.shapes.library import gesture, gestures_of
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import make_valid

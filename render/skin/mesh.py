@@ -15,8 +15,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.skinning import skin_frames
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.skin.surface import skin_frames, vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import quaternion_matrix

@@ -24,7 +24,7 @@ _BEFORE: Final = (150, 150, 150)
 
 
 class UserView:
-    """Hands of a user's file, flat and side by side; lines lead from the designed markers to the real ones."""
+    """Hands of a user's file, flat, side by side; lines lead from the designed markers to the real ones."""
 
     def __init__(self, server: ViserServer, hands: Sequence[GloveFit]) -> None:
         self.before = [nominal_hand(hand) for hand in hands]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from handsim.app.page import Section, write_page
 from handsim.errors import DatasetError
 from handsim.hand.topology import JOINTS, SIDES

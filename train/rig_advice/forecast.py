@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig

@@ -15,9 +15,8 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
 from handsim.space.cameras import CameraRig, as_rig, rig_setting
-from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion
-from poses.motion.rest_paths import can_be_left
+from poses.motion.paths import MotionConfig, can_be_left
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from poses.shapes.library import gesture
 from poses.shapes.touch import FINGERS, touching_angles

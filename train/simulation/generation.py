@@ -24,8 +24,8 @@ from handsim.app.interrupts import Stopped
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import DatasetError, HandSimWarning
-from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
+from handsim.files.outputs import check_free
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES

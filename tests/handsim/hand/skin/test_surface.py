@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 import trimesh
@@ -5,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import (
     ADULTS,
     EVERYBODY,
@@ -16,17 +19,18 @@ from handsim.hand.shape import (
 )
 from handsim.hand.skeleton import build_skeleton
 from handsim.hand.skin.cage_topology import cage_topology
-from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import (
     HandSurface,
     build_surface,
     cage_weights,
     rest_vertices,
+    skin_frames,
     strongest_weights,
     vertex_normals,
 )
-from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES
-from handsim.space.transforms import axis_angle_matrix, euler_matrix
+from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES, NUM_JOINTS
+from handsim.space.transforms import axis_angle_matrix, euler_matrix, random_quaternions
+from tests.handsim.hand.skin.blending import blend_skin
 
 FIST = [[20, 25, 40, 50]] + [[0, 90, 105, 65]] * 4
 SPREAD = [[30, -30, -10, -10], [20, 0, 0, 0], [0, 0, 0, 0], [-14, 0, 0, 0], [-30, 0, 0, 0]]
@@ -336,3 +340,32 @@ def test_strongest_keeps_the_four_largest_in_order():
     assert_allclose(shares[0], np.array([0.4, 0.25, 0.2, 0.1]) / 0.95)
     assert indices[1, 0] == 2
     assert_allclose(shares[1], [1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_every_vertex_agrees_with_plain_skinning(side, rng):
+    model = HandModel(sample_shape(side=side, rng=rng))
+    low, high = model.skeleton.ranges.T
+    qpos = join_qpos(
+        rng.uniform(low, high, size=(7, NUM_JOINTS)),
+        position=rng.uniform(-1.0, 1.0, size=(7, 3)),
+        quaternion=random_quaternions(7, rng=rng),
+    )
+    surface = model.surface
+    rest = (surface.vertices, surface.bone_indices, surface.bone_weights, model.rest_transforms)
+    plain = blend_skin(*rest, model.forward_kinematics(qpos))
+    np.testing.assert_allclose(skin_frames(*rest, model.forward_kinematics(qpos)), plain, atol=1e-14)
+    np.testing.assert_array_equal(model.skin(qpos), skin_frames(*rest, model.forward_kinematics(qpos)))
+
+
+def test_weights_sum_to_one_before_the_first_zero():
+    """The compiled loop ends a vertex's list at the first zero."""
+    weights = HandModel.named("S").surface.bone_weights
+    ended = np.cumsum(weights == 0.0, axis=1) > 0
+    assert ended.any(), "the test needs vertices with fewer than four bones"
+    assert (weights[ended] == 0.0).all()
+
+
+def test_no_frames():
+    model = HandModel.named("S")
+    assert model.skin(join_qpos(np.zeros((0, NUM_JOINTS)))).shape == (0, len(model.surface.vertices), 3)
