@@ -148,10 +148,9 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
-        """Some frames, seen by all cameras, with the people of a shard.
+        """Some frames, seen by all cameras, with the people of a shard and all else that changes with it.
 
         Args:
-            shard: Number of the shard; people change with it, as does all else that does not vary by frame.
             numbered: For each frame its place in the shard, which its random choices depend on, and its
                 number in the take.
             leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;

@@ -90,14 +90,9 @@ def check_poses(
     person: NDArray[Any] | None = None,
     shapes: tuple[HandShape, ...] | None = None,
 ) -> OwnPoses:
-    """A user's arrays as poses.
+    """A user's arrays as poses: (T, 27), (T, H, 27), or (T, 20) without wrists, [m, rad].
 
-    Args:
-        qpos: (T, 27) or, without wrists, joint angles (T, 20) of one hand; (T, H, 27) of several [m, rad].
-        num_hands: Number of hands, H.
-        times: Of the frames (T,), increasing [s]; poses are no motion without them.
-        person: Who is in each frame (T,).
-        shapes: Hands of the people.
+    Times (T,) increase [s], and poses are no motion without them; `person` (T,) is who is in each frame.
 
     Raises:
         ArgumentError: An array has another shape or impossible numbers, or there is no hand in any frame.

@@ -149,12 +149,9 @@ class Studio:
     def photograph(
         self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
     ) -> RenderedFrame:
-        """Draw one moment.
+        """Draw one moment of the studio's hands and bodies, with all other choices.
 
-        Args:
-            moment: Poses of the studio's hands and bodies.
-            choices: All other choices.
-            recorded: Whether the frame has its choices as JSON and the hands' vertices, which take time.
+        Where `recorded`, the frame has its choices as JSON and the hands' vertices, which take time.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.

@@ -39,10 +39,7 @@ def calibrate_take(
 ) -> tuple[Calibration, ...]:
     """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
 
-    Args:
-        take: The take; labels of hands that are tracked count.
-        start: Where to begin, for each side.
-        before: The hands that it was labeled with.
+    Labels of hands that are tracked count. Each side begins with `start`; the take was labeled with `before`.
 
     Raises:
         CalibrationError: No hand is in the take, or it tells too little of one.

@@ -50,16 +50,7 @@ class LabelCounts:
     def add(
         self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
     ) -> Bool[np.ndarray, "M"]:
-        """Count one frame.
-
-        Args:
-            labels: Given label of each point, -1 for a ghost.
-            truth: True label of each point, -1 for a ghost.
-            num_labels: Number of markers M.
-
-        Returns:
-            Which label slots are right.
-        """
+        """Count one frame by given and true labels, -1 for a ghost; which label slots are right."""
         given, true = _slots(labels, num_labels), _slots(truth, num_labels)
         right: np.ndarray = given == true
         slots_right, points_right = int(right.sum()), int((labels == truth).sum())
@@ -153,14 +144,10 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 def error_without(
     confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
 ) -> float:
-    """Share of points labeled wrongly after those of least confidence are left out; NaN when none is kept.
+    """Share of points labeled wrongly after a share of least confidence is left out; NaN when none is kept.
 
     Where only some points of one confidence are left out, the result is the mean over all choices, so that
     the order of the points does not matter.
-
-    Args:
-        confidence: Confidence of each label, 0 to 1.
-        share: Share of the points to leave out, rounded to whole points.
     """
     kept = len(confidence) - round(share * len(confidence))
     if not kept:

@@ -50,9 +50,7 @@ class TrainingState:
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
         """Make one gradient step together with the other devices and return the loss before it.
 
-        Args:
-            batch: The whole batch; each device learns from its part.
-            rng: Source of further randomness, the same on each device.
+        Each device learns from its part of the batch; the rng is the same on each.
 
         Raises:
             TrainingError: The loss is not finite; the state is of no use then.

@@ -43,13 +43,9 @@ def write_clip(
     shown: Float[np.ndarray, "N 3"],
     radius: float,
 ) -> None:
-    """Write a video, whole or not at all.
+    """Write a video (.mp4) of frames with the fields of `ClipFrame`, whole or not at all.
 
-    Args:
-        path: The file, .mp4.
-        frames: The fields of a `ClipFrame` each.
-        shown: Points in the world that the view shows [m].
-        radius: Radius of the points [m].
+    The view shows some points in the world [m]; points of frames have this radius [m].
 
     Raises:
         ArgumentError: The file's name ends otherwise.

@@ -168,13 +168,9 @@ def draw_camera(
     *,
     size: tuple[int, int] = (1100, 900),
 ) -> tuple[Picture, Bool[np.ndarray, "M"]]:
-    """The view of one camera of a rig, zoomed in: seen markers green, hidden ones as red rings.
+    """The view of one camera of a rig, zoomed in, and which markers it sees: seen green, hidden as red rings.
 
-    Args:
-        size: Width and height of the picture without names [px].
-
-    Returns:
-        The picture, and which markers this camera sees.
+    The size [px] is that of the picture without names.
     """
     transforms = fit.model.forward_kinematics(qpos[None])
     markers, normals = fit.attachment.markers(fit.model, transforms)
@@ -215,13 +211,9 @@ def draw_labels(
     *,
     size: tuple[int, int] = (640, 800),
 ) -> Picture:
-    """A frame's points without labels, and beside them with their labels.
+    """A frame's points [m] without labels, and beside them with their labels (-1: a ghost) and the hand.
 
-    Args:
-        hand: The hand behind the points, drawn faintly on the labeled side.
-        points: All points of the frame [m], ghosts among them.
-        labels: Marker of each point in `layout`, -1 for a ghost.
-        size: Width and height of one side without names [px].
+    The size [px] is that of one side without names.
     """
     ghost = labels < 0
     palette = np.concatenate([marker_colors(layout), [HIDDEN_COLOR]])

@@ -89,14 +89,10 @@ def add_lights(
     T_world_camera: Float[np.ndarray, "4 4"],
     extent: float | None = None,
 ) -> None:
-    """Light a pyrender scene that holds its meshes already.
+    """Light a pyrender scene that holds its meshes already; its ambient light is replaced.
 
-    Args:
-        pyrender: The module.
-        scene: The scene; its ambient light is replaced.
-        lighting: What to add.
-        T_world_camera: Pose of the camera whose axes the lamps' directions are in.
-        extent: How large the meshes are together, corner to corner [m]; measured unless given.
+    The lamps' directions are in the axes of the camera; `extent` is how large the meshes are together, corner
+    to corner [m], measured unless given.
     """
     rotation = T_world_camera[:3, :3]
     scene.ambient_light = np.array(lighting.ambient)

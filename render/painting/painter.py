@@ -34,12 +34,9 @@ def choose_painter(choice: PainterChoice) -> Painter:
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors over black (sRGB), and in the fourth channel the covered share of each pixel.
+    """Colors over black (sRGB) by a pinhole camera, and fourth the covered share of each pixel.
 
-    Args:
-        camera: A pinhole camera.
-        lighting: Light in the camera's axes.
-        painter: What paints; both give nearly the same picture.
+    Light is in the camera's axes; both painters give nearly the same picture.
 
     Raises:
         HandSimError: OpenGL is requested and missing on this machine; the message says what to install.

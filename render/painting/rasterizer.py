@@ -53,11 +53,9 @@ def join(surfaces: Sequence[Triangles]) -> Triangles:
 
 
 def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Pictures:
-    """Depth, normals, parts, instances and markers as a pinhole camera sees them.
+    """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
 
-    Args:
-        camera: A pinhole camera; for other lenses see `render.cameras.warp`.
-        surface: A closed surface; the backs of its faces are not drawn.
+    The surface is closed; the backs of its faces are not drawn.
 
     Raises:
         ArgumentError: The camera's lens is not a pinhole.
@@ -89,11 +87,11 @@ def nearest_faces(
 ) -> tuple[Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
     """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
 
+    Faces that run counter-clockwise in the picture, where y is down, are drawn.
+
     Args:
         corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
             as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
-        faces: Triangles that run counter-clockwise in the picture, where y is down, are drawn.
-        size: Width and height of the picture [px].
         farthest: Nearness of nothing.
     """
     nearness = np.full(size[::-1], farthest, dtype=np.float32)

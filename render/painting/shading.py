@@ -57,13 +57,9 @@ def display(light: float, table: NDArray[np.float32]) -> float:
 
 @kernel(inline=True)
 def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float, v: float) -> Any:
-    """Linear color (3), roughness and normal (3) of a texture; bilinear.
+    """Linear color (3), roughness and normal (3) of a texture (h, w, 8) at u, right, and v, up; bilinear.
 
-    Args:
-        texels: Texture (h, w, 8); see `Material.texels`.
-        table: `TO_LINEAR` (256,).
-        u: Texture coordinate to the right.
-        v: Texture coordinate upwards.
+    See `Material.texels`; the table is `TO_LINEAR` (256,).
     """
     rows, columns = texels.shape[:2]
     across = min(max(u * columns - 0.5, 0.0), columns - 1.001)

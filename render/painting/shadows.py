@@ -86,15 +86,9 @@ def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: 
 def lit_share(
     to_map: NDArray[np.float64], nearest: NDArray[np.float32], bias: float, x: float, y: float, z: float
 ) -> float:
-    """Visible share of the lamp at a position: the mean over a square of three texels around it.
+    """Visible share of the lamp at (x, y, z) [m]: the mean over a square of three texels around it.
 
-    Args:
-        to_map: `ShadowMap.to_map` (3, 4).
-        nearest: `ShadowMap.nearest` (N, N) [m].
-        bias: `ShadowMap.bias` [m].
-        x: Position in the frame of the map's points [m], as `y` and `z`.
-        y: See `x`.
-        z: See `x`.
+    The map is that of a `ShadowMap`, by its fields.
     """
     across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
@@ -118,11 +112,7 @@ def light_behind(
 ) -> Float32[np.ndarray, "H W"] | None:
     """Share of its light that a backdrop keeps at each pixel; None where no shadow falls on it.
 
-    Args:
-        camera: A pinhole camera.
-        drawn: The surfaces that cast the shadow.
-        lighting: Light in the camera's axes; the first lamp casts the shadow.
-        backdrop: Where it falls.
+    The drawn surfaces cast the shadow of the first lamp, in the axes of a pinhole camera.
     """
     if not drawn or not lighting.lamps:
         return None

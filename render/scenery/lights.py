@@ -130,10 +130,7 @@ def sample_surroundings(
 ) -> tuple[Background, Lighting]:
     """A random background, and random lamps in the light that it gives.
 
-    Args:
-        skin: Whose hands the picture is exposed for; None for gloves.
-        size: Of the picture that it will be behind [px]: the background is then painted once.
-        rng: Where the choices come from.
+    The picture is exposed for this skin, or for gloves; of a known size [px] the background is painted once.
 
     Raises:
         HandSimError: There is no photograph that can be read.

@@ -110,14 +110,13 @@ def cast_room(
     *,
     rng: np.random.Generator,
 ) -> RoomLight:
-    """A random room of a given size, seen from a given position.
+    """A random room of a given size, seen from a position; an equal rng gives the same from another.
 
     Args:
         rays: Unit directions in the room's axes, z up, no component 0.
         eye: Where they begin [m], the room's low corner at the origin.
         room: The room's far corner [m].
         free: Low and high corner of a box without furniture [m].
-        rng: Source of the room; the same one gives the same room from another position.
     """
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)

@@ -96,14 +96,11 @@ def apply_depth_noise(
     reflectance: Float32[np.ndarray, "H W"] | None = None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth as a sensor has it [m], 0 where it has none.
+    """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
 
-    Args:
-        depth: Along the camera's axis [m], 0 where there is nothing.
-        normals: Of the surfaces in the camera's axes; without them, all surfaces face the camera.
-        noise: The sensor; None leaves everything as it is.
-        reflectance: Share of infrared light that surfaces send back, for time-of-flight sensors; without it,
-            all are white. See `reflectance_of`.
+    Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
+    infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
+    nothing.
 
     Raises:
         ArgumentError: A picture is not as large as the camera's.

@@ -82,11 +82,7 @@ def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
 def expose(
     linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture that a sensor takes of light, sRGB.
-
-    Args:
-        linear: Light, 1 for white; more than that is as white.
-        exposure: How it is taken.
+    """The picture that a sensor takes of light (1 is white, more is as white), sRGB.
 
     Raises:
         ArgumentError: The light is not a picture of three colors.

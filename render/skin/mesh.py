@@ -97,10 +97,7 @@ class PosableSkin:
     def posed(
         self, qpos: Float[np.ndarray, "27"], upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> DrawnSkin:
-        """The skin in one pose.
-
-        Args:
-            upper_arm: Unit direction of the upper arm in the world; without it the arm is straight and short.
+        """The skin in one pose; without the upper arm's direction in the world the arm is straight and short.
 
         Raises:
             ArgumentError: `qpos` is not (27,) or not finite.

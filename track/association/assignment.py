@@ -51,12 +51,8 @@ def match_points(
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
     """The most likely assignment of points to markers, one to one; either may stay alone.
 
-    Args:
-        log_odds: Log-odds of each pair.
-
-    Returns:
-        Marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the alternatives of
-        both.
+    Returns the marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the
+    alternatives of both.
     """
     _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:

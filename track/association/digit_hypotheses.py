@@ -121,14 +121,9 @@ def evaluate_digit(
 ) -> None:
     """Evaluate all assignments of candidate points to the markers of one digit.
 
-    Args:
-        hand: The hand, its markers shifted by their biases.
-        model: Prior, noise and ranges of the digit.
-        points: The frame's points in the world [m].
-        candidates: Points that may be its markers.
-        log_odds: Log-odds of each label beside the fit, from IDs, presence and queries.
-        scores: The digit's row of `DigitHypotheses`, filled, as are the next two.
-        runners_up: See there.
+    The hand's markers are shifted by their biases; points are in the world [m]. Log-odds are those of each
+    label beside the fit, from IDs, presence and queries. The last three are the digit's rows of
+    `DigitHypotheses`, filled.
     """
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])

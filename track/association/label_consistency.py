@@ -29,11 +29,8 @@ _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard norm
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
     """Exchange the labels of two points where that explains both much better: the system exchanged their IDs.
 
-    A motion that the prediction misses moves both points alike and cancels in the comparison.
-
-    Args:
-        frame: The frame; a hand without a prediction has no labels.
-        positions: Predicted position of the marker of each label [m].
+    A motion that the prediction misses moves both points alike and cancels in the comparison. A hand without
+    a prediction has no labels.
     """
     labels = frame.labels.copy()
     points = _exchange(frame.points, labels, positions)

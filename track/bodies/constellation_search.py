@@ -30,14 +30,11 @@ def search_constellation(
     """The largest set of points in the markers' constellation, from every triangle that fits.
 
     Args:
-        positions: Markers in the body's frame (Q, 3) [m].
         distances: Distances between markers (Q, Q) [m].
-        points: Points (N, 3) [m].
         expected: Expected positions of the markers in the world (Q, 3) [m].
         radius: Largest distance from there [m]; infinite when nothing is known.
         gate: Largest residual of a point after the fit [m].
-        assignment: Overwritten by the best assignment (Q,).
-        pose: Overwritten by its pose (7,).
+        assignment: Overwritten by the best assignment, as `pose` by its pose.
 
     Returns:
         Number of markers in the best assignment, its RMS distance [m], and number of markers in the best

@@ -84,13 +84,9 @@ def shape_jacobian(
 
 
 def skeleton_jacobian(start: HandShape, parameters: Float[np.ndarray, "53"]) -> Float[np.ndarray, "45 53"]:
-    """Derivative of what determines a skeleton by the parameters.
+    """Derivative of what determines a skeleton by the parameters, zero of which are the shape `start`.
 
     That is, in this order: bone lengths [m], knuckles [m] and base angles [rad], digit by digit.
-
-    Args:
-        start: Shape of zero parameters.
-        parameters: Where to differentiate.
     """
     along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
     lengths = start.bone_lengths.ravel() * along * np.exp(parameters[BONE_LENGTHS])
@@ -112,12 +108,8 @@ def skinned_shape_jacobian(
     """Derivative of skinned points by the skeleton (`skeleton_jacobian`), rest points and poses held fixed.
 
     A longer bone moves all bones beyond it, in the pose and at rest. Skinning undoes the rest transform, so
-    the derivative is the difference of the two.
-
-    Args:
-        model: A right hand.
-        points: Rest positions in the wrist's frame [m].
-        weights: Skinning weights of all bones.
+    the derivative is the difference of the two. The model is a right hand, rest points are in the wrist's
+    frame [m].
     """
     rest = model.rest_transforms
     jacobian = np.zeros((len(T_world_bone), len(points), 3, 45))
@@ -241,12 +233,7 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """The terms of linear blend skinning.
-
-    Args:
-        model: A right hand.
-        points: Rest positions in the wrist's frame [m].
-        weights: Skinning weights of all bones.
+    """Terms of linear blend skinning of a right hand, with rest points in the wrist's frame [m].
 
     Returns:
         Derivative of each skinned point by its rest position (the blended rotation), and the position that

@@ -222,11 +222,7 @@ def project_onto_skin(
     """Coordinates of points, by Newton steps that walk from triangle to adjacent triangle.
 
     The height of a point is its signed distance along the normal. Where the skin folds and the walk does not
-    converge, the foot point stays on the last edge.
-
-    Args:
-        coordinates: Where to begin.
-        targets: The points, in the wrist's frame [m].
+    converge, the foot point stays on the last edge. Targets are in the wrist's frame [m].
     """
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)

@@ -107,15 +107,7 @@ def digit_prior(
     angles: Float[np.ndarray, "4"],
     precision: Float[np.ndarray, "4 4"],
 ) -> None:
-    """Prior of one digit's hinges, given the markers of the other digits.
-
-    Args:
-        prior: Distribution of the hinges before the markers were used.
-        information_matrix: See `MarkerPrediction`.
-        information_vector: See `MarkerPrediction`.
-        angles: Its mean [rad], filled.
-        precision: Its precision [1/rad^2], filled.
-    """
+    """Fill mean and precision of one digit's hinges, given the others' markers; see `MarkerPrediction`."""
     count = len(information_vector)
     order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
     index = 0

@@ -231,13 +231,10 @@ def move_wrist(
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:
-    """Translation and rotation of the wrist between two poses, along its axes in the second.
+    """Fill the last six numbers of a step: translation and rotation of the wrist from one pose to another.
 
-    Args:
-        before: The first pose.
-        now: The second pose.
-        step: Its last six numbers are filled [m, rad]; the rotation is to first order, twice the vector part
-            of the quaternion.
+    They are along its axes in the second; the rotation is to first order, twice the vector part of the
+    quaternion.
     """
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
@@ -284,15 +281,10 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
-    """Eliminate unknowns of a symmetric positive-definite system (Schur complement).
+    """Eliminate unknowns `first` to before `last` of a symmetric positive-definite system (Schur complement).
 
-    The block below and right of the eliminated unknowns stays symmetric and complete.
-
-    Args:
-        matrix: The matrix, overwritten.
-        right_side: The right side, overwritten.
-        first: The first unknown that is eliminated from those after it.
-        last: The first unknown that is not eliminated.
+    Matrix and right side are overwritten; the block below and right of the eliminated unknowns stays
+    symmetric and complete.
     """
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]

@@ -106,13 +106,9 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
 
 
 def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
-    """Of a calibrated hand, which is as near to its user's as the noise of its markers lets it be.
+    """Of a calibrated hand, which is as near to its user's as the noise of its markers [m] lets it be.
 
     A digit with a single marker remains half as doubtful as on a hand of which the size is known.
-
-    Args:
-        digits: Digit of each marker, -1 for the palm.
-        noise: Standard deviation of a marker around its place, from frame to frame [m].
     """
     before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)

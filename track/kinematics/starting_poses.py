@@ -64,10 +64,6 @@ def initial_poses(
 
     The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
     aligned with the markers first.
-
-    Args:
-        digits: Digit of each marker, -1 for the palm.
-        target: Markers in the world [m]; NaN where missing.
     """
     count = len(shapes.angles)
     aligned, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))

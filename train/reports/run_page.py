@@ -24,15 +24,9 @@ _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: Report) -> Path:
-    """Write the page of a run: one HTML file with its pictures inside, complete or not at all.
+    """Write the page of a run: one HTML file with its pictures inside, complete or not at all; its path.
 
-    Args:
-        out: The run's folder; an older page there is replaced.
-        card: The run's model card, see `train.loop.train_labeler`.
-        report: Evaluation on held-out frames with the paper's corruption.
-
-    Returns:
-        The page's path.
+    The report is of held-out frames with the paper's corruption.
     """
     layout = stored_layout(card["dataset"]["layout"])
     sections = [

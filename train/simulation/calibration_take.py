@@ -100,9 +100,6 @@ def calibration_angles(
 ) -> NDArray[np.float64]:
     """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
 
-    Args:
-        config: How many rounds, and how long the free motion is.
-
     Raises:
         PoseError: This hand finds no way from its touches to free motion.
     """

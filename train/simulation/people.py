@@ -28,8 +28,7 @@ def sample_hands(
 ) -> tuple[HandModel, ...]:
     """A random person's left and right hand, whose fingers do not overlap at rest.
 
-    Args:
-        redrawn: Counts the people who were drawn again, by reason.
+    Those who were drawn again are counted in `redrawn`, by reason.
 
     Raises:
         ArgumentError: No hand of this population can rest.

@@ -94,15 +94,9 @@ def label_false_points(
     labels: Int[np.ndarray, "S"],
     max_distance: float,
 ) -> Int[np.ndarray, "T F"]:
-    """Labels of false points: the nearest marker that has no other point, -1 where none is near.
+    """Labels of false points: the nearest marker that has no other point, -1 where none is near enough [m].
 
     A person who labels a capture takes such a point for the marker, although it is a little off.
-
-    Args:
-        found: What the optical system made of the sources.
-        positions: True positions of the sources [m].
-        labels: Marker of each source, -1 for a source that is not a marker.
-        max_distance: Largest distance from the marker to its false point [m].
     """
     false_labels = np.full(found.false_points.shape[:2], -1)
     markers = np.flatnonzero(labels >= 0)

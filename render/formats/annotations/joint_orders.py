@@ -74,14 +74,7 @@ def joint_order(name: str) -> tuple[int, ...]:
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Our keypoints, or other rows with one per keypoint, in another order.
-
-    Args:
-        points: In the order of `KEYPOINT_NAMES`.
-        name: One of `JOINT_ORDERS`.
-
-    Returns:
-        As many as that order has; NaN for those that we do not have.
+    """Our keypoints, or other rows with one per keypoint, in one of `JOINT_ORDERS`; NaN for those we lack.
 
     Raises:
         ArgumentError: The order is unknown, or there are not 21 points.
