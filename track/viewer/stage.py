@@ -20,6 +20,7 @@ _NEAREST: Final = 0.22  # [m] between the eye and its target, at least
 _HALF_SIDE: Final = 0.3  # [m] of the cube that wrists move in, as in training sets
 _SPACING: Final = 0.2  # [m] between the points whose cameras are counted
 _MOST_POINTS: Final = 40_000
+_FRUSTUM: Final = 0.12  # [m]
 _FEW, _MANY = np.array([214, 96, 60]), np.array([40, 120, 180])
 
 
@@ -71,12 +72,8 @@ def _set_light(server: ViserServer) -> None:
     scene.add_light_directional("/light/fill", intensity=0.3, position=(-2.0, 1.5, 1.0))
 
 
-def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> None:
-    """The cameras as frusta, each with its number on the first one's side.
-
-    Args:
-        scale: Size of a frustum [m].
-    """
+def show_rig(server: ViserServer, rig: CameraRig) -> None:
+    """The cameras as frusta, each with its number on the first one's side."""
     quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
     for number, (camera, quaternion) in enumerate(zip(rig.cameras, quaternions, strict=True), 1):
         width, height = camera.angles
@@ -84,7 +81,7 @@ def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> Non
             f"/cameras/{number}",
             fov=height,
             aspect=float(np.tan(width / 2) / np.tan(height / 2)),
-            scale=scale,
+            scale=_FRUSTUM,
             thickness=0.004,
             color=(60, 66, 76),
             position=camera.T_world_camera[:3, 3],
