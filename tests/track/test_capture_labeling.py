@@ -66,7 +66,7 @@ def test_one_hand_none_and_a_body(rng):
 
 @pytest.mark.parametrize("spread", [0.05, 0.5])
 def test_random_points_are_no_hand(spread, rng):
-    walk = np.cumsum(rng.normal(scale=0.001, size=(15, 1, 3)), axis=0)
+    walk = np.cumsum(rng.normal(scale=0.001, size=(40, 1, 3)), axis=0)
     labeled = label_capture(capture_of(list(walk + rng.normal(scale=spread, size=(30, 3)))))
     assert (labeled.labels >= 0).mean() < 0.01
 
