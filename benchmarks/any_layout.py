@@ -1,8 +1,8 @@
 """The labeler for any layout beside trained ones: slots right, clean and with drops and ghosts; its time.
 
-Without any training of the glove (at once), after `train.any_layout.fine_tuning` (after a minute), and with
-the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of 6 to
-30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
+Without any training of the glove (at once), after a minute of it (`train.any_layout.learned_gloves`), and
+with the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of
+6 to 30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
 
 python -m benchmarks.any_layout [--frames 1000] [--random 4] [--captures FOLDER]
 """
@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.record import describe
-from gloves.captures.collection import read_markers
+from gloves.captures.formats import read_markers
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.any_layout.layout_labeler import LayoutLabeler
+from train.any_layout.layout_labeler import LayoutLabeler, sample_worn_markers
+from train.any_layout.learned_gloves import fine_tuned_labeler
 from train.any_layout.skin_bank import sample_places
-from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.evaluate import evaluate_labeler

@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import right_hands
 from benchmarks.record import Figures, add_save, describe, save_figures
@@ -42,7 +43,6 @@ from handsim.hand.topology import BONES, SIDES
 from handsim.space.transforms import quaternion_matrix
 from poses.shapes.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.contacts import contact_geometry, initialize_contacts
-from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
 from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.held_out import held_out_markers
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from benchmarks.record import add_save, describe, save_figures
-from gloves.captures.collection import find_captures, read_markers
+from gloves.captures.formats import find_captures, read_markers
 from gloves.layout import load_layout
 from train.config import KINDS, TrainConfig, batch_recipe, default_config
 from train.data.batches import draw_batch
@@ -27,7 +28,6 @@ from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
-from train.simulation.held_out import held_out_markers
 from train.training_state import TrainingState
 
 GLOVE = "dense19"

@@ -27,6 +27,7 @@ from typing import Final
 import numpy as np
 import torch
 
+from benchmarks.held_out import held_out_markers
 from benchmarks.record import describe
 from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
 from benchmarks.training_scaling import train
@@ -34,12 +35,11 @@ from render.painting.gl import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
 from train.glove_labeler import load_labeler
-from train.labelers import batch_network
+from train.labelers import kinds
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.protocol import Labeler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
-from train.simulation.held_out import held_out_markers
 
 SECTIONS: Final = ("labels", "training", "pictures")
 CPU: Final = torch.device("cpu")
@@ -79,7 +79,7 @@ def labels(count: int) -> None:
     }
     for name, (make, clouds) in makers.items():
         for device in devices():
-            batch_network.batch_device = lambda device=device: device
+            kinds.batch_device = lambda device=device: device
             labeler = make()
             labeler.label_frames(clouds[:512])  # to warm up
             start = time.perf_counter()

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.record import describe
 from gloves.captures.capture import Capture
-from gloves.captures.collection import read_markers
+from gloves.captures.formats import read_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take

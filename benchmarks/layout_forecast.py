@@ -31,8 +31,7 @@ from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
 from track.glove_advice.trials import FRAMES, METHODS, WORK, try_layout
 from track.kinematics.pose_solver import PoseSolver
-from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.any_layout.learned_gloves import learned_labeler
+from train.any_layout.learned_gloves import fine_tuned_labeler, learned_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gloves.captures.collection import read_markers
+from gloves.captures.formats import read_markers
 
 
 def right_hands(captures: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

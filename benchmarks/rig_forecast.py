@@ -18,12 +18,12 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.record import describe
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
 from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.rig_advice.forecast import Forecast, forecast, light_work
-from train.rig_advice.plan import plan
+from train.rig_advice.planning import plan
 from train.rig_advice.work import sample_work
 from train.simulation.room_settings import SimulatedKind
 from train.simulation.takes import simulate_take

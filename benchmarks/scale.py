@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.held_out import held_out_markers
 from benchmarks.record import describe
 from handsim.app.cluster import chosen_workers
 from handsim.app.workers import run_jobs
@@ -29,7 +30,6 @@ from train.data.augmentation import Corruption, corrupt
 from train.glove_labeler import load_labeler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
-from train.simulation.held_out import held_out_markers
 from train.simulation.takes import simulate_take
 
 SHARD = 1.0  # [s] that a shard sleeps

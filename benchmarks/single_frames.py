@@ -16,9 +16,9 @@ import torch
 
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.captures.collection import find_captures, read_markers
-from train.evaluation.labeler_evaluation import Report
+from gloves.captures.formats import find_captures, read_markers
 from train.glove_labeler import load_labeler
+from train.labeler_evaluation import Report
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "

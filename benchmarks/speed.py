@@ -46,6 +46,7 @@ import torch
 
 from benchmarks import inverse_kinematics, rendering
 from benchmarks.agreement import blocked_rays
+from benchmarks.held_out import held_out_markers
 from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
 from benchmarks.record import Figures, add_save, describe, save_figures
@@ -74,7 +75,6 @@ from train.labelers.storage import load_network
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
-from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS
 from train.simulation.takes import simulate_take
 from train.threads import TrainingThreads

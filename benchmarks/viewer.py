@@ -18,8 +18,8 @@ from websockets.sync.client import ClientConnection, connect
 from benchmarks.record import describe
 from gloves.takes.take import load_take
 from track.network_address import LOOPBACK
-from track.viewer.recordings.takes import TakeRecording
-from track.viewer.scene.frame_view import FrameView
+from track.viewer.frame_view import FrameView
+from track.viewer.recordings import TakeRecording
 from track.viewer.server import opened_server
 from track.viewer.timeline import Timeline
 

@@ -137,7 +137,6 @@ def vary_layout(
         layout: The glove as designed.
         along: Standard deviation along the bones [bone lengths]; for the palm also across, at half of it.
         around: Standard deviation around the bones [rad].
-        rng: Source of all randomness.
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
@@ -198,12 +197,6 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
     """First exits along rays: faces (R,), -1 for none, barycentric weights (R, 3), distances (R,) [m].
 
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997).
-
-    Args:
-        origins: Where rays begin (R, 3) [m].
-        directions: Their unit directions (R, 3).
-        vertices: Of the skin (V, 3) [m].
-        faces: Triangles (F, 3), counter-clockwise from outside.
     """
     found, weights = np.full(len(origins), -1), np.empty((len(origins), 3))
     nearest = np.full(len(origins), np.inf)

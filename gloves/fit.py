@@ -131,9 +131,7 @@ def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> Glo
     """A hand of one of the five sizes, with its glove put on as designed.
 
     Args:
-        layout: The glove's markers.
         size: XS, S, M, L or XL: 0.165 to 0.210 [m] of hand length.
-        side: Which hand.
 
     Raises:
         ArgumentError: There is no such size or side.

@@ -254,14 +254,7 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
 
 
 def shipped_layout(name: str) -> ShippedLayout:
-    """A shipped layout with its description and its source.
-
-    Args:
-        name: One of `list_layouts`.
-
-    Raises:
-        LayoutError: There is no such layout.
-    """
+    """A shipped layout with its description and its source; a `LayoutError` if there is none of this name."""
     if name not in list_layouts():
         raise LayoutError(choices(name, list_layouts(), noun="glove"))
     table = read_toml(_SHIPPED / f"{name}.toml", error=LayoutError)

@@ -17,11 +17,7 @@ _DECIMALS: Final = 1e-8
 
 
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
-    """The text of a layout file with the markers where `layout` has them.
-
-    Args:
-        text: A layout file with the same markers in the same order.
-        layout: The layout as it shall be.
+    """The text of a layout file with the same markers in the same order where `layout` has them.
 
     Returns:
         The text, and whether it is the given one with changed places. Where that one is written in a way

@@ -34,7 +34,6 @@ def place_marker(
     there. On the palm it lies straight above or below its place in the palm's plane.
 
     Args:
-        layout: The glove.
         index: The marker to move.
         model: The hand that the point is meant on.
         point: Where the marker's center shall be, in the wrist's frame of the flat hand [m]. A marker on a

@@ -18,17 +18,12 @@ Settings = TypeVar("Settings")
 def check_type(
     name: str, value: object, kinds: type | tuple[type, ...], expected: str, valid: Iterable[str] = ()
 ) -> None:
-    """Refuse an argument of another type; the one check of all public functions.
+    """Refuse an argument of another type by an `ArgumentError`; the one check of all public functions.
 
     Args:
-        name: The argument.
-        value: What was given for it.
         kinds: The types that it may have; a bool is none of them unless it is named.
         expected: What is wanted, in words, such as "a MarkerLayout, or the name or path of one".
         valid: The names that there are.
-
-    Raises:
-        ArgumentError: The value is of another type.
     """
     named = kinds if isinstance(kinds, tuple) else (kinds,)
     if isinstance(value, kinds) and (not isinstance(value, bool) or bool in named):
@@ -42,8 +37,7 @@ def check_type(
 def fill_settings(config: Any) -> None:
     """Put settings in the place of mappings, in the fields of a frozen dataclass that are groups of settings.
 
-    Args:
-        config: The dataclass; a mapping holds what differs from the field's default.
+    A mapping holds what differs from the field's default.
 
     Raises:
         ArgumentError: A setting is unknown, or a field is no such group.
@@ -62,16 +56,10 @@ def fill_settings(config: Any) -> None:
 def make_settings(
     kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
 ) -> Settings:
-    """A dataclass of settings, some of which are given by name.
-
-    Args:
-        kind: The dataclass.
-        noun: What one of its fields is called in messages.
-        given: Fields and their values.
-        default: Where the others come from; the dataclass's own defaults when not given.
+    """A dataclass of settings, some given by name, the others from `default` or the dataclass.
 
     Raises:
-        ArgumentError: There is no field of some name.
+        ArgumentError: There is no field of some name; `noun` is what messages call one.
     """
     known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
     for name in given:

@@ -35,12 +35,8 @@ def list_plugins(group: str) -> tuple[str, ...]:
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
     """What a name stands for, imported now; a class is called without arguments, once.
 
-    The current folder is searched last, after everything that is installed.
-
-    Args:
-        name: `module:name`, or the name of an entry point.
-        group: The group of entry points, such as `handsim.pose_samplers`.
-        noun: What it is, for messages.
+    The name is `module:name`, or that of an entry point of the group. The current folder is searched last,
+    after everything that is installed.
 
     Raises:
         ArgumentError: There is nothing of that name, or its module cannot be imported.
@@ -55,11 +51,8 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
 def make_plugin(address: str, *, group: str, noun: str) -> Any:
     """What a name stands for, called anew with the options that follow it, which are strings.
 
-    Args:
-        address: `module:name` or the name of an entry point, of a class or a function; perhaps followed by
-            `?option=value&option=value`.
-        group: The group of entry points, such as `handsim.sinks`.
-        noun: What it is, for messages.
+    The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
+    `?option=value&option=value`.
 
     Raises:
         ArgumentError: There is nothing of that name, its module cannot be imported, or it does not take the

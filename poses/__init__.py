@@ -11,8 +11,8 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from poses.motion.minimum_jerk import MotionConfig
     from poses.motion.motions import sample_motion
+    from poses.motion.paths import MotionConfig
     from poses.shapes.library import load_gestures
     from poses.shapes.sampling import PoseSampler, sample_poses
     from poses.shapes.validity import validate
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "MotionConfig": "poses.motion.minimum_jerk",
+        "MotionConfig": "poses.motion.paths",
         "PoseSampler": "poses.shapes.sampling",
         "load_gestures": "poses.shapes.library",
         "sample_motion": "poses.motion.motions",

@@ -98,10 +98,6 @@ def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | 
 class Drawing:
     """A subject before its cameras: draws any of its frames.
 
-    Args:
-        subject: What is drawn.
-        config: How it is drawn.
-
     Raises:
         HandSimError: The subject has no motion to blur, or no camera has a hand in its picture.
     """
@@ -152,10 +148,9 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
-        """Some frames, seen by all cameras, with the people of a shard.
+        """Some frames, seen by all cameras, with the people of a shard and all else that changes with it.
 
         Args:
-            shard: Number of the shard; people change with it, as does all else that does not vary by frame.
             numbered: For each frame its place in the shard, which its random choices depend on, and its
                 number in the take.
             leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;
@@ -209,14 +204,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
 ) -> Studio:
-    """A studio of one person, whose looks are drawn.
-
-    Args:
-        hands: The person's hands.
-        config: How they are dressed and drawn.
-        bodies: Rigid bodies beside them.
-        rng: Source of the looks.
-    """
+    """A studio of one person, whose looks are drawn."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     painter = choose_painter(config.with_chosen_painter().painter)
@@ -233,9 +221,7 @@ def sample_choices(
     """Random choices of a picture.
 
     Args:
-        config: What to choose from.
         skin: See `sample_surroundings`.
-        rng: Source of the choices.
         size: Of the picture [px].
         around: Positions that a background of several cameras is around [m].
     """

@@ -28,15 +28,9 @@ def hand_truth(
     *,
     recorded: bool = True,
 ) -> HandTruth:
-    """Ground truth of one hand.
+    """Ground truth of a hand, by its number among those in the picture, from the camera's depth and parts.
 
-    Args:
-        figure: The hand.
-        qpos: Pose of the hand.
-        number: Index of the hand among those in the picture.
-        camera: The camera.
-        pictures: Depth and parts of that camera.
-        recorded: Whether to compute the vertices, else there are none.
+    Vertices are computed where it is recorded.
     """
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]

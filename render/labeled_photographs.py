@@ -87,13 +87,9 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
 
 
 def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator) -> CutOut:
-    """A square around a hand, resampled; what is outside of the photograph has the color of its border.
+    """A square of `size` pixels around a hand, whose labeled keypoints span a share of it, somewhere in it.
 
-    Args:
-        hand: The hand.
-        size: Side of the square [px].
-        share: Of the side that the labeled keypoints span.
-        rng: Source of where in the square the hand is.
+    What is outside of the photograph has the color of its border.
 
     Raises:
         DatasetError: The photograph cannot be read.

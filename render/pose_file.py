@@ -15,8 +15,7 @@ from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWar
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
 from handsim.hand.model import join_qpos
-from handsim.hand.records import HAND_DTYPE, unpack_hand
-from handsim.hand.shape import HandShape, shape_from_measures
+from handsim.hand.shape import HAND_DTYPE, HandShape, shape_from_measures, unpack_hand
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
 from handsim.motion_files.joint_table import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
@@ -91,14 +90,9 @@ def check_poses(
     person: NDArray[Any] | None = None,
     shapes: tuple[HandShape, ...] | None = None,
 ) -> OwnPoses:
-    """A user's arrays as poses.
+    """A user's arrays as poses: (T, 27), (T, H, 27), or (T, 20) without wrists, [m, rad].
 
-    Args:
-        qpos: (T, 27) or, without wrists, joint angles (T, 20) of one hand; (T, H, 27) of several [m, rad].
-        num_hands: Number of hands, H.
-        times: Of the frames (T,), increasing [s]; poses are no motion without them.
-        person: Who is in each frame (T,).
-        shapes: Hands of the people.
+    Times (T,) increase [s], and poses are no motion without them; `person` (T,) is who is in each frame.
 
     Raises:
         ArgumentError: An array has another shape or impossible numbers, or there is no hand in any frame.
@@ -268,7 +262,7 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
     if "hands" in arrays:
         hands = np.atleast_1d(arrays["hands"])
         if hands.dtype != HAND_DTYPE or hands.ndim != 1 or not 1 <= len(hands) <= MOST_PEOPLE:
-            raise ArgumentError("hands are not records of handsim.hand.records.HAND_DTYPE")
+            raise ArgumentError("hands are not records of handsim.hand.shape.HAND_DTYPE")
         return tuple(unpack_hand(hand) for hand in hands)
     if "hand_size" not in arrays:
         return None

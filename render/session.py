@@ -22,8 +22,8 @@ from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning, choices
-from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
+from handsim.files.outputs import check_free
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured
 from render.formats.annotations.common import without_colors
@@ -171,8 +171,6 @@ class _Telling:
     Args:
         folder: Where workers of this machine leave their `_DRAWN` files.
         count: Pictures that are there already.
-        total: All pictures.
-        progress: Who is told.
     """
 
     def __init__(self, folder: Path, count: int, total: int, progress: Progress | None) -> None:

@@ -19,8 +19,7 @@ from handsim._checks import check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
-from handsim.hand.records import pack_hand
-from handsim.hand.shape import HandShape, sample_shape
+from handsim.hand.shape import HandShape, pack_hand, sample_shape
 from handsim.hand.topology import NUM_KEYPOINTS, NUM_QPOS, SIDES, Side
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses

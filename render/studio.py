@@ -114,7 +114,6 @@ class Studio:
 
     Args:
         hands: The hands, in the order of the takes.
-        people: Appearance of each hand.
         bodies: The rigid bodies, in the order of the takes.
         body_colors: Color of each of them, sRGB in [0, 1].
         passes: Some of `PASSES`.
@@ -150,13 +149,9 @@ class Studio:
     def photograph(
         self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
     ) -> RenderedFrame:
-        """Draw one moment.
+        """Draw one moment of the studio's hands and bodies, with all other choices.
 
-        Args:
-            moment: Poses of the studio's hands and bodies.
-            camera: The camera.
-            choices: All other choices.
-            recorded: Whether the frame has its choices as JSON and the hands' vertices, which take time.
+        Where `recorded`, the frame has its choices as JSON and the hands' vertices, which take time.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.

@@ -19,8 +19,7 @@ from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, load_model
-from handsim.hand.records import HAND_DTYPE, pack_hand
-from handsim.hand.shape import HandShape, sample_shape
+from handsim.hand.shape import HAND_DTYPE, HandShape, pack_hand, sample_shape
 from handsim.hand.topology import SIDES, Side
 from render.config import SpawnKey
 from render.pose_file import CSV, MOST_PEOPLE, OwnPoses, check_poses, read_pose_file
@@ -209,7 +208,6 @@ def subject_of_poses(
         person: Which of the people is in each frame (T,); when not given, a number of people is distributed
             at random, and of hands there is one, or one for each frame.
         glove: Marker layout on the hands, where they wear gloves.
-        seed: Seed of the people.
 
     Raises:
         ArgumentError: An array has another shape or impossible numbers, or the arguments do not fit together.

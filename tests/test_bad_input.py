@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +49,12 @@ def good_capture(folder: Path) -> str:
     return path.read_text()
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = good_capture(tmp_path)
-    files = {
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """What users may name, made once."""
+    made = tmp_path_factory.mktemp("files")
+    text = good_capture(made)
+    texts = {
         "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
         "twice.toml": layout(*FIVE, ("a", "index_middle")),
         "two_markers.toml": layout(*FIVE[:2]),
@@ -76,16 +78,24 @@ def folder(tmp_path, monkeypatch):
         "page.xml": "<html/>",
         "bomb.xcp": '<!DOCTYPE c [<!ENTITY a "b">]><Cameras>&a;</Cameras>',
     }
-    for name, content in files.items():
-        (tmp_path / name).write_text(content)
-    write_archive(tmp_path / "older.npz", {"kind": "tracked take", "schema": 2}, {})
-    write_archive(tmp_path / "newer.npz", {"kind": "take", "schema": 99}, {})
+    for name, content in texts.items():
+        (made / name).write_text(content)
+    write_archive(made / "older.npz", {"kind": "tracked take", "schema": 2}, {})
+    write_archive(made / "newer.npz", {"kind": "take", "schema": 99}, {})
     take = simulate_take(num_frames=2)
-    take.save(tmp_path / "good.truth.npz")
-    dataclasses.replace(take, settings={"tracker": {}}).save(tmp_path / "tracked.npz")
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_text("no picture")
-    load_layout("dense19").save(tmp_path / "copy.toml")
+    take.save(made / "good.truth.npz")
+    dataclasses.replace(take, settings={"tracker": {}}).save(made / "tracked.npz")
+    (made / "photos").mkdir()
+    (made / "photos" / "broken.jpg").write_text("no picture")
+    load_layout("dense19").save(made / "copy.toml")
+    return made
+
+
+@pytest.fixture
+def folder(files, tmp_path, monkeypatch):
+    """A folder of its own with copies of the files."""
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 

@@ -73,6 +73,17 @@ def test_name_is_typed(package, name):
                 assert parameter.annotation is not parameter.empty, f"{function.__name__}: {parameter.name}"
 
 
+@pytest.mark.parametrize(("package", "name"), exported())
+def test_a_list_of_arguments_is_whole(package, name):
+    value = getattr(importlib.import_module(package), name)
+    for function in (value, *vars(value).values()) if inspect.isclass(value) else (value,):
+        text = inspect.getdoc(function) or ""
+        if inspect.isfunction(function) and "\nArgs:\n" in text:
+            told = set(re.findall(r"^    \*{0,2}(\w+): ", text, re.M))
+            missing = set(inspect.signature(function).parameters) - {"self", "cls"} - told
+            assert not missing, f"{function.__qualname__}: {missing}"
+
+
 def our_types(annotation: object) -> set[type]:
     """The classes of our packages in a type."""
     found = {one for part in get_args(annotation) for one in our_types(part)}

@@ -54,8 +54,6 @@ def label_both_ways(
 
     Args:
         frames: The frames in the order of their times.
-        user: The hands.
-        labeler: Labeler of their glove.
         told: Called with the number of frames that are done; a frame is done in both directions.
     """
     forward = _track(frames, user, labeler, lambda count: told(count // 2))

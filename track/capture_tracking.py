@@ -124,14 +124,7 @@ def _record(
 def _calibrated(
     take: Take, setup: TrackerSetup, progress: Progress | None, *, is_measured: bool
 ) -> TrackerSetup:
-    """The setup with its hands calibrated on a take, as far as they fit held-out frames better.
-
-    Args:
-        take: A take that was made with the setup.
-        setup: The setup.
-        progress: Called with the number of steps, and of all steps.
-        is_measured: Whether its hands were measured, so that where their markers are is a guess.
-    """
+    """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
     user, told = setup.user, None if progress is None else lambda _, *steps: progress(*steps)
     try:
         done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, told)

@@ -42,7 +42,6 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
     again; with fewer, and where the hand is lost, its pose stays. Poses of rigid bodies stay.
 
     Args:
-        take: The tracked take.
         corrections: In the order in which they were made.
 
     Raises:

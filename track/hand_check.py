@@ -78,8 +78,6 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
 
     Args:
         frames: Frames of unlabeled points [m], as `sample_frames` gives.
-        hands: The hands that are asked for.
-        labeler: Labeler of their glove.
 
     Raises:
         ArgumentError: The points fit hands at another scale alone.

@@ -101,9 +101,6 @@ def fit_size(
 
     Args:
         frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
-        layout: The glove that the hands wear.
-        sides: Which hands.
-        labeler: Labeler of the glove.
         is_quick: Whether hands are looked for as adults' alone, and not a second time by weaker evidence.
 
     Returns:
@@ -297,17 +294,10 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[GloveFit, float]:
-    """One shape for all hands of a user, by a calibration without touches.
+    """One right hand for all hands of a user, calibrated without touches, and its median RMS distance [m].
 
-    What the frames do not tell stays as it was.
-
-    Args:
-        seen: Labeled markers of right hands in the glove's order [m]; NaN where missing, at least four in
-            every frame.
-        start: A right hand of about the right length and breadth in the glove as designed.
-
-    Returns:
-        The right hand in its glove, and the median over frames of the RMS distance of its markers [m].
+    `seen` are labeled markers of right hands, at least four in every frame. What these do not tell stays as
+    it was at the start.
     """
     worn, shape = start.attachment, start.model.shape
     coordinates = nearest_coordinates(worn.points, shape)

@@ -60,15 +60,10 @@ class Intake:
     def check_frame(
         self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"] | None, time: float | None
     ) -> IncomingFrame:
-        """Check the next frame.
-
-        Args:
-            points: Points [m].
-            ids: Their IDs; -1 where there is none, None where the stream has none.
-            time: Time stamp of the frame [s].
+        """Check the next frame; an ID is -1 where there is none, and the stream may have none.
 
         Raises:
-            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time,
+            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time [s],
                 which is the caller's mistake, not the stream's.
         """
         points = _numbers("points", points, np.float64)
@@ -116,11 +111,7 @@ class Intake:
 
 
 def _numbers(name: str, values: ArrayLike, kind: type) -> NDArray[Any]:
-    """An array of a kind of numbers.
-
-    Raises:
-        ArgumentError: The values are no numbers.
-    """
+    """An array of a kind of numbers; an `ArgumentError` if the values are none."""
     try:
         return np.asarray(values, dtype=kind)
     except (TypeError, ValueError, OverflowError) as error:

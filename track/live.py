@@ -113,7 +113,6 @@ def measured_setup(
     """The setup with the hands as measured in the first frames of a stream, and all its frames.
 
     Args:
-        stream: The stream.
         setup: What the tracker is made of; a stream is not waited for if its hands are known.
         status: Says what is waited for.
         seconds: How long to wait [s], ten seconds at most.

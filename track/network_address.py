@@ -25,12 +25,9 @@ class NetworkAddress:
 def split_address(
     address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None
 ) -> NetworkAddress:
-    """Take an address apart.
+    """Take `scheme://host:port?option=value` apart; without a host it is this machine's loopback.
 
-    Args:
-        address: `scheme://host:port?option=value`; without a host it is this machine's loopback.
-        options: The valid values of each valid option; the first one is that which holds when none is given.
-        port: The port where the address has none; an error when not given.
+    The first of an option's valid values holds when none is given; a port must be given where `port` is not.
 
     Raises:
         ArgumentError: The address has other parts, or an option is unknown.

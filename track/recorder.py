@@ -40,11 +40,7 @@ _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
 
 
 class TakeRecorder:
-    """Records tracked frames; `take` gives the take so far at any time.
-
-    Args:
-        tracker: The tracker, for its hands and bodies.
-    """
+    """Records tracked frames; `take` gives the take so far at any time."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
@@ -68,11 +64,7 @@ class TakeRecorder:
             self._rows.append(frame_values(frame, tracked))
 
     def take(self, capture: Capture | None = None) -> Take:
-        """The take so far.
-
-        Args:
-            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
-                rate is the median one.
+        """The take so far, with the columns and the rate of its capture; of a stream, with the median rate.
 
         Raises:
             CaptureError: There are too few frames to determine the rate of a stream.

@@ -168,10 +168,6 @@ def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
     """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
 
     Otherwise the first frames of a stream would have to wait.
-
-    Args:
-        hands: The user's hands.
-        labeler: Labeler of their glove.
     """
     tracker = Tracker(hands, labeler)
     qpos = np.zeros((len(hands), NUM_QPOS))
@@ -194,13 +190,7 @@ def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
 def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[User, bool]:
     """The hands that arguments name, and whether they are still to be measured.
 
-    Args:
-        glove: The glove; when None that of the hands, or dense19 for hands that are measured.
-        hands: Hands, or sides.
-        size: Size of hands of which only the sides are given.
-
-    Raises:
-        ArgumentError: See `TrackerSetup.of`.
+    Without a glove they wear their own, or dense19 where they are measured. See `TrackerSetup.of` for errors.
     """
     if size not in get_args(Size):
         raise ArgumentError(choices(str(size), get_args(Size), noun="size"))

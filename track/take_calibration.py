@@ -39,11 +39,7 @@ def calibrate_take(
 ) -> tuple[Calibration, ...]:
     """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
 
-    Args:
-        take: The take; labels of hands that are tracked count.
-        start: Where to begin, for each side.
-        before: The hands that it was labeled with.
-        progress: Called with what is done.
+    Labels of hands that are tracked count. Each side begins with `start`; the take was labeled with `before`.
 
     Raises:
         CalibrationError: No hand is in the take, or it tells too little of one.
@@ -76,11 +72,9 @@ def kept_user(
     """The user with the hands that fit held-out frames better: calibrated on all frames, or as before.
 
     Args:
-        take: The take.
         done: What `calibrate_take` made of it.
         before: The hands that it was labeled with, for each side in `done`.
         notes: Where the user is from.
-        progress: Called with what is done.
     """
     whole = tuple(_solved_again(take, one, progress) if one.is_better else one for one in done)
     worn = {hand.side: hand for hand in before}

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from train.data.own_corruption import OwnCorruption
     from train.data.shards import Dataset
     from train.evaluate import evaluate_labeler
-    from train.evaluation.labeler_evaluation import Report
     from train.glove_labeler import load_labeler
+    from train.labeler_evaluation import Report
     from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
     from train.simulation.generation import generate_dataset
@@ -30,7 +30,7 @@ __getattr__, __dir__ = lazy_exports(
     {
         "Cloud": "train.data.augmentation",
         "OwnCorruption": "train.data.own_corruption",
-        "Report": "train.evaluation.labeler_evaluation",
+        "Report": "train.labeler_evaluation",
         "Labeling": "train.labelers.protocol",
         "CloudStream": "train.data.cloud_stream",
         "Corruption": "train.data.augmentation",

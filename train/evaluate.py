@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.captures.collection import find_captures, read_markers
+from gloves.captures.formats import find_captures, read_markers
 from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take, load_take
@@ -20,8 +20,8 @@ from handsim.errors import ArgumentError, CaptureError
 from train.data.augmentation import Corruption
 from train.data.own_corruption import OwnCorruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
-from train.evaluation.labeler_evaluation import LabelingCount, Report
 from train.glove_labeler import load_labeler
+from train.labeler_evaluation import LabelingCount, Report
 from train.labelers.protocol import Labeler
 
 CLEAN: Final = Corruption(occlude=0, ghosts=0)

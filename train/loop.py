@@ -21,9 +21,8 @@ from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
 from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
 from train.data.batches import Batch, draw_batch
-from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import check_corruption
-from train.data.shards import Dataset, load_dataset
+from train.data.shards import Dataset, MappedRows, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric
 from train.devices.local_processes import Progress, Tell, in_local_processes

@@ -15,9 +15,8 @@ from handsim._version import __version__
 from train.config import CNNConfig, Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption, right_hands
-from train.data.mapped_rows import MappedRows
-from train.data.shards import Manifest
-from train.evaluation.labeler_evaluation import Report, evaluate_markers, paper_report
+from train.data.shards import Manifest, MappedRows
+from train.labeler_evaluation import Report, evaluate_markers, paper_report
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler, labeler_of
@@ -48,10 +47,8 @@ def finish_run(
     """Evaluate the network, write weights, card and page, and return the card.
 
     Args:
-        state: The trained state.
         rows: What it was trained on.
         held_out: What it has not seen.
-        manifest: Of the training set.
         out: Folder of the run.
         tell: Called with the name of each step.
     """
@@ -83,11 +80,7 @@ def few(rows: MappedRows, count: int) -> NDArray[np.void]:
 def _card(
     network: nn.Module, rows: NDArray[np.void], config: TrainConfig, manifest: Manifest
 ) -> tuple[dict[str, Any], Report]:
-    """Model card: where the weights come from, and their figures on held-out simulated frames.
-
-    Returns:
-        The card, and the evaluation with the paper's corruption.
-    """
+    """Model card with figures on held-out simulated frames; the evaluation with the paper's corruption."""
     labeler = labeler_of(network, manifest.marker_names)
     markers = rows["markers"].astype(np.float64)
     clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
@@ -113,8 +106,6 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
     Settings that the network has already are kept.
 
     Args:
-        network: Trained network.
-        marker_names: Markers in label order.
         rows: A few hundred held-out rows of a training set; they get the paper's corruption.
     """
     labeler = _Recalling(network, marker_names)

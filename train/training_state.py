@@ -20,9 +20,9 @@ from handsim.files.arrays import check_members
 from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
 from train.data.batches import Batch, Part
-from train.data.mapped_rows import MappedRows
-from train.evaluation.labeler_evaluation import paper_report
+from train.data.shards import MappedRows
 from train.history import History
+from train.labeler_evaluation import paper_report
 from train.labelers.kinds import batch_loss, labeler_of, new_network, prepare_network
 
 _CURVE: Final = 200  # points of the loss curve
@@ -50,9 +50,7 @@ class TrainingState:
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
         """Make one gradient step together with the other devices and return the loss before it.
 
-        Args:
-            batch: The whole batch; each device learns from its part.
-            rng: Source of further randomness, the same on each device.
+        Each device learns from its part of the batch; the rng is the same on each.
 
         Raises:
             TrainingError: The loss is not finite; the state is of no use then.

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from benchmarks.record import Figures, save_figures
-from gloves.captures.collection import find_captures, read_markers
-from gloves.captures.gaps import count_gaps, run_lengths
+from gloves.captures.capture import count_gaps, run_lengths
+from gloves.captures.formats import find_captures, read_markers
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
@@ -25,12 +26,11 @@ from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.data.shards import Dataset
 from train.evaluate import evaluate_labeler
-from train.evaluation.labeler_evaluation import Report
 from train.glove_labeler import load_labeler
+from train.labeler_evaluation import Report
 from train.labelers.protocol import Labeler
 from train.labelers.storage import shipped_labelers
 from train.loop import train_labeler
-from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import simulate_take
 

@@ -35,8 +35,8 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.files.atomic import atomic_write, remove_leftovers
-from handsim.files.capacity import check_free
 from handsim.files.json_files import claim
+from handsim.files.outputs import check_free
 from handsim.hand.model import HandModel
 from handsim.space.cameras import load_rig
 from track.user import User, load_user

@@ -135,14 +135,6 @@ def _analog_numbers(
 ) -> int:
     """Analog numbers of a frame, which lie between its points and those of the next.
 
-    Args:
-        parameters: Of the file.
-        header: Of the file.
-        extent: Of the frames.
-        size: Bytes of a number.
-        num_points: Points of a frame.
-        tell: Called where the header is wrong about them.
-
     Raises:
         CaptureError: Header and parameters contradict each other and the data do not decide, so that points
             would be read from other places than they were written to.
@@ -186,16 +178,7 @@ def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
 def _num_frames(
     data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, tell: Tell
 ) -> int:
-    """Number of frames to read.
-
-    Args:
-        data: The file.
-        header: Of the file.
-        extent: Of the frames.
-        words: Numbers of a frame.
-        size: Bytes of a number.
-        agreed: Whether header and parameters state the same number of points.
-        tell: Called where the two state other numbers of frames, or more follows than frames.
+    """Number of frames to read, each of so many words (numbers) of so many bytes.
 
     Raises:
         CaptureError: There are none, or fewer than stated, or their size contradicts the file's.

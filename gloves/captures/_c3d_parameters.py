@@ -42,12 +42,7 @@ class Parameters:
 
     @staticmethod
     def parse(data: bytes, start: int, tell: Tell) -> Parameters:
-        """Read the records from byte `start`; nothing outside the file is ever touched.
-
-        Args:
-            data: The file, of at least one block.
-            start: Where the parameter section begins.
-            tell: Called where the last record points behind the section.
+        """Read the records from byte `start` of a file of at least one block; nothing outside it is touched.
 
         Raises:
             CaptureError: The section makes no sense, or a parameter of points is damaged.
@@ -94,14 +89,7 @@ class Parameters:
 def _walk(
     data: bytes, at: int, processor: int, tell: Tell
 ) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
-    """Names of groups by number; and of each parameter its group, its name and its record from the type on.
-
-    Args:
-        data: The file.
-        at: Where the first record begins.
-        processor: The number format.
-        tell: Called where the last record points behind the section.
-    """
+    """Names of groups by number; and of each parameter its group, name and record from the type on."""
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     groups: dict[int, str] = {}
     found: list[tuple[int, str, memoryview]] = []

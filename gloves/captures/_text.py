@@ -115,13 +115,8 @@ def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
     """The same lines with tabs between their cells, and without quotes around them.
 
-    Quotes in a file with tabs count only where the first cell of the file is quoted.
-
-    Args:
-        lines: Lines of a file.
-        separator: What separates their cells.
-        first: Number of the first one in the file.
-        wider: Whether rows may have more cells than the line above them.
+    Quotes in a file with tabs count only where the first cell of the file is quoted. `first` is the number of
+    the first line in the file; where `wider`, rows may have more cells than the line above them.
 
     Raises:
         CaptureError: A line has more cells than a marker file has, its quotes are damaged, or commas are both

@@ -30,9 +30,7 @@ _MOST_LABEL_BYTES: Final = 255
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a C3D file; points with a negative residual are missing.
 
-    Args:
-        data: The file.
-        tell: Called with a sentence where no unit is stated, or where the file contradicts itself.
+    A missing unit is told, and where the file contradicts itself.
 
     Raises:
         CaptureError: Not a C3D, cut or damaged, without points or frames, or in unknown units.

@@ -1,15 +1,22 @@
-"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in."""
+"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in.
+
+Many captures make one stack of labeled frames (`read_markers`).
+"""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
+
+import numpy as np
+from jaxtyping import Float
 
 from gloves.captures._text import Tell, separator_behind, split_lines
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import Capture
-from gloves.captures.markers import unlabeled_frames
+from gloves.captures.markers import select_hands, unlabeled_frames
 from gloves.captures.motive_csv import MOTIVE_BEGIN, read_motive_csv, write_motive_csv
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault, zeros_as_missing
 from gloves.captures.qtm_tsv import read_qtm_tsv
@@ -146,3 +153,43 @@ def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
     """Raise a `CaptureError` with the valid suffixes unless the path has one of them."""
     if path.suffix.lower() not in valid:
         raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")
+
+
+def find_captures(paths: Sequence[Path]) -> list[Path]:
+    """The capture files among paths, folders searched through.
+
+    Raises:
+        CaptureError: There is none, or a folder holds none.
+    """
+    files = []
+    for path in paths:
+        inside = (
+            sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
+            if path.is_dir()
+            else [path]
+        )
+        if not inside:
+            raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
+        files += inside
+    if not files:
+        raise CaptureError("no capture was given; expected files or folders")
+    return files
+
+
+def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    """The named markers of labeled captures [m], NaN where missing, hand by hand; no frames without any.
+
+    Raises:
+        CaptureError: A file cannot be read or lacks a marker; the file is named.
+    """
+    markers = np.concatenate([_markers_of(file, names) for file in files])
+    shown: Float[np.ndarray, "T M 3"] = markers[np.isfinite(markers).any(axis=(1, 2))]
+    return shown
+
+
+def _markers_of(file: Path, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    try:
+        return np.concatenate(select_hands(read_capture(file), names))
+    except CaptureError as error:
+        text = str(error)
+        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error

@@ -70,13 +70,9 @@ def check_same_rate(name: str, rate: float, other_name: str, other: float) -> No
 def timed_positions(
     positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, tell: Callable[[str], None]
 ) -> tuple[Float[np.ndarray, "T N 3"], float]:
-    """Positions of all frames from the first to the last, and their rate [Hz].
+    """Positions of all frames from the first to the last [m], and their rate [Hz].
 
-    Args:
-        positions: Of the frames that are there [m].
-        stated: What the file says of their times.
-        tell: Called with a sentence where frames are missing, which are NaN, or where the rate is stated
-            by the times alone.
+    Frames that are missing are NaN, and told, as is a rate that is stated by the times alone.
 
     Raises:
         CaptureError: Rate, times and numbers contradict each other, or there are fewer frames than stated.
@@ -162,11 +158,7 @@ def _stated_rate(text: str) -> float | None:
 
 
 def _increasing_numbers(numbers: Float[np.ndarray, "T"] | None) -> Int[np.ndarray, "T"] | None:
-    """The numbers of the frames, if all have one.
-
-    Raises:
-        CaptureError: One is not whole, or not larger than the one before.
-    """
+    """The numbers of the frames, if all have one; a `CaptureError` unless they are whole and increase."""
     if numbers is None or np.isnan(numbers).any():
         return None
     odd = np.flatnonzero((numbers != np.round(numbers)) | (np.abs(numbers) > 2.0**52))
@@ -180,11 +172,7 @@ def _increasing_numbers(numbers: Float[np.ndarray, "T"] | None) -> Int[np.ndarra
 
 
 def _increasing_times(stated: StatedTimes) -> Float[np.ndarray, "T"] | None:
-    """The times of the frames [s], if all have one.
-
-    Raises:
-        CaptureError: They go back, or stand still.
-    """
+    """The times of the frames [s], if all have one; a `CaptureError` unless they increase."""
     times = stated.times
     if times is None or np.isnan(times).any():
         return None
@@ -219,10 +207,8 @@ def _rate_of_times(
 def _with_gaps_in_time(steps: Int[np.ndarray, "T-1"], ticks: _Ticks) -> Int[np.ndarray, "T-1"]:
     """Frames from each row to the next, with those that are missing by the times alone.
 
-    A time that is late and made up for by the next one is no gap: clocks jitter.
-
-    Raises:
-        CaptureError: Numbers go on by more frames than times.
+    A time that is late and made up for by the next one is no gap: clocks jitter. Numbers that go on by more
+    frames than times are a `CaptureError`.
     """
     interval = 1.0 / ticks.rate(steps)
     excess = np.diff(ticks.times) / interval - steps

@@ -80,10 +80,8 @@ def labeled_columns(
     """Labeled points as a capture: one column per marker, then columns for the points without one.
 
     Args:
-        frames: Points of every frame [m].
         labels: Marker of every point, -1 for none.
         names: Marker names in label order.
-        rate: Frames per second [Hz].
     """
     extra = max((int((label < 0).sum()) for label in labels), default=0)
     positions = np.full((len(frames), len(names) + extra, 3), np.nan)

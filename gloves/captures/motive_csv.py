@@ -38,9 +38,7 @@ _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Mark
 def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
-    Args:
-        data: The file; its cells are separated by commas, semicolons or tabs.
-        tell: Called with a sentence where the file states no unit of length, or frames are missing.
+    Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
 
     Raises:
         CaptureError: Not a Motive export, without marker columns, cut, with a cell that is not a number, or
@@ -89,13 +87,8 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
     """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells.
 
-    Args:
-        path: Where to write.
-        capture: What to write.
-        title: The file name whose stem is the take's name (`path` may be a temporary one).
-
-    Raises:
-        OSError: The file cannot be written.
+    The take is named after the stem of `title`, since `path` may be a temporary one; an `OSError` if it
+    cannot be written.
     """
     num_frames, num_markers = capture.positions.shape[:2]
     rate = f"{capture.rate:.6f}"
@@ -129,11 +122,7 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
 
 
 def _types_and_names(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
-    """Type and name of each column, from the header rows between line 1 and the axes.
-
-    Raises:
-        CaptureError: There are no such rows.
-    """
+    """Type and name of each column, from the header rows between line 1 and the axes."""
     filled = [row for row in rows if any(row)]
     # Without labels the first row says 'Marker' itself, behind two blank cells.
     if len(filled) > 2 and not any(filled[0][:2]) and set(filled[0]) & _TYPES:

@@ -46,7 +46,6 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     Medians over the frames decide, since strays of a real system lie anywhere.
 
     Args:
-        clouds: Points of each frame [m].
         only_wide: Ask only whether they span more than a room, since they may be parts of one frame.
     """
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
@@ -96,15 +95,11 @@ def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
 
 
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
-    """Refuse clouds that are not in meters.
-
-    Args:
-        clouds: Points of each frame [m].
-        only_wide: See `unit_fault`.
+    """Refuse clouds that are not in meters, see `unit_fault`.
 
     Raises:
-        ArgumentError: They cannot be, see `unit_fault`; or all points are at the origin, which a single
-            cloud's (`only_wide`) may be.
+        ArgumentError: They cannot be; or all points are at the origin, which a single cloud's (`only_wide`)
+            may be.
     """
     if not only_wide and all_at_origin(clouds):
         raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
@@ -128,17 +123,10 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
 
 
 def check_place(capture: Capture, farthest: float) -> None:
-    """Tell of points so far from the origin that they will be left out.
-
-    Args:
-        capture: Positions [m].
-        farthest: From this coordinate on a point is left out [m].
+    """Warn of points that will be left out, farther than this from the origin in a coordinate [m].
 
     Raises:
         CaptureError: They are most of the points.
-
-    Warns:
-        HandSimWarning: There are some.
     """
     there = np.isfinite(capture.positions[..., 0])
     far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())

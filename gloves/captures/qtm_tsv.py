@@ -34,11 +34,7 @@ _UNIT: Final = "mm"  # the only one that QTM writes
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers in the bytes of a Qualisys TSV with 3D data.
-
-    Args:
-        data: The file.
-        tell: Called with a sentence where frames are missing, or there are more than stated.
+    """The markers in the bytes of a Qualisys TSV with 3D data; frames that are missing or too many are told.
 
     Raises:
         CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
@@ -112,13 +108,7 @@ def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
 
 
 def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int]:
-    """Index of the first row of numbers, and how many of its cells precede the positions.
-
-    Args:
-        lines: All lines of the file.
-        start: Index of the first line that is none of the header's.
-        width: Number of cells that positions take.
-    """
+    """Index of the first row of numbers, and how many of its cells precede the positions (`width` cells)."""
     while start < len(lines) and not lines[start].strip():
         start += 1
     if start == len(lines):

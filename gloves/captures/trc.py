@@ -46,10 +46,8 @@ _KEYS: Final = (
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a TRC file.
 
-    Args:
-        data: The file. Cells are separated by tabs, or by commas or semicolons where the first line is.
-        tell: Called with a sentence for what is suspicious: missing frames, or a rate that only the column of
-            times states.
+    Cells are separated by tabs, or by commas or semicolons where the first line is. Missing frames are told,
+    and a rate that only the column of times states.
 
     Raises:
         CaptureError: Not a TRC, header or last row cut, unknown units, a cell that is not a number, or rate,
@@ -106,8 +104,6 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
 
     Args:
-        path: Where to write.
-        capture: What to write.
         title: The file name that the first line states (`path` may be a temporary one).
 
     Raises:
@@ -160,11 +156,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
 
 
 def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
-    """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them.
-
-    Raises:
-        CaptureError: There is no trajectory at all, or a row has cells that are not three per trajectory.
-    """
+    """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them."""
     expected = _LEADING + 3 * num_named
     widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)

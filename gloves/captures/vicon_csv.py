@@ -48,9 +48,7 @@ def vicon_sections(lines: list[bytes]) -> dict[str, int]:
 def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The trajectories in the bytes of a Vicon CSV, labeled or not.
 
-    Args:
-        data: The file; its cells are separated by commas, semicolons or tabs.
-        tell: Called with a sentence where no unit of length is stated, or frames are missing.
+    Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
 
     Raises:
         CaptureError: Not such an export, without trajectories, cut, or with a cell that is not a number.
@@ -86,11 +84,7 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
-    """Where the position of each trajectory begins.
-
-    Raises:
-        CaptureError: The row does not begin as one of axes does, or names none.
-    """
+    """Where the position of each trajectory begins, by the row of axes."""
     if axes[0].lower() not in _FIRST_CELLS:
         raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
     columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]

@@ -24,7 +24,7 @@ _BLIND: Final = 1e-6  # determinant of a lens's Jacobian below which it makes no
 def draw_blobs(
     sources: Any, sizes: Any, seen: Any, cameras: Any, optics: Any, rng: Any, centers: Any, radii: Any
 ) -> None:
-    """Write noisy blob centers and radii of one frame; radius 0 where there is no blob.
+    """Write noisy blob centers (C, S, 2) and radii (C, S) [px] of one frame; radius 0 where there is no blob.
 
     The error of a disc's centroid comes from the pixels of its border, whose number grows with the radius,
     and is divided by the disc's area, which grows with its square: it falls with the radius's root.
@@ -35,9 +35,7 @@ def draw_blobs(
         seen: Which cameras have a free view of each (S, C).
         cameras: `CameraArrays` of C cameras.
         optics: Noise of a source of `MARKER_RADIUS` [px], chance to lose a blob, roundness.
-        rng: Source of all randomness; the draws go by camera, then source.
-        centers: Where the centers go (C, S, 2) [px].
-        radii: Where the radii go (C, S) [px].
+        rng: The draws go by camera, then source.
     """
     loss = optics[1]
     for c in range(len(cameras.lenses)):
@@ -75,16 +73,10 @@ def draw_blobs(
 def cast_rays(
     seen: Any, cameras: Any, optics: Any, centers: Any, radii: Any, directions: Any, usable: Any
 ) -> None:
-    """Write the unit rays of every source's blob in every camera, after blobs that touch have merged.
+    """Write the unit rays (S, C, 3) of every source's blob in every camera; blobs that touch have merged.
 
-    Args:
-        seen: Which cameras have a free view of each source (S, C).
-        cameras: As for `draw_blobs`.
-        optics: As for `draw_blobs`.
-        centers: Blob centers (C, S, 2) [px].
-        radii: Blob radii (C, S) [px]; 0 where there is none.
-        directions: Where the rays go (S, C, 3), in the world.
-        usable: Output (S, C), whether a camera has a ray to a source.
+    `usable` (S, C) gets whether a camera has a ray to a source. The other arguments are those of
+    `draw_blobs`.
     """
     roundness = optics[2]
     count = seen.shape[0]

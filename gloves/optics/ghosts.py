@@ -62,12 +62,8 @@ def sample_ghosts(
 
     Args:
         markers: Marker centers in the world [m].
-        rig: The cameras.
         segments: Axes of the capsules that block the view, in the world [m].
-        radii: Their radii [m].
-        config: How often and where.
         min_cameras: Cameras that must see a mirror image before it is a point.
-        rng: Source of all randomness.
     """
     frames = len(markers)
     low, high = markers.min(axis=1), markers.max(axis=1)

@@ -13,14 +13,9 @@ _PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes a
 
 @kernel
 def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
-    """Refit every box to its triangles; written out, because loops over axes take longer.
+    """Refit every box (N, 6) [m] to its triangles; written out, because loops over axes take longer.
 
-    Args:
-        vertices: The mesh (V, 3) [m].
-        skip: `MeshTree.skip` (N,).
-        spots: `MeshTree.spots`, the vertices of the leaves.
-        start: `MeshTree.spots_start` (N + 1,).
-        boxes: Low and high corner of each node (N, 6) [m], overwritten.
+    `skip`, `spots` and `start` are those of the `MeshTree`, the vertices those of the mesh (V, 3) [m].
     """
     for back in range(len(skip)):
         node = len(skip) - 1 - back
@@ -46,15 +41,7 @@ def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
 
 @kernel
 def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
-    """Whether the line from `start` to `end`, each (3,) [m], meets a triangle.
-
-    Args:
-        start: One end of the line.
-        end: The other end.
-        vertices: The mesh (V, 3) [m].
-        nodes: `faces`, `first` and `skip` of the tree.
-        boxes: Low and high corner of each node (N, 6) [m].
-    """
+    """Whether the line from `start` to `end`, each (3,) [m], meets a triangle of the tree."""
     faces, first, skip = nodes
     px, py, pz = start[0], start[1], start[2]
     d = (end[0] - px, end[1] - py, end[2] - pz)

@@ -19,16 +19,10 @@ def clear_of_mesh(
     cameras: Float[np.ndarray, "C 3"],
     needed: Bool[np.ndarray, "T P C"],
 ) -> Bool[np.ndarray, "T P C"]:
-    """Which of the needed lines from point to camera meet no triangle of their frame's mesh.
+    """Which of the needed lines from point to camera, in the world, meet no triangle of their frame's mesh.
 
-    A line that starts inside a closed mesh is not clear. NaN points are never clear.
-
-    Args:
-        tree: Tree over the mesh's faces.
-        vertices: The mesh in every frame, in the world [m].
-        points: Where lines start, in the world [m]: one point for all cameras, or one for each.
-        cameras: Where lines end, in the world [m].
-        needed: The lines to test; the others cost nothing and count as not clear.
+    A line that starts inside a closed mesh is not clear. NaN points are never clear. Points [m] are one for
+    all cameras, or one for each. Lines that are not needed cost nothing and count as not clear.
 
     Raises:
         ArgumentError: Shapes do not fit together, or the vertices or cameras are not finite.
@@ -54,13 +48,6 @@ def clear_of_body(
     needed: Bool[np.ndarray, "T P C"],
 ) -> Bool[np.ndarray, "T P C"]:
     """`clear_of_mesh` for a rigid body: lines are transformed into its frame, the tree is used as built.
-
-    Args:
-        tree: Tree over the body's mesh in the body's own frame.
-        T_world_body: Its pose in every frame.
-        points: Where lines start, in the world [m]: one point for all cameras, or one for each.
-        cameras: Where lines end, in the world [m].
-        needed: The lines to test; the others count as not clear.
 
     Raises:
         ArgumentError: Shapes do not fit together, a pose is not rigid, or poses or cameras are not finite.

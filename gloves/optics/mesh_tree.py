@@ -68,12 +68,7 @@ def hand_tree() -> MeshTree:
 
 @kernel
 def _build(low: Any, high: Any) -> Any:
-    """Order of the triangles (F,), first triangle of every node (N + 1,), and `skip` (N,).
-
-    Args:
-        low: Low corner of each triangle's box (F, 3) [m].
-        high: High corner (F, 3) [m].
-    """
+    """Order of the triangles (F,) by their boxes, first triangle of every node (N + 1,), and `skip` (N,)."""
     count = len(low)
     centers = low + high
     order = np.arange(count)
@@ -102,14 +97,7 @@ def _build(low: Any, high: Any) -> Any:
 
 @kernel
 def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
-    """Sort a node's triangles along an axis and return where to cut them: least sum of count x box area.
-
-    Args:
-        order: The node's triangles (n,), sorted in place.
-        low: Low corner of every triangle's box (F, 3) [m].
-        high: High corner (F, 3) [m].
-        centers: Twice their centers (F, 3) [m].
-    """
+    """Sort a node's triangles along an axis and return where to cut them: least sum of count x box area."""
     count = len(order)
     least, cut = np.inf, _LEAF
     best = order.copy()

@@ -45,9 +45,7 @@ def cameras_by_mirror(
         plane_point: Middle of the patch in each frame [m].
         plane_normal: Unit normal of its shiny side.
         radius: Radius of the patch [m].
-        rig: The cameras.
         segments: Axes of the capsules that block the view, in the world [m].
-        radii: Their radii [m].
     """
     seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
     _over_patch(images, plane_point, plane_normal, radius, rig.arrays, segments, radii, seen)
@@ -59,18 +57,7 @@ def _over_patch(
     images: Any, plane_point: Any, plane_normal: Any, radius: float, cameras: Any, segments: Any,
     radii: Any, seen: Any,
 ) -> None:  # fmt: skip
-    """Write which cameras see which mirror image into `seen` (T, P, C); see `cameras_by_mirror`.
-
-    Args:
-        images: Mirror images (T, P, 3) [m]; NaN where there is none.
-        plane_point: Middle of the patch (T, 3) [m].
-        plane_normal: Unit normal of its shiny side (T, 3).
-        radius: Radius of the patch [m].
-        cameras: `CameraArrays` of C cameras.
-        segments: Axes of the blocking capsules (T, K, 2, 3) [m].
-        radii: Their radii (K,) [m].
-        seen: Where the result goes (T, P, C), False before.
-    """
+    """Write which cameras see which mirror image into `seen` (T, P, C); arguments as `cameras_by_mirror`."""
     hit, marker, camera, local = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for t in range(len(images)):
         point, normal = plane_point[t], plane_normal[t]

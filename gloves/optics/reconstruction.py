@@ -120,11 +120,8 @@ def reconstruct(
     Args:
         sources: True positions of markers, mirror images and strays [m]; NaN where there is none.
         seen: Which cameras have a free view of each.
-        rig: The cameras.
-        config: Noise, gates and losses.
         radii: Radius of each source, or of all [m].
         continuous: Frames follow each other in time; otherwise each stands alone, and `min_rays` is enough.
-        rng: Source of all randomness.
     """
     frames, count = sources.shape[:2]
     positions = np.full((frames, count, 3), np.nan)

@@ -51,10 +51,7 @@ def sample_strays(
     Args:
         T_world_carrier: Pose of the carrier.
         middle: Middle of the ball in which they lie, in the carrier's frame [m].
-        config: Number, positions and durations.
-        rate: Frames per second [Hz].
         num_cameras: Cameras of the rig.
-        rng: Source of all randomness.
 
     Returns:
         Positions in the world [m], and which cameras each reflects to; occlusion is not tested here.

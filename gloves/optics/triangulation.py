@@ -18,7 +18,7 @@ def reconstruct_frames(
     sources: Any, sizes: Any, seen: Any, cameras: Any, optics: Any, gates: Any, min_rays: Any,
     rng: Any, positions: Any, rays: Any, false_points: Any,
 ) -> None:  # fmt: skip
-    """Write the points of every frame; see `reconstruct`.
+    """Write the points (T, S, 3) [m] of every frame; see `reconstruct`.
 
     Args:
         sources: True positions (T, S, 3) [m]; NaN where there is none.
@@ -28,8 +28,6 @@ def reconstruct_frames(
         optics: As for `gloves.optics.blobs.draw_blobs`.
         gates: Largest residual of a ray [m], sine of the smallest angle, smallest distance of two points [m].
         min_rays: Rays that must meet for a point to go on, and to begin.
-        rng: Source of all randomness.
-        positions: Where the points go (T, S, 3) [m].
         rays: Where the number of their rays goes (T, S).
         false_points: Where false intersections go (T, F, 3) [m]; NaN before.
     """

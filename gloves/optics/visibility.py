@@ -24,16 +24,10 @@ def free_rays(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which straight lines from marker to camera meet no capsule.
+    """Which straight lines from marker to camera, in the world [m], meet no capsule.
 
-    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than
-    its radius, so one distance between two segments decides it.
-
-    Args:
-        markers: Marker centers in the world [m].
-        cameras: Camera positions in the world [m].
-        segments: Both ends of every capsule's axis in the world [m].
-        radii: Capsule radii [m].
+    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than its
+    radius, so one distance between two segments decides it.
     """
     free = np.ones((*markers.shape[:2], len(cameras)), dtype=np.bool_)
     _keep_free(markers, cameras, segments, radii, free)
@@ -52,9 +46,7 @@ def visible_cameras(
     Args:
         markers: Marker centers in the world [m].
         normals: Outward unit directions of the skin under the markers.
-        rig: The cameras.
         segments: Both ends of every capsule's axis in the world [m].
-        radii: Capsule radii [m].
     """
     seen = facing_cameras(markers, normals, rig)
     _keep_free(markers, rig.positions, segments, radii, seen)
@@ -69,7 +61,6 @@ def facing_cameras(
     Args:
         markers: Marker centers in the world [m].
         normals: Outward unit directions of the surface under the markers.
-        rig: The cameras.
     """
     seen: NDArray[np.bool_] = _facing(
         np.ascontiguousarray(markers, dtype=np.float64),
@@ -87,22 +78,9 @@ def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
     return packed
 
 
-def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndarray, "*batch C"]:
-    """Inverse of `pack_cameras`."""
-    bits: NDArray[np.bool_] = (packed[..., None] >> np.arange(num_cameras, dtype=np.uint32)) & 1 == 1
-    return bits
-
-
 @kernel
 def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
-    """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.
-
-    Args:
-        markers: Marker centers (T, M, 3) [m]; what is NaN is in no view.
-        normals: Outward unit directions (T, M, 3).
-        cameras: `CameraArrays` of C cameras.
-        facing: Cosine of the largest angle of facing.
-    """
+    """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`."""
     frames, count = markers.shape[:2]
     seen = np.empty((frames, count, len(cameras.sizes)), dtype=np.bool_)
     for c in range(len(cameras.sizes)):

@@ -51,9 +51,7 @@ def read_archive(
 ) -> Content:
     """Read what `write_archive` wrote, or what has been recorded of it until now.
 
-    Args:
-        path: The file.
-        unpack: Makes the content from header and arrays; an exception means that they are damaged.
+    `unpack` makes the content from header and arrays; an exception means that they are damaged.
 
     Raises:
         CaptureError: No such file, not a take, of another schema, or damaged.

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.hand.records import HAND_DTYPE
+from handsim.hand.shape import HAND_DTYPE
 from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, NUM_QPOS
 
 
@@ -89,12 +89,7 @@ STORED: Final = (*FRAMES, KEYPOINTS, *WORN)
 
 
 def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
-    """Values as an array of a column's type.
-
-    Args:
-        column: The column.
-        values: What is to be kept in it.
-        sizes: The number that each letter stands for.
+    """Values as an array of a column's type, of these sizes by letter.
 
     Raises:
         ValueError: They have another shape, or numbers of this type cannot hold them.
@@ -131,14 +126,9 @@ def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -
 def stacked_frames(
     frames: Sequence[Mapping[str, NDArray[Any]]], present: NDArray[np.bool_]
 ) -> dict[str, NDArray[Any]]:
-    """Rows of single frames as arrays over all of them.
+    """Rows of single frames as arrays over all of them: those of `FRAMES`, and of `OPTIONAL` if there.
 
-    Args:
-        frames: By name the entries of each frame: those of points for the points it has.
-        present: Which columns of points have one in each frame, (T, N).
-
-    Returns:
-        The arrays of `FRAMES`, and those of `OPTIONAL` that the frames have.
+    Entries of points are those of the points that a frame has, in the columns (T, N) that are present.
     """
     stacked: dict[str, NDArray[Any]] = {}
     for column in (*FRAMES, *(column for column in OPTIONAL if column.name in frames[0])):

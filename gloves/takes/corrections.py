@@ -123,12 +123,6 @@ def find_pins(
 ) -> Pins:
     """The points that corrections are about; of two about one point, the later counts.
 
-    Args:
-        corrections: In the order in which they were made.
-        points: Observed points [m], NaN where a column has no point.
-        ids: The system's ID of each point, -1 where it has none.
-        label_names: Name of each label.
-
     Raises:
         CaptureError: A span is not within the frames, a label is unknown, or two points of a frame have one
             label.
@@ -152,11 +146,6 @@ def follow_point(
 
     Nothing where there is no point at the place. A point with an ID is what has that ID, also after a gap.
     One without is the nearest to where its last two places lead, until there is none.
-
-    Args:
-        points: Observed points [m], NaN where a column has no point.
-        ids: The system's ID of each point, -1 where it has none.
-        correction: Whose span is within the frames.
     """
     first, last = correction.first, correction.last
     start = nearest_column(points[first], np.array(correction.place), _SAME_PLACE)

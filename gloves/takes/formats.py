@@ -15,9 +15,8 @@ from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.motion_files import openxr
 from handsim.motion_files.bvh import write_bvh
 from handsim.motion_files.glb_animation import write_glb
-from handsim.motion_files.joint_table import write_joint_csv, write_joint_parquet
+from handsim.motion_files.joint_table import write_joint_csv, write_joint_parquet, write_mot
 from handsim.motion_files.motion import Motion, posed_hands
-from handsim.motion_files.opensim_motion import write_mot
 from handsim.motion_files.usd import write_usd
 from handsim.space.transforms import UpAxis
 

@@ -98,11 +98,7 @@ class GrowingArchive(Closing):
         self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
-        """Add a frame.
-
-        Args:
-            values: By column; those of points with an entry per point.
-            num_points: The number of its points.
+        """Add a frame; columns of points have an entry for each of its points.
 
         Raises:
             OSError: The disk is full, or the file cannot be written.
@@ -167,7 +163,6 @@ class GrownArchive:
     """Reads an archive that grew, or still grows, up to its last whole block.
 
     Args:
-        path: The file.
         check: Whether checksums are compared.
 
     Raises:
@@ -289,12 +284,6 @@ def finish_archive(
     grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
 ) -> None:
     """Write an archive that grew in its usual form, whole or not at all; its memory does not grow with it.
-
-    Args:
-        grown: The archive.
-        path: The .npz file.
-        header: The header, as JSON.
-        told: Called after every part.
 
     Raises:
         OSError: The file cannot be written.

@@ -42,7 +42,7 @@ from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
-from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
+from handsim.hand.shape import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.hand.topology import NUM_KEYPOINTS, Side
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import UpAxis

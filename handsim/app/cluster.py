@@ -145,13 +145,7 @@ class _Task:
 
 
 def check_worker(worker: str, threads: int, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a worker that other bytes may come from.
-
-    Args:
-        worker: Its address.
-        threads: The number of its threads; jobs take a process each.
-        found: Its versions of packages.
-        expected: The versions that it must have.
+    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions.
 
     Raises:
         HandSimError: It has several threads, or another version.

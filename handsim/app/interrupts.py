@@ -21,7 +21,6 @@ class Stopped(KeyboardInterrupt):
     """A command was asked to end.
 
     Args:
-        number: The signal.
         kept: What is kept and how to go on, a sentence without a capital and a period.
     """
 
@@ -64,10 +63,7 @@ def interrupt_flag(*, again: bool = True) -> Iterator[InterruptFlag]:
     """Within the block the first signal to end raises nothing; the yielded flag says whether it came.
 
     An exception from a signal can be lost: compiled code that calls back into Python swallows it. Only the
-    main thread gets signals; in other threads the flag stays down.
-
-    Args:
-        again: Whether a second signal raises.
+    main thread gets signals; in other threads the flag stays down. A second signal raises where `again`.
     """
     flag = InterruptFlag(again=again)
     with _handled(flag.note, ENDING):
@@ -86,12 +82,7 @@ class _Block:
 
 
 class _Persistent(Stopped):
-    """A `Stopped` that comes again when it is lost, until a block is left.
-
-    Args:
-        number: The signal.
-        block: The block.
-    """
+    """A `Stopped` that comes again when it is lost, until a block is left."""
 
     def __init__(self, number: int, block: _Block) -> None:
         super().__init__(number)

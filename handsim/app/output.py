@@ -94,19 +94,7 @@ class Output:
         grows: str = "",
         result: str | None = None,
     ) -> None:
-        """Claim the folder by a settings file, see `handsim.files.json_files.claim`.
-
-        Args:
-            name: The settings file.
-            settings: What decides the content.
-            noun: What the folder holds, for messages.
-            error: Class of the error.
-            grows: A setting that may be larger than before.
-            result: A file that is true for the old settings only.
-
-        Raises:
-            HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
-        """
+        """Claim the folder by a settings file of this name, see `handsim.files.json_files.claim`."""
         path = self.folder / name
         if self.is_here:
             old = None if result is None else self.folder / result
@@ -130,7 +118,6 @@ class Output:
         """A job that writes to the claimed folder.
 
         Args:
-            make: What to do.
             last: Patterns of the files that say that a job is finished, whose content is then complete.
         """
         name = self._claimed[0]

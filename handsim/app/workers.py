@@ -46,7 +46,6 @@ def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> I
 
     Args:
         job: Takes a number and returns it.
-        todo: The numbers of the jobs.
         workers: Number of processes, all cores when not given; or an executor. With a number the first job is
             done in this process, before the others: this fills numba's cache before workers need it, and a
             mistake common to all jobs shows at once.
@@ -102,9 +101,6 @@ class LocalProcesses(ProcessPoolExecutor):
 
     They end with the block; at once if it raises, or if this process ends, however that ends. They do not
     hear Ctrl-C and hang-ups.
-
-    Args:
-        workers: Number of processes.
     """
 
     def __init__(self, workers: int) -> None:

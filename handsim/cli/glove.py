@@ -34,8 +34,8 @@ from handsim.hand.shape import SIZES
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
     from handsim.space.cameras import CameraRig
+    from track.glove_advice.improvement import Worth
     from track.glove_advice.layout_score import LayoutScore
-    from track.glove_advice.layout_worth import Worth
     from track.glove_advice.observed_hands import ObservedHand
     from track.glove_advice.trials import Trial
 
@@ -265,7 +265,7 @@ def _hands(
 
 def _tell(score: LayoutScore) -> None:
     """Print the figures of a score."""
-    from train.evaluation.metrics import percent
+    from train.metrics import percent
 
     joints = np.rad2deg(score.joints)
     for title, report in (

@@ -18,8 +18,7 @@ from typing import Any, Final
 from handsim._version import __version__
 from handsim.app.interrupts import Stopped, signals_raise
 from handsim.app.messages import told_warnings
-from handsim.cli.command_table import COMMANDS, load
-from handsim.cli.presets import PresetCommand
+from handsim.cli.command_table import COMMANDS, PresetCommand, load
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
@@ -189,7 +188,7 @@ def _print_completion(commands: Mapping[str, tuple[str, str]], shells: Sequence[
     if list(shells) != ["bash"]:
         print("handsim: --print-completion takes one shell; valid names: bash", file=sys.stderr)
         return 2
-    from handsim.cli.completion import bash_completion
+    from handsim.cli.parsing import bash_completion
 
     print(bash_completion(commands), end="")
     return 0

@@ -1,4 +1,7 @@
-"""How the signatures of commands become options: one reading of types, and of what help says of defaults."""
+"""How the signatures of commands become options: one reading of types, and of what help says of defaults.
+
+The same options stand in the script that completes commands in bash.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import functools
 import inspect
 import textwrap
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
 
@@ -23,8 +26,25 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
+from handsim.cli.command_table import PresetCommand, load
+
 Command = Callable[..., Any]
 _UNIONS: Final = (Union, types.UnionType)
+_SCRIPT: Final = """\
+# Completion of handsim in bash; in zsh, after `autoload -U bashcompinit && bashcompinit`.
+_handsim() {{
+    local words
+    if [ "$COMP_CWORD" -eq 1 ]; then
+        words="{commands} --help --version"
+    else
+        case "${{COMP_WORDS[1]}}" in
+{cases}
+        esac
+    fi
+    COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o default -F _handsim handsim
+"""
 
 
 def run_command(
@@ -155,3 +175,23 @@ def _with_hints(command: Command) -> Command:
     wrapped.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": Any}
     wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return wrapped
+
+
+def bash_completion(commands: Mapping[str, tuple[str, str]]) -> str:
+    """The script for a table of commands; loads all of them, which takes some seconds."""
+    cases = [
+        f'            {name}) words="{" ".join(_words(target))}" ;;' for name, (target, _) in commands.items()
+    ]
+    return _SCRIPT.format(commands=" ".join(commands), cases="\n".join(cases))
+
+
+def _words(target: str) -> list[str]:
+    """The options of a command, and its sub-commands."""
+    command: Any = load(target)
+    if isinstance(command, PresetCommand):
+        command = command.choose((), "handsim")
+    functions = list(command.values()) if isinstance(command, dict) else [command]
+    found = list(command) if isinstance(command, dict) else []
+    for function in functions:
+        found += [word for word in options_of(function) if word not in found]
+    return found

@@ -272,7 +272,7 @@ def plan_rig(
         raise ArgumentError(f"--cameras is {cameras}, expected {fewest} to {MAX_CAMERAS}")
     sides, middle = _checked_sides("--volume", volume), _checked_center(center)
     check_outputs([keep, glove], [out])
-    from train.rig_advice.plan import plan
+    from train.rig_advice.planning import plan
 
     camera = _camera(size, field_of_view) if hung is None else hung.cameras[0]
     with named_steps("simulating hands") as step:

@@ -9,9 +9,8 @@ from typing import Annotated, Final
 
 import tyro
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, count_gaps
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
 from handsim.app.cluster import chosen_workers
@@ -19,8 +18,7 @@ from handsim.app.messages import print_line
 from handsim.app.workers import run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
-from handsim.files.capacity import check_free, check_memory
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_free, check_memory, check_outputs
 from train.simulation.takes import TakeConfig, record_config
 
 _MEMORY: Final = 20_000

@@ -174,6 +174,7 @@ def _check_options(
 ) -> None:
     from gloves.captures.formats import WRITABLE, check_suffix
     from handsim.cli.options import check_take_file
+    from track.streams.addresses import check_address
 
     if (capture is None) == (live is None):
         given = (
@@ -188,6 +189,8 @@ def _check_options(
         )
     if seconds is not None and not 0.0 < seconds < np.inf:
         raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
+    if live is not None:
+        check_address(live)  # before kernels are compiled
     check_take_file(out, live=live is not None)
     if labeled is not None:
         check_suffix(labeled, WRITABLE)

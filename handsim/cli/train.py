@@ -14,8 +14,8 @@ import tyro
 from handsim.app.interrupts import Stopped
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
+from handsim.cli.command_table import PresetCommand, given_option
 from handsim.cli.parsing import run_command
-from handsim.cli.presets import PresetCommand, given_option
 from handsim.errors import DatasetError, HandSimError
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
 from train.devices.world import world_of

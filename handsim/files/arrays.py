@@ -26,9 +26,6 @@ _DAMAGE: Final = (
 def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     """All arrays of an `.npz`, by name.
 
-    Args:
-        path: A regular file.
-
     Raises:
         ValueError: Not an archive of plain arrays, a header that does not fit its bytes, or far more bytes
             than such a file may hold.
@@ -59,11 +56,7 @@ def check_members(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array in an `.npy`, whose header must state exactly its bytes.
-
-    Args:
-        file: At its beginning; read up to the end of the header.
-        size: Number of its bytes.
+    """Shape and type of the array in an `.npy` of `size` bytes, whose header must state exactly these.
 
     Raises:
         ValueError: It does not, or the array holds Python objects.

@@ -178,7 +178,6 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Args:
-        path: The file.
         error: What to raise, in one sentence, when the file cannot be read or is not TOML.
     """
     data = read_bytes(path, error=error, most=_MOST_TOML)

@@ -22,17 +22,12 @@ _KINDS: Final = (
 
 
 def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
-    """Refuse a pipe, a socket or a device, which may never end, and a file that is too long.
+    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes.
 
     A path that does not exist, or is a folder, is left to whoever opens it.
 
-    Args:
-        path: The file.
-        error: What to raise, in one sentence.
-        most: Largest size [bytes]; any when None.
-
     Raises:
-        HandSimError: Of class `error`: the path is not a regular file, or is longer than `most`.
+        HandSimError: Of class `error`: the path is not a regular file, or is too long.
     """
     try:
         found = path.stat()
@@ -48,12 +43,7 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
 
 
 def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
-    """The bytes of a regular file.
-
-    Args:
-        path: The file.
-        error: What to raise, in one sentence.
-        most: Largest size [bytes]; any when None.
+    """The bytes of a regular file of at most `most` bytes.
 
     Raises:
         HandSimError: Of class `error`: the file cannot be read, is not a regular one, or is too long.

@@ -64,7 +64,6 @@ def claim(
         path: The settings file; its folder is claimed.
         settings: What decides the content of the folder.
         noun: What the folder holds, for messages.
-        error: Class of the error.
         grows: A setting, written like `train.samples`, that may be larger than in the file; the file then
             takes the new settings.
         free: Settings that may differ or be missing, because the content does not depend on them.

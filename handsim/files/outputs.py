@@ -1,12 +1,16 @@
-"""A check, before the work, that outputs can be written, and none of them over an input."""
+"""Checks before the work: outputs can be written, none over an input, and disk and memory have room."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Final
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, HandSimError
+
+_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
@@ -41,3 +45,51 @@ def _same(source: Path, output: Path) -> bool:
         return os.path.samefile(source, output)
     except (OSError, ValueError):  # one of them does not exist
         return False
+
+
+def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
+    """Refuse work that the disk has no space for; the folder need not exist yet.
+
+    Args:
+        needed: Bytes still to be written.
+        what: What needs them, for the message, in the plural.
+        remedy: What to do beside freeing space, as in `ask for fewer frames`.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise error(
+            f"{what} need {shown_bytes(needed)}, but the disk of {folder} has {shown_bytes(free)} free; "
+            f"{remedy} or name a folder on another disk"
+        )
+
+
+def check_memory(needed: int, what: str, remedy: str) -> None:
+    """Refuse work that the machine has no memory for by an `ArgumentError`; words as for `check_free`."""
+    free = available_bytes()
+    if needed > free:
+        raise ArgumentError(
+            f"{what} need {shown_bytes(needed)} of memory, but {shown_bytes(free)} are free; {remedy}"
+        )
+
+
+def available_bytes() -> int:
+    """Memory to be had without swapping [bytes]; all that is built in where the system tells no more."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def shown_bytes(count: float) -> str:
+    """A number of bytes with a unit that suits it."""
+    unit = 0
+    while count >= 1000.0 and unit < len(_UNITS) - 1:
+        count, unit = count / 1000.0, unit + 1
+    return f"{count:.3g} {_UNITS[unit]}"

@@ -70,14 +70,7 @@ def _posed(
     starts: Float[np.ndarray, "K 3"],
     ends: Float[np.ndarray, "K 3"],
 ) -> Any:
-    """Ends of the capsules' axes (T, K, 2, 3) [m], in the world.
-
-    Args:
-        transforms: `T_world_bone` (T, L, 4, 4).
-        bones: Bone of each capsule (K,).
-        starts: One end of each axis in its bone's frame (K, 3) [m].
-        ends: The other end (K, 3) [m].
-    """
+    """Ends of the capsules' axes (T, K, 2, 3) in the world, from both ends in their bones' frames [m]."""
     posed = np.empty((len(transforms), len(bones), 2, 3))
     for frame in range(len(transforms)):
         for capsule in range(len(bones)):
@@ -96,14 +89,7 @@ def bounding_spheres(
     centers: Float[np.ndarray, "K 3"],
     sizes: Float[np.ndarray, "K"],
 ) -> None:
-    """Write the bounding spheres of one frame's capsules.
-
-    Args:
-        segments: Both ends of every axis (K, 2, 3) [m].
-        radii: Capsule radii (K,) [m].
-        centers: Where the spheres' centers go (K, 3) [m].
-        sizes: Where the spheres' radii go (K,) [m].
-    """
+    """Write the bounding spheres of one frame's capsules: centers (K, 3) and sizes (K,), their radii [m]."""
     for k in range(len(radii)):
         squared = 0.0
         for i in range(3):

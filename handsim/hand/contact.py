@@ -40,13 +40,7 @@ def overlap_between(
 def _deepest(
     segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
 ) -> Any:
-    """Deepest overlap (T,) [m] of the capsules of one hand; 0 where nothing touches.
-
-    Args:
-        segments: Both ends of every axis (T, K, 2, 3) [m].
-        radii: Capsule radii (K,) [m].
-        pairs: Capsules that may collide (P, 2).
-    """
+    """Deepest overlap (T,) [m] of these pairs of capsules of one hand; 0 where nothing touches."""
     depth = np.zeros(len(segments))
     centers, sizes = np.empty((len(radii), 3)), np.empty(len(radii))
     for frame in range(len(segments)):
@@ -73,14 +67,7 @@ def _overlap(
     second: Float[np.ndarray, "T N 2 3"],
     second_radii: Float[np.ndarray, "N"],
 ) -> Any:
-    """Deepest overlap (T,) [m] of capsules of two hands; minus the gap where nothing touches.
-
-    Args:
-        first: Both ends of every axis of one hand (T, K, 2, 3) [m].
-        first_radii: Its capsule radii (K,) [m].
-        second: The same of the other hand (T, N, 2, 3) [m].
-        second_radii: Its capsule radii (N,) [m].
-    """
+    """Deepest overlap (T,) [m] of capsules of two hands; minus the gap where nothing touches."""
     overlap = np.full(len(first), -np.inf)
     for frame in range(len(first)):
         for i in range(len(first_radii)):

@@ -55,11 +55,8 @@ def skinned_jacobian(
     """Derivative of skinned points [m] with respect to MuJoCo's velocities (`NUM_VELOCITIES`).
 
     Args:
-        model: The hand.
         T_world_bone: Its bones, from `forward_kinematics`.
         points: Rest positions in the wrist frame [m].
-        bone_indices: The bones that move each point.
-        bone_weights: Their shares.
     """
     frames, count = len(T_world_bone), len(points)
     motion = T_world_bone @ np.linalg.inv(model.rest_transforms)

@@ -40,10 +40,6 @@ _WRIST: Final = 1.3  # thickness of the wrist, in thicknesses of the palm
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
     """Keypoints in the world [m].
 
-    Args:
-        model: The hand.
-        qpos: Poses.
-
     Raises:
         ArgumentError: `qpos` is not (T, 27) or not finite.
     """

@@ -11,12 +11,10 @@ from jaxtyping import Float
 from handsim._checks import check_array, check_type
 from handsim.hand.capsules import Capsules, build_capsules
 from handsim.hand.contact import penetration_depth
-from handsim.hand.kinematics import bone_transforms
 from handsim.hand.mjcf import build_spec
 from handsim.hand.shape import SIZES, HandShape, named_shape
-from handsim.hand.skeleton import Skeleton, build_skeleton
-from handsim.hand.skin.skinning import skin_frames
-from handsim.hand.skin.surface import HandSurface, build_surface
+from handsim.hand.skeleton import Skeleton, bone_transforms, build_skeleton
+from handsim.hand.skin.surface import HandSurface, build_surface, skin_frames
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
 
 if TYPE_CHECKING:
@@ -108,14 +106,7 @@ class HandModel:
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
-    """A hand as it is, of a shape, or a right one of a size by its name.
-
-    Args:
-        model: The hand, its measures [m], or XS, S, M, L or XL.
-
-    Raises:
-        ArgumentError: It is none of these.
-    """
+    """A hand as it is, of measures, or a right one of size XS, S, M, L or XL; else an `ArgumentError`."""
     if isinstance(model, HandModel):
         return model
     if isinstance(model, HandShape):

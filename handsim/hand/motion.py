@@ -86,14 +86,9 @@ class BodyMotion:
 
 
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
-    """A motion from poses some of which are missing: linear from the pose before to the pose after.
+    """A motion from poses some of which (NaN), but not all, are missing: linear from pose to pose.
 
     The hand keeps its first pose before it, and its last pose after it.
-
-    Args:
-        times: Time of each pose [s], increasing.
-        qpos: Poses, NaN where there is none; at least one must be there.
-        rate: Frames per second of the motion [Hz].
     """
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -122,7 +117,6 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 
     Args:
         times: Time of each frame [s], increasing.
-        rate: Frames per second [Hz].
 
     Raises:
         ArgumentError: The rate is not positive, or there would be too many frames.
@@ -141,14 +135,8 @@ def between_poses(
 ) -> Float[np.ndarray, "K H W"]:
     """Poses at other times: positions and angles linear, rotations on the shortest way.
 
-    There is none where an old one beside it is missing, or where the old ones are more than a tenth of a
-    second apart.
-
-    Args:
-        times: Time of each old pose [s], increasing.
-        new: The other times [s].
-        poses: Rows of positions, then a quaternion (wxyz), then angles, if any; NaN where there is none.
-        rate: Frames per second of the old poses [Hz].
+    A pose is a position, a quaternion (wxyz), then angles, if any. There is none (NaN) where an old one
+    beside it is missing, or where the old ones, whose rate is given, are more than a tenth of a second apart.
     """
     longest = max(_LONGEST_GAP, _LONGEST_GAP_FRAMES / rate)
     before, share = _brackets(times - times[0], new - times[0], longest)

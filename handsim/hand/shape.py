@@ -1,5 +1,7 @@
 """The shape of a hand: lengths, breadths and girths [m], five named sizes, and a population to sample from.
 
+Files hold shapes as rows of a structured array (`HAND_DTYPE`).
+
 Sources, in docs/anatomy.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
 28:755), hand length and breadth from ANSUR II (2012), finger girths from Greiner 1991 (NATICK/TR-92/011).
 """
@@ -8,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
@@ -66,6 +68,18 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
+HAND_DTYPE: Final = np.dtype(
+    [
+        ("left", "?"),
+        ("length", "<f8"),
+        ("breadth", "<f8"),
+        ("bone_lengths", "<f8", (5, 3)),
+        ("knuckles", "<f8", (5, 3)),
+        ("base_angles", "<f8", (5, 3)),
+        ("radii", "<f8", (5, 4)),
+        ("palm_thickness", "<f8"),
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,3 +232,15 @@ def sample_shape(
         radii=mean.radii * np.exp(spread(population.girth_spread, (5, 1))),
         palm_thickness=mean.palm_thickness * float(np.exp(spread(population.girth_spread, ()))),
     )
+
+
+def pack_hand(shape: HandShape) -> tuple[Any, ...]:
+    """A hand as one element of a `HAND_DTYPE` array."""
+    return (shape.side == "left", *(getattr(shape, name) for name in (HAND_DTYPE.names or ())[1:]))
+
+
+def unpack_hand(record: np.void) -> HandShape:
+    """The hand of one element of a `HAND_DTYPE` array."""
+    fields = {name: record[name] for name in (HAND_DTYPE.names or ())[1:]}
+    fields = {name: float(value) if np.ndim(value) == 0 else value for name, value in fields.items()}
+    return HandShape(side=SIDES[0] if record["left"] else SIDES[1], **fields)

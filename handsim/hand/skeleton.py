@@ -1,15 +1,22 @@
-"""Bones and joint axes of a hand at zero angles, for either side."""
+"""Bones and joint axes of a hand at zero angles, for either side, and where its bones are in many poses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import BONES, JOINTS, NUM_BONES
+from handsim.kernels.chain import pose_bones
 from handsim.space.transforms import MIRROR, euler_matrix
+
+_MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
+_CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
+"""Parent of each bone, and how many joints move it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,3 +67,15 @@ def build_skeleton(shape: HandShape) -> Skeleton:
         axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
     ranges = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
     return Skeleton(offsets, rotations, axes, ranges, lengths)
+
+
+def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
+    """`T_world_bone` of every bone in every frame.
+
+    Args:
+        qpos: Wrist position [m], wrist orientation (wxyz, normalized here), joint angles [rad].
+    """
+    transforms: NDArray[np.float64] = pose_bones(
+        np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN
+    )
+    return transforms

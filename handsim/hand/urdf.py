@@ -24,12 +24,7 @@ _COLOR: Final = "0.85 0.65 0.55 1"
 
 
 def hand_urdf(model: HandModel, *, name: str = "hand") -> str:
-    """The text of a .urdf file: meters, radians, kilograms.
-
-    Args:
-        model: The hand.
-        name: Of the robot.
-    """
+    """The text of a .urdf file: meters, radians, kilograms."""
     root = ET.Element("robot", name=name)
     ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
     for number, bone in enumerate(BONES):

@@ -31,11 +31,6 @@ def velocity_of(
 ) -> Float[np.ndarray, "26"]:
     """Velocity that takes a hand from one pose to another, the shorter way round: `mj_differentiatePos`.
 
-    Args:
-        before: Wrist position [m], wrist orientation (wxyz, unit), joint angles [rad].
-        after: The same, later.
-        span: Time between the two [s].
-
     Returns:
         Wrist velocity in the world [m/s], its angular velocity in its own frame [rad/s], joint rates [rad/s].
     """

@@ -23,11 +23,8 @@ def kernel(function: Callable[P, R] | None = None, /, *, inline: bool = False) -
     """Compile a function with numba at its first call, and keep the machine code on disk.
 
     A division by zero gives infinity or NaN as in numpy. Sums keep their order (no fast-math), so that
-    results are the same on every machine.
-
-    Args:
-        function: The function; its arguments are arrays, numbers and other kernels.
-        inline: Whether its body is copied into each kernel that calls it.
+    results are the same on every machine. Arguments are arrays, numbers and other kernels; the body of an
+    inline kernel is copied into each kernel that calls it.
     """
     compiled = numba.njit(cache=True, error_model="numpy", inline="always" if inline else "never")
     return compiled if function is None else compiled(function)

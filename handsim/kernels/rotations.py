@@ -14,15 +14,7 @@ from handsim.kernels.kernel import kernel
 
 @kernel
 def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float, y: float, z: float) -> None:
-    """Write the rotation matrix of a unit quaternion.
-
-    Args:
-        matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
-        w: Real part.
-        x: First imaginary part.
-        y: Second imaginary part.
-        z: Third imaginary part.
-    """
+    """Write the rotation of a unit quaternion to the upper left 3x3 block of a matrix or transform."""
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = (
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),
@@ -49,7 +41,6 @@ def write_axis_angle_matrix(
     Args:
         matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
         axis: Unit vector (3,).
-        angle: [rad].
     """
     sine, cosine = np.sin(0.5 * angle), np.cos(0.5 * angle)
     write_quaternion_matrix(matrix, cosine, sine * axis[0], sine * axis[1], sine * axis[2])
@@ -79,7 +70,6 @@ def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray
     Args:
         rotation: Orientation (3, 3) of the frame, overwritten.
         axis: Unit vector (3,) in the frame's own coordinates.
-        angle: [rad].
     """
     sine, cosine = np.sin(angle), np.cos(angle)
     x, y, z = axis[0], axis[1], axis[2]

@@ -36,10 +36,3 @@ def segment_distance_squared(
         s = min(1.0, max(0.0, (uv * t - uw) / uu)) if uu > tiny else 0.0
     dx, dy, dz = wx + s * ux - t * vx, wy + s * uy - t * vy, wz + s * uz - t * vz
     return float(dx * dx + dy * dy + dz * dz)
-
-
-def segment_distance(
-    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> float:
-    """Distance [m] between the segments p-q and a-b, each point an array (3,) [m]."""
-    return float(np.sqrt(segment_distance_squared(p, q, a, b)))

@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
-from handsim.motion_files.local_poses import CHILDREN, local_rotations
-from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_bodies, posed_hands
+from handsim.motion_files.motion import (
+    CHILDREN,
+    Motion,
+    PosedHand,
+    file_axes,
+    local_rotations,
+    posed_bodies,
+    posed_hands,
+)
 from handsim.space.transforms import UpAxis, euler_angles
 
 ROOT: Final = "world_cm"
@@ -30,16 +37,7 @@ _POSITIONS: Final = "Xposition Yposition Zposition"
 
 
 def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things.
-
-    Args:
-        path: A .bvh file.
-        motion: What to write, at a steady rate.
-        up: The axis of its world that points up.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write hands and things, of a motion at a steady rate; an `OSError` if the file cannot be written."""
     turn = file_axes(up)
     columns = [np.zeros((len(motion.times), 6))]
     lines = [f"ROOT {ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]

@@ -4,26 +4,28 @@ Axes: y up, meters. At the top stand a node for each hand, `right_skeleton`, wit
 below it, named `right_palm`, `right_index_proximal` ..., its skin `right_hand`, and the things. The node over
 the palm lets programs see two skeletons in two hands: Blender puts bones with nothing above them into one.
 Each bone has a key per frame. What has no pose in some frames has the scale 0 there, which every reader shows
-as nothing; its other keys stay as they were.
+as nothing; its other keys stay as they were. The file is a JSON chunk and a chunk of arrays.
 """
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handsim._version import __version__
+from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
-from handsim.motion_files.glb_buffer import GlbBuffer
-from handsim.motion_files.local_poses import CHILDREN, local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals, split_vertices
 from handsim.motion_files.motion import (
+    CHILDREN,
     SKIN,
     THING,
     Material,
@@ -32,22 +34,26 @@ from handsim.motion_files.motion import (
     PosedHand,
     changes,
     file_axes,
+    local_rotations,
     posed_bodies,
     posed_hands,
     seconds_of,
+    smooth_quaternions,
 )
 from handsim.space.transforms import UpAxis
 
 _MATERIALS: Final = (SKIN, THING)
+Target = Literal["vertices", "indices"]
+_COMPONENTS: Final = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
+_TYPES: Final = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+_TARGETS: Final = {"vertices": 34962, "indices": 34963}
+_HEADER: Final = struct.Struct("<4sII")
+_CHUNK: Final = struct.Struct("<I4s")
+_MOST: Final = (1 << 32) - 1  # bytes that the header can state
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things; a motion of one frame is written as a pose, without an animation.
-
-    Args:
-        path: A .glb file.
-        motion: What to write.
-        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
@@ -80,7 +86,7 @@ class _Scene:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
-        """The whole file."""
+        """The whole file, of JSON without its arrays; an `ArgumentError` if a .glb cannot be so large."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": f"handsim {__version__}"},
             "scene": 0,
@@ -215,3 +221,65 @@ class _Scene:
 def _xyzw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions in glTF's order."""
     return np.roll(quaternions, -1, axis=-1)
+
+
+class GlbBuffer:
+    """Collects arrays and writes them with the JSON that names them."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+
+    def add(self, array: NDArray[Any], *, target: Target | None = None, bounds: bool = False) -> int:
+        """Add an array and return the index of its accessor.
+
+        Args:
+            array: Entries along the first axis: numbers, vectors or matrices (4, 4), of unsigned bytes or
+                words, or of float32.
+            target: What a graphics card uses it for.
+            bounds: Whether its least and greatest values are stated, as for positions and times.
+        """
+        content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # by columns
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": content.nbytes}
+        if target is not None:
+            view["target"] = _TARGETS[target]
+        accessor: dict[str, Any] = {
+            "bufferView": len(self._views),
+            "componentType": _COMPONENTS[content.dtype.str],
+            "count": len(content),
+            "type": _TYPES[content.shape[1:]],
+        }
+        if bounds:
+            for name, values in (("min", content.min(axis=0)), ("max", content.max(axis=0))):
+                accessor[name] = np.atleast_1d(values).tolist()
+        self._append(content.tobytes())
+        self._views.append(view)
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def pack(self, document: dict[str, Any]) -> bytes:
+        """The whole file.
+
+        Args:
+            document: The JSON without buffers, views and accessors.
+
+        Raises:
+            ArgumentError: It would be larger than a .glb can be.
+        """
+        arrays = {"buffers": [{"byteLength": self._size}], "bufferViews": self._views}
+        text = json.dumps(
+            {**document, **arrays, "accessors": self._accessors}, separators=(",", ":"), allow_nan=False
+        ).encode()
+        text += b" " * (-len(text) % 4)
+        size = _HEADER.size + 2 * _CHUNK.size + len(text) + self._size
+        if size > _MOST:
+            raise ArgumentError(f"a .glb of {size} bytes, expected at most {_MOST}; export at a lower rate")
+        head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON")
+        return b"".join([head, text, _CHUNK.pack(self._size, b"BIN\0"), *self._parts])
+
+    def _append(self, content: bytes) -> None:
+        content += b"\0" * (-len(content) % 4)
+        self._parts.append(content)
+        self._size += len(content)

@@ -1,6 +1,7 @@
 """Tables of joints, .csv and .parquet: a row per frame and hand, a column per number, its unit in its name.
 
 Where a hand has no pose, its row is there and its numbers are missing: empty in a .csv, null in .parquet.
+OpenSim's .mot has a row per frame, angles in degrees and NaN without a pose.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.osim import coordinate_names
 from handsim.hand.topology import JOINT_NAMES, SIDES, Side
-from handsim.motion_files.motion import Motion, PosedHand, posed_hands
-from handsim.space.transforms import UpAxis
+from handsim.motion_files.motion import Motion, PosedHand, posed_hands, seconds_of
+from handsim.space.transforms import UpAxis, body_fixed_angles, quaternion_matrix
 
 _FIRST: Final = ("frame", "time_s", "hand")
 _QPOS: Final = (
@@ -48,9 +51,6 @@ def read_joint_csv(path: Path) -> JointTable:
     """The poses in a .csv of `write_joint_csv`, or in another with its columns of frame, time, hand and qpos.
 
     Further columns, such as the positions of joints, are passed over; columns may come in any order.
-
-    Args:
-        path: A .csv file.
 
     Raises:
         CaptureError: The file cannot be read, lacks a column, or a cell is not what its column holds.
@@ -101,12 +101,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as text, UTF-8, with nine digits.
-
-    Args:
-        path: A .csv file.
-        motion: What to write.
-        up: Of no effect: the axes are the take's.
+    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is.
 
     Raises:
         OSError: The file cannot be written.
@@ -124,12 +119,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as Apache Parquet.
-
-    Args:
-        path: A .parquet file.
-        motion: What to write.
-        up: Of no effect: the axes are the take's.
+    """Write the table as Apache Parquet, in the take's axes whatever `up` is.
 
     Raises:
         OSError: The file cannot be written.
@@ -163,3 +153,36 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
     numbers = np.concatenate([qpos, keypoints], axis=1)
     numbers[~hand.present] = np.nan
     return numbers
+
+
+def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write the angles of all hands, in the take's axes whatever `up` is.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    hands = tuple(posed_hands(motion))
+    table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
+    names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
+    header = [
+        path.stem,
+        "version=1",
+        f"nRows={len(table)}",
+        f"nColumns={table.shape[1]}",
+        "inDegrees=yes",
+        "endheader",
+        "\t".join(names),
+    ]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(header) + "\n")
+        np.savetxt(file, table, fmt="%.9f", delimiter="\t")
+
+
+def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
+    """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
+    qpos = hand.qpos
+    turns = np.unwrap(body_fixed_angles(quaternion_matrix(qpos[:, 3:7])), axis=0)
+    angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
+    coordinates: NDArray[np.float64] = np.concatenate([qpos[:, :3], angles], axis=1)
+    coordinates[~hand.present] = np.nan
+    return coordinates

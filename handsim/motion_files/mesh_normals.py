@@ -18,7 +18,6 @@ def corner_normals(
     """Outward unit normal at each corner of each face: of the faces there that meet at less than 40 degrees.
 
     Args:
-        vertices: Positions [m].
         faces: Triangles, counter-clockwise from outside.
     """
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
@@ -37,11 +36,7 @@ def corner_normals(
 def split_vertices(
     faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
 ) -> tuple[Int[np.ndarray, "W"], Float[np.ndarray, "W 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices with one normal each.
-
-    Args:
-        faces: Triangles.
-        normals: The normals at their corners.
+    """Vertices with one normal each, from triangles with one at each corner.
 
     Returns:
         The old vertex of each new one, its normal, and the triangles of the new ones.

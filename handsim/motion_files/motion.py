@@ -1,4 +1,7 @@
-"""What the writers of motion files take: hands and rigid bodies over time, as a take has them."""
+"""What the writers of motion files take: hands and rigid bodies over time, as a take has them.
+
+Skeletons of other programs have rotations of the bones relative to their parents (`local_rotations`).
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,16 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.topology import Side
+from handsim.hand.topology import BONES, PALM, Side
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import UpAxis, pose_matrices
+from handsim.space.transforms import UpAxis, pose_matrices, rotation_quaternions
+
+CHILDREN: Final = tuple(
+    tuple(number for number, bone in enumerate(BONES) if bone.parent == parent)
+    for parent in range(len(BONES))
+)
+"""Indices of the bones that begin at the end of each bone."""
+_PARENTS: Final = np.array([bone.parent for bone in BONES])
 
 
 class Material(NamedTuple):
@@ -147,3 +157,19 @@ def _held(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np
     last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
     held: NDArray[np.float64] = values[np.where(last < 0, np.argmax(present), last)]
     return held
+
+
+def local_rotations(rotations: Float[np.ndarray, "T L 3 3"]) -> Float[np.ndarray, "T L 3 3"]:
+    """Each bone's orientation in its parent's frame; the palm's stays as it is."""
+    local: NDArray[np.float64] = np.swapaxes(rotations[:, _PARENTS], -1, -2) @ rotations
+    local[:, PALM] = rotations[:, PALM]
+    return local
+
+
+def smooth_quaternions(rotations: Float[np.ndarray, "T *batch 3 3"]) -> Float[np.ndarray, "T *batch 4"]:
+    """Unit wxyz quaternions of rotations over time, with the signs of which neighbors are near."""
+    quaternions = rotation_quaternions(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 4)
+    dots = (quaternions[1:] * quaternions[:-1]).sum(axis=-1, keepdims=True)
+    signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0), axis=0)
+    quaternions[1:] *= signs
+    return quaternions

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.motion_files.local_poses import smooth_quaternions
-from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_hands
+from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_hands, smooth_quaternions
 from handsim.space.transforms import UpAxis
 
 JOINTS: Final[tuple[str, ...]] = (
@@ -47,16 +46,7 @@ _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the joints of all hands.
-
-    Args:
-        path: A .json file, by custom `.openxr.json`.
-        motion: What to write.
-        up: The axis of its world that points up.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the joints of all hands as JSON, by custom to a name that ends in `.openxr.json`."""
     tracks = tuple(posed_hands(motion))
     header = {
         "format": "XR_EXT_hand_tracking joints by handsim",
@@ -82,10 +72,6 @@ def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:
     """`T_world_joint` of OpenXR's joints, in our world [m].
-
-    Args:
-        model: The hand.
-        qpos: Its poses.
 
     Raises:
         ArgumentError: `qpos` is not (T, 27) or not finite.

@@ -20,7 +20,6 @@ from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, PALM, Side
-from handsim.motion_files.local_poses import local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals
 from handsim.motion_files.motion import (
     SKIN,
@@ -30,9 +29,11 @@ from handsim.motion_files.motion import (
     PosedBody,
     PosedHand,
     changes,
+    local_rotations,
     posed_bodies,
     posed_hands,
     seconds_of,
+    smooth_quaternions,
 )
 from handsim.space.transforms import UpAxis
 
@@ -41,11 +42,6 @@ _AROUND: Final = 0.03  # [m] of skin around keypoints
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things.
-
-    Args:
-        path: A .usda or .usdc file.
-        motion: What to write.
-        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.

@@ -148,8 +148,6 @@ def pinhole(
     """A camera without distortion.
 
     Args:
-        name: Its name.
-        size: Width and height [px].
         focal: Focal length [px].
         center: Principal point [px]; the picture's center when not given.
     """
@@ -223,15 +221,9 @@ def points_in_view(
 
 @kernel(inline=True)
 def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
-    """Whether a camera has a point in its picture.
+    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture.
 
-    Args:
-        inner: Its row of `CameraArrays.intrinsics`.
-        size: Its row of `CameraArrays.sizes`.
-        lens: Its row of `CameraArrays.lenses`.
-        x: Of the point in the camera's axes [m], right.
-        y: Down.
-        z: Ahead.
+    The camera is its rows of `CameraArrays`: intrinsics, sizes and lenses.
     """
     u, v = x / z, y / z
     if lens[0] != PINHOLE:  # the call costs more than all the rest

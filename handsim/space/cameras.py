@@ -215,16 +215,10 @@ def _read(path: Path) -> CameraRig:
 def check_outside(
     rig: CameraRig, points: Float[np.ndarray, "*batch 3"], *, clearance: float = 0.05, what: str = "hand"
 ) -> None:
-    """Refuse a rig with a camera inside or near an object or a hand.
-
-    Args:
-        rig: The cameras.
-        points: The object's vertices, or other points of it, in all frames [m]; NaN points are left out.
-        clearance: Smallest distance of a camera from any of them [m].
-        what: Name of the object, for the message.
+    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages).
 
     Raises:
-        ArgumentError: A camera is nearer.
+        ArgumentError: A camera is nearer than `clearance` [m] to one of the points in any frame.
     """
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     flat = flat[~np.isnan(flat).any(axis=1)]
@@ -242,14 +236,8 @@ def check_outside_volume(
 ) -> None:
     """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
 
-    Args:
-        rig: The cameras.
-        center: Middle of the cube in the world [m].
-        half_side: Half its side [m].
-        clearance: Smallest distance of a camera from the cube [m].
-
     Raises:
-        ArgumentError: A camera is nearer.
+        ArgumentError: A camera is nearer to the cube than `clearance` [m].
     """
     middle = np.asarray(center, dtype=np.float64)
     nearest = np.clip(rig.positions, middle - half_side, middle + half_side)

@@ -67,11 +67,7 @@ class Lens:
     def jacobian(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 2"]:
         """How far image points move per tangent of their rays: derivatives of `distort` by x/z and y/z.
 
-        Args:
-            directions: In the camera's axes, z ahead; of any length.
-
-        Returns:
-            The identity for a pinhole; NaN where the lens does not see.
+        The identity for a pinhole; NaN where the lens does not see.
         """
         rays = np.ascontiguousarray(directions, dtype=np.float64)
         jacobians = np.empty((*rays.shape[:-1], 2, 2))
@@ -93,14 +89,7 @@ class Lens:
         return points
 
     def undistort(self, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Unit directions of the rays of image points: the inverse of `distort`.
-
-        Args:
-            points: Image points in focal lengths from the principal point.
-
-        Returns:
-            NaN for points that no ray meets.
-        """
+        """Unit directions of the rays of image points, inverse of `distort`; NaN where there is no ray."""
         points = np.asarray(points, dtype=np.float64)
         if self.kind == "fisheye":
             across = np.hypot(points[..., 0], points[..., 1])
@@ -192,14 +181,7 @@ class Lens:
 
 @kernel
 def distort_ray(lens: Any, x: float, y: float, z: float) -> tuple[float, float]:
-    """The image point of one ray [focal lengths]; NaN where the lens does not see.
-
-    Args:
-        lens: `Lens.row`.
-        x: Right, of a direction of any length in the camera's axes.
-        y: Down.
-        z: Ahead.
-    """
+    """The image point of a ray in the axes of the camera [focal lengths]; NaN if the lens sees it not."""
     if lens[0] == _FISHEYE:
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)

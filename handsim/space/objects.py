@@ -154,11 +154,7 @@ def _read_mesh(path: Path) -> Any:
 
 
 def _close(mesh: Any, path: Path) -> Part:
-    """Join the seams of a mesh, turn its inside in, and give its hull.
-
-    Raises:
-        ObjectError: It is not closed, or encloses nothing.
-    """
+    """Join the seams of a mesh, turn its inside in, and give its hull; an `ObjectError` if it is open."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
         closed = bool(mesh.is_watertight)

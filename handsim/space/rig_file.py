@@ -114,12 +114,7 @@ def check_near(owner: str, camera: Camera) -> None:
 
 
 def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
-    """The lines of a file, whose numbers are exact; pictures that all cameras share stand at the top.
-
-    Args:
-        name: The rig's name.
-        cameras: Its cameras.
-    """
+    """The lines of a file, whose numbers are exact; pictures that all cameras share stand at the top."""
     pictures = [list(_picture_lines(one)) for one in cameras]
     shared = all(one == pictures[0] for one in pictures)
     lines = [f"name = {quoted(name)}", *(pictures[0] if shared else ())]

@@ -44,14 +44,8 @@ def first_contact(
 ) -> Float[np.ndarray, "T"]:
     """Distance along `axis` [m] at which the moving hand, coming from outside, first touches the still one.
 
-    Everything farther out is free. Frames without a contact give `NEAREST`.
-
-    Args:
-        still: The hand that stays.
-        still_qpos: Its poses.
-        moving: The hand that approaches.
-        moving_qpos: Its poses at distance zero.
-        axis: Unit direction in the world in which the moving hand backs off.
+    Everything farther out is free. Frames without a contact give `NEAREST`. The axis is the unit direction in
+    the world in which the moving hand backs off; its poses are those at distance zero.
     """
     distance: NDArray[np.float64] = search_contact(
         moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
@@ -76,12 +70,10 @@ def close_fingers(
     """Joint angles [rad] of fingers that close from one pose towards another until they meet a hand.
 
     Args:
-        model: The hand whose fingers close.
-        opened: Its poses with open fingers.
+        opened: Poses with open fingers.
         closed: Joint angles [rad] of the fingers if nothing blocks them.
-        strength: Share of the path that each digit closes if nothing blocks it.
-        other: The hand that blocks the fingers, besides their own.
-        other_qpos: Its poses.
+        strength: Share of the path that each digit closes then.
+        other: The hand that blocks the fingers, besides their own, in its poses.
         window: Frames over which the paths are smoothed; 1 leaves each frame alone.
     """
     busy = np.flatnonzero(strength.max(axis=1) > 0.0)

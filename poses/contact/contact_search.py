@@ -82,12 +82,8 @@ def search_contact(
 ) -> Any:
     """Distance (T,) [m] along the axis at which capsules first touch others, by conservative advancement.
 
-    Args:
-        moving: Axes of the moving capsules at distance zero, in the world (T, K, 2, 3) [m].
-        moving_radii: Their radii (K,) [m].
-        still: Axes of the other capsules in the world (T, L, 2, 3) [m].
-        still_radii: Their radii (L,) [m].
-        axis: Unit direction in which the moving capsules back off (T, 3).
+    The moving capsules are in the world, at distance zero; the axis is the unit direction in which they back
+    off.
     """
     reach = np.empty(len(moving))
     p, q = np.empty(3), np.empty(3)
@@ -225,7 +221,6 @@ def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
 
     Args:
         wrists: Orientations (T, 3, 3) and positions (T, 3) [m] of the wrist.
-        angles: The digit's joint angles (T, 4) [rad].
         parts: The `Digit`.
     """
     posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((4, 3))

@@ -143,7 +143,6 @@ def sketch_meeting(
         variant: Its description, from `draw_variant`.
         count: Number of beats, K.
         together: Whether beats belong to one meeting, and so resemble each other, or are independent.
-        rng: Source of all randomness.
     """
     noise = _Noise(count, together, rng)
     still, moving = (

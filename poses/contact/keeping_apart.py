@@ -33,11 +33,8 @@ def point_pen(
     """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
 
     Args:
-        holder: The hand with the pen.
-        other: The hand that is pointed at.
-        pen: The pen; its tip is its first marker, its body goes from there along its z axis.
+        pen: Its tip is its first marker, its body goes from there along its z axis.
         held: Motion of fingers and pen relative to the wrist; the wrist's own motion is computed here.
-        other_motion: Motion of the other hand.
         path: Poses of the pen with its tip at the origin, from `pointing_path`.
 
     Raises:
@@ -62,16 +59,8 @@ def keep_apart(
 ) -> tuple[HandMotion, BodyMotion]:
     """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand.
 
-    Args:
-        holder: The hand with the object.
-        other: The hand to stay clear of.
-        obj: The object.
-        held: Motion of hand and object before they are drawn back.
-        other_motion: Motion of the other hand.
-        direction: Unit directions to draw back in.
-
     Raises:
-        PoseError: Something touches even when drawn back.
+        PoseError: Something touches even when drawn back, in these unit directions.
     """
     motion, body = held
     back = np.zeros(len(direction))

@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 from handsim.hand.model import HandModel, join_qpos
 from poses.contact.contact_closing import NEAREST, close_fingers, first_contact, smooth_above
 from poses.contact.interactions import Meeting, Sketch, draw_variant, meet, sketch_meeting
-from poses.contact.passages import Passage, TwoHandConfig, join_passages, placed_qpos, valid_frames
-from poses.motion.minimum_jerk import minimum_jerk
+from poses.contact.passages import (
+    APPROACH,
+    MAX_ACCELERATION,
+    MAX_SPEED,
+    RATE,
+    WRIST_SPEED,
+    Passage,
+    join_passages,
+    placed_qpos,
+    valid_frames,
+)
+from poses.motion.paths import minimum_jerk
 
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
 _FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
@@ -32,17 +42,11 @@ class _Course(NamedTuple):
     """Share of their strength with which fingers close."""
 
 
-def play_meeting(
-    right: HandModel, left: HandModel, name: str, config: TwoHandConfig, *, rng: np.random.Generator
-) -> Passage | None:
+def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random.Generator) -> Passage | None:
     """One interaction from coming together to letting go; None when this draw is not valid.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         name: One of `INTERACTIONS`.
-        config: Speeds and times.
-        rng: Source of all randomness.
     """
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
@@ -52,12 +56,12 @@ def play_meeting(
     ]
     draws = [meet([sketch], still, moving) for sketch in sketches]
     meeting = min(draws, key=lambda draw: float(_contact_distance(still, moving, draw, np.zeros(1))[0]))
-    course = _course(variant, count, config, rng)
+    course = _course(variant, count, rng)
     distance = _contact_distance(still, moving, meeting, course.beats)
     if (distance <= NEAREST).any():
         return None
-    passage = _close_contact(still, moving, meeting, course, distance=distance, rate=config.rate)
-    if _too_fast(passage, config) or not valid_frames(right, left, passage).all():
+    passage = _close_contact(still, moving, meeting, course, distance=distance, rate=RATE)
+    if _too_fast(passage) or not valid_frames(right, left, passage).all():
         return None
     return passage
 
@@ -68,11 +72,8 @@ def draw_poses(
     """Valid single poses of several interactions, the roles drawn once for each.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         counts: Names out of `INTERACTIONS`, each with a number of poses to draw; those that are not valid are
             left out.
-        rng: Source of all randomness.
     """
     draws = [_draw(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")
@@ -183,24 +184,24 @@ def _close_contact(
     return Passage(back, -np.einsum("tij,tj->ti", back, position), moving_qpos[:, 7:], still_qpos[:, 7:])
 
 
-def _course(variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.random.Generator) -> _Course:
+def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
     """The course of a meeting: come together, stay and move `count` times, let go."""
-    ends = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
+    ends = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
     # Fingers close after the hands met, and open before they part.
-    grips = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
+    grips = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
     tempo = rng.random(2)
     beats, lift = [np.zeros(ends[0] + grips[0])], [1.0 - minimum_jerk(ends[0]), np.zeros(grips[0])]
     lift[0] = rng.uniform(*_PARTED) * lift[0]
     for beat in range(count):
         stay, move = (
-            int((low + share * (high - low)) * rng.uniform(0.9, 1.1) * config.rate) + 1
+            int((low + share * (high - low)) * rng.uniform(0.9, 1.1) * RATE) + 1
             for (low, high), share in zip((variant["stay"], variant["move"]), tempo, strict=True)
         )
         beats.append(np.full(stay, float(beat)))
         lift.append(np.zeros(stay))
         if beat < count - 1:
             time = np.arange(1, move + 1) / move
-            height = min(rng.uniform(*variant["lift"]), move / config.rate * config.wrist_speed)
+            height = min(rng.uniform(*variant["lift"]), move / RATE * WRIST_SPEED)
             beats.append(beat + minimum_jerk(move))
             lift.append(height * 64.0 * (time * (1.0 - time)) ** 3)
     beats.append(np.full(ends[1] + grips[1], count - 1.0))
@@ -211,11 +212,9 @@ def _course(variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.
     return _Course(np.concatenate(beats), np.concatenate(lift), grip)
 
 
-def _too_fast(passage: Passage, config: TwoHandConfig) -> bool:
+def _too_fast(passage: Passage) -> bool:
     """Whether a joint exceeds the limits of speed or acceleration."""
     angles = np.concatenate([passage.right, passage.left], axis=1)
-    speeds = np.diff(angles, axis=0) * config.rate
-    accelerations = np.diff(speeds, axis=0) * config.rate
-    return bool(
-        np.abs(speeds).max() > config.max_speed or np.abs(accelerations).max() > config.max_acceleration
-    )
+    speeds = np.diff(angles, axis=0) * RATE
+    accelerations = np.diff(speeds, axis=0) * RATE
+    return bool(np.abs(speeds).max() > MAX_SPEED or np.abs(accelerations).max() > MAX_ACCELERATION)

@@ -10,48 +10,28 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim._checks import check_number, check_span
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rotation_quaternions
-from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
+from poses.motion.paths import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes.validity import is_valid, sample_valid_angles
 
 MAX_OVERLAP: Final = 0.001
 """How deep two hands may press into each other [m]."""
+RATE: Final = 120.0
+"""Frames per second [Hz]."""
+MAX_SPEED: Final = 10.0
+"""Highest joint speed [rad/s]."""
+MAX_ACCELERATION: Final = 200.0
+"""Largest joint acceleration [rad/s^2]."""
+WRIST_SPEED: Final = 1.0
+"""Highest speed of the pair, and of either hand against it between two meetings [m/s]."""
+APPROACH: Final = (0.4, 0.8)
+"""Shortest and longest time to come together or to let go [s]."""
+VOLUME: Final = 0.2
+"""Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
 _TURNING: Final = 8.0  # fastest rotation of one hand against the other [rad/s]
 _DISTANCE: Final = (0.25, 0.45)  # between the wrists of hands that are apart [m]
-
-
-@dataclass(frozen=True, slots=True)
-class TwoHandConfig:
-    """Speeds of two hands, times of their approach, and the volume in which they move.
-
-    Raises:
-        ArgumentError: A number or a pair of numbers is out of range.
-    """
-
-    rate: float = 120.0
-    """Frames per second [Hz]."""
-    max_speed: float = 10.0
-    """Highest joint speed [rad/s]."""
-    max_acceleration: float = 200.0
-    """Largest joint acceleration [rad/s^2]."""
-    wrist_speed: float = 1.0
-    """Highest speed of the pair, and of either hand against it between two meetings [m/s]."""
-    approach: tuple[float, float] = (0.4, 0.8)
-    """Shortest and longest time to come together or to let go [s]."""
-    apart: tuple[float, float] = (0.0, 0.6)
-    """Shortest and longest rest between two meetings [s]."""
-    volume: float = 0.2
-    """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "max_speed", "max_acceleration", "wrist_speed"):
-            check_number(name, getattr(self, name), 0.0, above=True)
-        check_number("volume", self.volume, 0.0)
-        check_span("approach", self.approach)
-        check_span("apart", self.apart)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,25 +70,22 @@ def path_between(
     left: HandModel,
     start: Passage,
     end: Passage,
-    config: TwoHandConfig,
+    pause: tuple[float, float],
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
     """Frames from one pose to another by way of one where the hands are apart; None when not valid.
 
     Args:
-        right: The right hand.
-        left: The left hand.
         start: Where the path begins, one frame.
         end: Where it ends, one frame.
-        config: Speeds and times.
-        rng: Source of all randomness.
+        pause: Shortest and longest rest where the hands are apart [s].
     """
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
     )
-    rest = apart.at(np.zeros(int(rng.uniform(*config.apart) * config.rate), dtype=int))
-    path = join_passages([_straight(start, apart, config, rng), rest, _straight(apart, end, config, rng)])
+    rest = apart.at(np.zeros(int(rng.uniform(*pause) * RATE), dtype=int))
+    path = join_passages([_straight(start, apart, rng), rest, _straight(apart, end, rng)])
     return path if valid_frames(right, left, path).all() else None
 
 
@@ -135,18 +112,18 @@ def placed_qpos(
     return join_qpos(angles, position=position, quaternion=rotation_quaternions(rotation))
 
 
-def _straight(start: Passage, end: Passage, config: TwoHandConfig, rng: np.random.Generator) -> Passage:
+def _straight(start: Passage, end: Passage, rng: np.random.Generator) -> Passage:
     """Minimum-jerk frames from a single pose to another, without the first."""
     rotations = Rotation.from_matrix(np.concatenate([start.rotation, end.rotation]))
     bend = max(np.abs(end.right - start.right).max(), np.abs(end.left - start.left).max())
     seconds = max(
-        rng.uniform(*config.approach),
-        PEAK_SPEED * bend / config.max_speed,
-        np.sqrt(PEAK_ACCELERATION * bend / config.max_acceleration),
+        rng.uniform(*APPROACH),
+        PEAK_SPEED * bend / MAX_SPEED,
+        np.sqrt(PEAK_ACCELERATION * bend / MAX_ACCELERATION),
         PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _TURNING,
-        PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / config.wrist_speed,
+        PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / WRIST_SPEED,
     )
-    share = minimum_jerk(int(np.ceil(seconds * config.rate)) + 1)
+    share = minimum_jerk(int(np.ceil(seconds * RATE)) + 1)
     along = share[:, None]
     return Passage(
         Slerp([0.0, 1.0], rotations)(share).as_matrix(),

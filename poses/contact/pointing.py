@@ -9,9 +9,20 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from handsim._checks import check_number, check_span
-from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
+from poses.motion.paths import PEAK_SPEED, minimum_jerk
 
+DISTANCE: Final = (0.006, 0.02)
+"""Smallest and largest distance of the tip from its target [m]."""
+SPEED: Final = 0.6
+"""Highest speed of the tip between still targets, without the retreat [m/s]; slow paths take longer."""
+TURNING: Final = 3.0
+"""The same for the rotation of the pen [rad/s]."""
+RETREAT: Final = 0.05
+"""Distance that the tip draws back between two targets [m]."""
+_STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
+PATH: Final = (0.4, 0.9)
+"""Shortest and longest time from target to target [s]."""
+_TILT: Final = 0.6  # lean of the pen from the outward direction, standard deviation of the tangent
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
 _ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
@@ -21,44 +32,12 @@ _BEHIND: Final = -0.2  # targets that face away from the pen by more, as a cosin
 _STEADY: Final = 0.15  # [s] over which outward directions are smoothed, standard deviation
 
 
-@dataclass(frozen=True, slots=True)
-class PointingConfig:
-    """Distances, times and speeds of the pen.
-
-    Raises:
-        ArgumentError: A number or a pair of numbers is out of range.
-    """
-
-    distance: tuple[float, float] = (0.006, 0.02)
-    """Smallest and largest distance of the tip from its target [m]."""
-    retreat: float = 0.05
-    """Distance that the tip draws back between two targets [m]."""
-    stay: tuple[float, float] = (0.15, 0.6)
-    """Shortest and longest time at a target [s]."""
-    path: tuple[float, float] = (0.4, 0.9)
-    """Shortest and longest time from target to target [s]."""
-    tilt: float = 0.6
-    """Lean of the pen from the outward direction, standard deviation of the tangent."""
-    speed: float = 0.6
-    """Highest speed of the tip between still targets, without the retreat [m/s]; slow paths take longer."""
-    turning: float = 3.0
-    """The same for the rotation of the pen [rad/s]."""
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "turning"):
-            check_number(name, getattr(self, name), 0.0, above=True)
-        for name in ("retreat", "tilt"):
-            check_number(name, getattr(self, name), 0.0)
-        for name in ("distance", "stay", "path"):
-            check_span(name, getattr(self, name))
-
-
 def pointing_path(
     positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
-    config: PointingConfig | None = None,
     *,
+    speed: float = SPEED,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 4"]:
     """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
@@ -66,14 +45,11 @@ def pointing_path(
     Args:
         positions: Possible targets, moving in the world [m].
         outward: Unit directions from which each can be reached.
-        rate: Frames per second [Hz].
-        config: Distances, times and speeds; the defaults if not given.
-        rng: Source of all randomness.
+        speed: Highest speed of the tip [m/s], see `SPEED`.
     """
-    config = config or PointingConfig()
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
-    visits = _plan(positions, outward, rate, config, rng)
+    visits = _plan(positions, outward, rate, speed, rng)
     share = np.concatenate([visit.share for visit in visits])
     number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
     now = np.arange(len(positions))
@@ -89,7 +65,7 @@ def pointing_path(
     (here, axis_here), (there, axis_there) = at(number), at(number + 1)
     blend = share[:, None]
     axis = _between(axis_here, axis_there, blend)
-    lift = config.retreat * np.sin(np.pi * blend) ** 2
+    lift = RETREAT * np.sin(np.pi * blend) ** 2
     return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
 
 
@@ -108,37 +84,35 @@ def _plan(
     positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
-    config: PointingConfig,
+    speed: float,
     rng: np.random.Generator,
 ) -> list[_Visit]:
     """Visits for all frames, and one more where the last path leads."""
     visits: list[_Visit] = []
     frame = 0
-    target, lean = _draw(outward[0], config, rng)
+    target, lean = _draw(outward[0], rng)
     while frame < len(positions):
         here, axis = positions[frame], _axes(outward[frame, target], lean)
-        following, next_lean = _draw(outward[frame], config, rng)
+        following, next_lean = _draw(outward[frame], rng)
         next_axis = _axes(outward[frame, following], next_lean)
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
         seconds = max(
-            rng.uniform(*config.path),
-            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
-            PEAK_SPEED * turn / config.turning,
+            rng.uniform(*PATH),
+            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / speed,
+            PEAK_SPEED * turn / TURNING,
         )
-        stay = np.zeros(max(1, round(rng.uniform(*config.stay) * rate)))
+        stay = np.zeros(max(1, round(rng.uniform(*_STAY) * rate)))
         share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])
-        visits.append(_Visit(target, rng.uniform(*config.distance), lean, share))
+        visits.append(_Visit(target, rng.uniform(*DISTANCE), lean, share))
         frame, target, lean = frame + len(share), following, next_lean
-    return [*visits, _Visit(target, rng.uniform(*config.distance), lean, np.zeros(0))]
+    return [*visits, _Visit(target, rng.uniform(*DISTANCE), lean, np.zeros(0))]
 
 
-def _draw(
-    outward: Float[np.ndarray, "M 3"], config: PointingConfig, rng: np.random.Generator
-) -> tuple[int, Float[np.ndarray, "3"]]:
+def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[int, Float[np.ndarray, "3"]]:
     """A target that can be reached now, and the lean of the pen there."""
     open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
-    lean = config.tilt * rng.standard_normal(3)
+    lean = _TILT * rng.standard_normal(3)
     lean -= (lean @ outward[target]) * outward[
         target
     ]  # sideways, or a rotation of the target would swing the pen

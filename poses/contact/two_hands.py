@@ -23,18 +23,19 @@ from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
 from poses.contact.meetings import draw_poses, play_meeting
-from poses.contact.passages import Passage, TwoHandConfig, join_passages, path_between
-from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
+from poses.contact.passages import RATE, VOLUME, WRIST_SPEED, Passage, join_passages, path_between
+from poses.motion.paths import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
 
 __all__ = [
     "INTERACTIONS",
-    "TwoHandConfig",
     "sample_two_hand_motion",
     "sample_two_hand_poses",
     "two_hands_penetration",
 ]
 
+PAUSE: Final = (0.0, 0.6)
+"""Shortest and longest rest between two meetings [s]."""
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
 _ROTATION: Final = 0.5  # spread of the rotation between two positions [rad]
 _MOST_DRAWS: Final = 60
@@ -62,54 +63,40 @@ def sample_two_hand_motion(
     right: HandModel,
     left: HandModel,
     duration: float,
-    config: TwoHandConfig | None = None,
     *,
+    pause: tuple[float, float] = PAUSE,
     interactions: Sequence[str] | None = None,
     rng: np.random.Generator,
 ) -> tuple[HandMotion, HandMotion]:
     """Random smooth motion of two hands through a series of interactions, valid at every frame.
 
-    Args:
-        right: A right hand.
-        left: A left hand; it may be another person's.
-        duration: How long [s]; each motion has `round(duration * rate) + 1` frames.
-        config: Speeds and positions; human ones by default.
-        interactions: Names out of `INTERACTIONS`; all of them when not given.
-        rng: Source of all randomness.
+    It has `round(duration * RATE) + 1` frames, and the interactions are all of `INTERACTIONS` when not given.
+    Between two meetings hands rest apart for a time from shortest to longest pause [s]. The left hand may be
+    another person's.
 
     Raises:
         ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
             and a left one.
         PoseError: No valid path that brings them together was found.
     """
-    config = config or TwoHandConfig()
     names = INTERACTIONS if interactions is None else tuple(interactions)
     check_names(names)
     _check_sides(right, left)
     if not 0.0 < duration < np.inf:
         raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
-    frames = round(duration * config.rate) + 1
-    passages = _next_passages(right, left, None, names, config, rng=rng)
+    frames = round(duration * RATE) + 1
+    passages = _next_passages(right, left, None, names, pause, rng=rng)
     while sum(map(len, passages)) < frames:
-        passages += _next_passages(right, left, passages[-1].at([-1]), names, config, rng=rng)
+        passages += _next_passages(right, left, passages[-1].at([-1]), names, pause, rng=rng)
     whole = join_passages(passages).at(slice(frames))
-    right_qpos, left_qpos = _in_world(whole, *_travel(frames, config, rng))
-    return HandMotion(right_qpos, config.rate), HandMotion(left_qpos, config.rate)
+    right_qpos, left_qpos = _in_world(whole, *_travel(frames, rng))
+    return HandMotion(right_qpos, RATE), HandMotion(left_qpos, RATE)
 
 
 def sample_two_hand_poses(
     right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
-    """Single poses of two hands that touch or nearly do, each drawn on its own, all valid.
-
-    Args:
-        right: A right hand.
-        left: A left hand; it may be another person's.
-        count: How many.
-        rng: Source of all randomness.
-
-    Returns:
-        qpos of the right hand and of the left one.
+    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid.
 
     Raises:
         ArgumentError: The count is not positive, or the hands are not a right and a left one.
@@ -131,8 +118,7 @@ def sample_two_hand_poses(
         if missing <= 0:
             whole = join_passages(passages)
             whole = whole.at(rng.permutation(len(whole))[:count])
-            volume = TwoHandConfig().volume
-            positions = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
+            positions = ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=(count, 3))
             return _in_world(whole, positions, Rotation.from_quat(random_quaternions(count, rng=rng)))
     raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
 
@@ -142,37 +128,35 @@ def _next_passages(
     left: HandModel,
     last: Passage | None,
     names: tuple[str, ...],
-    config: TwoHandConfig,
+    pause: tuple[float, float],
     *,
     rng: np.random.Generator,
 ) -> list[Passage]:
     """The path from the last frame to a meeting, and the meeting."""
     name = names[rng.integers(len(names))]
     for _ in range(_MOST_DRAWS):
-        meeting = play_meeting(right, left, name, config, rng=rng)
+        meeting = play_meeting(right, left, name, rng=rng)
         if meeting is None:
             continue
         if last is None:
             return [meeting]
         for _ in range(_MOST_PATHS):
-            path = path_between(right, left, last, meeting.at([0]), config, rng=rng)
+            path = path_between(right, left, last, meeting.at([0]), pause, rng=rng)
             if path is not None:
                 return [path, meeting]
     raise PoseError(f"no valid path was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
 
 
-def _travel(
-    frames: int, config: TwoHandConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], Rotation]:
+def _travel(frames: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], Rotation]:
     """Positions (T, 3) and orientations of a pair of hands that moves from position to position."""
-    positions = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
+    positions = [ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3)]
     orientations, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
     while sum(map(len, shares)) < frames:
-        positions.append(ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3))
+        positions.append(ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3))
         orientations.append(orientations[-1] * Rotation.from_rotvec(rng.normal(scale=_ROTATION, size=3)))
         distance = float(np.linalg.norm(positions[-1] - positions[-2]))
-        seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / config.wrist_speed)
-        shares.append(len(positions) - 2 + minimum_jerk(int(np.ceil(seconds * config.rate))))
+        seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / WRIST_SPEED)
+        shares.append(len(positions) - 2 + minimum_jerk(int(np.ceil(seconds * RATE))))
     return along(np.array(positions), Rotation.concatenate(orientations), np.concatenate(shares)[:frames])
 
 

@@ -43,12 +43,7 @@ _GEOMS: Final = {
 
 
 class GraspScene:
-    """One hand and one object, compiled. Poses are in the wrist's frame; the scene itself keeps no state.
-
-    Args:
-        model: The hand.
-        obj: The object.
-    """
+    """One hand and one object, compiled. Poses are in the wrist's frame; the scene itself keeps no state."""
 
     def __init__(self, model: HandModel, obj: RigidObject) -> None:
         self.hand = model
@@ -118,12 +113,6 @@ def object_penetration(
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch.
-
-    Args:
-        model: The hand.
-        obj: The object.
-        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad].
-        T_world_object: Pose of the object in the world [m].
 
     Raises:
         ArgumentError: The arrays have different numbers of frames, or another shape.

@@ -52,11 +52,7 @@ def settle_hold(
 ) -> Hold:
     """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
 
-    Args:
-        model: The hand.
-        obj: The object it holds.
-        rng: Source of all randomness: placement, and the style when none is named.
-        hold: One of `hold_names`; a random one by default.
+    The hold is one of `hold_names`, a random one when not given.
 
     Raises:
         ArgumentError: The object has no hold of this name.

@@ -45,15 +45,7 @@ def sample_held_poses(
 ) -> tuple[Float[np.ndarray, "B 20"], Float[np.ndarray, "B 4 4"]]:
     """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
 
-    Args:
-        model: The hand.
-        obj: The object it holds.
-        hold: A settled grasp of the object by this hand.
-        count: Number of variants, B.
-        rng: Source of all randomness.
-
-    Returns:
-        Joint angles [rad], and `T_wrist_object` [m].
+    Returns joint angles [rad], and `T_wrist_object` [m].
 
     Raises:
         PoseError: The hold is not valid, such as one of another hand.

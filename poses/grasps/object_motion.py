@@ -26,7 +26,7 @@ from poses.grasps.grasp_scene import (
 from poses.grasps.grasping import Hold, settle_hold, why_not_held
 from poses.grasps.held_poses import Held, between, is_held_valid, rotation_between, sample_held_poses
 from poses.grasps.hold_library import HoldStyle, hold_names, hold_style
-from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, minimum_jerk
+from poses.motion.paths import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, minimum_jerk
 from poses.motion.wrist_paths import free_wrist_path
 
 __all__ = [
@@ -58,12 +58,7 @@ def sample_object_motion(
 ) -> tuple[HandMotion, BodyMotion]:
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
-    Args:
-        model: The hand.
-        obj: The object it holds.
-        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and positions; human ones by default.
-        rng: Source of all randomness.
+    It has `round(duration * rate) + 1` frames.
 
     Raises:
         ArgumentError: The duration is not positive.

@@ -19,8 +19,7 @@ from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_JOINTS
-from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight_path
-from poses.motion.rest_paths import path_to_rest
+from poses.motion.paths import MotionConfig, held, minimum_jerk, path_to_rest, straight_path
 from poses.motion.wrist_paths import free_wrist_path
 from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
 
@@ -70,16 +69,10 @@ def motion_through(
     *,
     rng: np.random.Generator,
 ) -> HandMotion:
-    """Smooth motion of one hand from each of the given poses to the next, valid at every frame.
+    """Smooth motion of one hand from each of the given poses [rad] to the next, valid at every frame.
 
     It begins in the first pose and rests for a moment at each later one; durations and the wrist's path are
-    random.
-
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        poses: Joint angles [rad], at least two poses.
-        config: Speeds and positions; human ones by default.
-        rng: Source of all randomness.
+    random. A shape or the name of a size is a right hand.
 
     Raises:
         ArgumentError: There are fewer than two poses, or one is not valid on this hand.

@@ -18,9 +18,8 @@ from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_JOINTS
-from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion, with_wrist
-from poses.motion.rest_paths import can_be_left
+from poses.motion.paths import MotionConfig, can_be_left
 from poses.shapes.library import gesture, gestures_of
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import make_valid
@@ -58,7 +57,6 @@ def scripted_motion(
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
         config: Speeds and positions; human ones by default. Except for "free",
             `durations` and `hold` are those of the script.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There is no such script, or the duration is not positive or less than a step.

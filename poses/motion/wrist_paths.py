@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from handsim._checks import check_array, check_number, check_span
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
-from poses.motion.minimum_jerk import MotionConfig, minimum_jerk
+from poses.motion.paths import MotionConfig, minimum_jerk
 
 _FREE_ROTATION: Final = 0.6  # from position to position, standard deviation about each axis [rad]
 _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

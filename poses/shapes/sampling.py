@@ -48,13 +48,7 @@ class PoseSampler(Protocol):
 def mixed_angles(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T 20"]:
     """The sampler that training sets use: gestures, finger curls and uniform angles in the default mix.
 
-    Args:
-        model: The hand; these angles are the same for every hand.
-        num_poses: Number of poses, T.
-        rng: Source of all randomness.
-
-    Returns:
-        Joint angles [rad], inside ranges and couplings; digits may still touch.
+    Joint angles [rad] are inside ranges and couplings, the same for every hand; digits may still touch.
     """
     return sample_angles(num_poses, rng=rng)
 

@@ -62,12 +62,9 @@ class ThumbContact:
 def thumb_contact(
     model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
 ) -> ThumbContact:
-    """The nearest points of thumb and finger, touching or not.
+    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not.
 
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        angles: Joint angles [rad].
-        finger: "index", "middle", "ring" or "little".
+    A shape or the name of a size is a right hand.
 
     Raises:
         ArgumentError: There is no such finger, or `angles` is not (T, 20).
@@ -230,13 +227,7 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
 def _overlaps(
     segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
 ) -> Any:
-    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart.
-
-    Args:
-        segments: Both ends of every axis (T, K, 2, 3) [m].
-        radii: Capsule radii (K,) [m].
-        pairs: Indices of two capsules each (P, 2).
-    """
+    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart."""
     overlaps = np.empty((len(segments), len(pairs)))
     for frame in range(len(segments)):
         for pair in range(len(pairs)):

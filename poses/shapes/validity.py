@@ -74,7 +74,6 @@ def make_valid(
 
     Args:
         model: The hand; a shape or the name of a size is a right one.
-        angles: Joint angles [rad].
 
     Raises:
         PoseError: This hand has no valid pose at rest.

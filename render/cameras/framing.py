@@ -22,11 +22,7 @@ _WIDEST: Final = 2.0  # tangent of half the angle of view that is made use of
 
 
 class Framing:
-    """The hands of a take as cameras have to show them.
-
-    Args:
-        take: The take.
-    """
+    """The hands of a take as cameras have to show them."""
 
     def __init__(self, take: Take) -> None:
         shape = (take.num_frames, len(take.hands), len(_KEPT), 3)
@@ -121,7 +117,6 @@ class Framing:
         """Shortest distance of a camera from the place that it looks at with all hands in its picture [m].
 
         Args:
-            camera: The camera.
             centers: Where it looks [m].
             rotations: Its axes in the world, as columns.
             frames: Which frames; all when not given.

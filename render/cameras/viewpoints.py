@@ -128,9 +128,7 @@ class Viewpoints:
     """Cameras of every frame.
 
     Args:
-        config: Placement of the cameras.
         take: The take whose hands they look at.
-        rng: Source of all random choices.
     """
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
@@ -232,11 +230,7 @@ def _largest(
 ) -> _Path:
     """The first of some cameras that shows hands as large as asked for; if none does, the best of them.
 
-    Args:
-        config: What is asked for.
-        framing: The hands.
-        ways: Directions (T, 3) of a camera from the hands; the first is taken where hands have one distance.
-        rng: Source of the distances.
+    Of the directions (T, 3) the first is taken where hands have one distance.
     """
     best, chosen = np.inf, None
     for directions in ways:
@@ -450,12 +444,9 @@ def zoomed(camera: Camera, zoom: float) -> Camera:
 
 
 def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
-    """Refuse cameras that never have a hand in their pictures, and tell of those among them.
+    """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
 
-    Args:
-        name: Their file or names, for messages.
-        cameras: The cameras.
-        take: The take; keypoints of all frames are projected, and hidden ones count.
+    Cameras among them without a hand are told.
 
     Raises:
         RigError: No camera has a keypoint in its picture in any frame.
@@ -498,14 +489,9 @@ def around_hands(
     *,
     rng: np.random.Generator,
 ) -> Camera:
-    """A camera at a random place around hands, turned at random about its axis.
+    """A camera at a random place around hands, turned at random about its axis, not behind their forearms.
 
-    Args:
-        camera: Its size, matrix and lens.
-        keypoints: Of all hands, in the world [m].
-        qpos: Their poses; the camera is not behind their forearms.
-        share: Of the picture's shorter side that the keypoints span.
-        rng: Source of the place.
+    The keypoints of all hands, in the world [m], span this share of the picture's shorter side.
     """
     center = 0.5 * (keypoints.min(axis=0) + keypoints.max(axis=0))
     along = quaternion_matrix(qpos[:, 3:7])[..., 0]
@@ -536,14 +522,9 @@ def around_hands(
 def crop_around(
     camera: Camera, keypoints: Float[np.ndarray, "K 3"], share: float, size: int, *, rng: np.random.Generator
 ) -> Camera:
-    """A pinhole camera at the same place that sees a square around hands alone.
+    """A pinhole camera at the place of another one that sees a square of `size` pixels around hands.
 
-    Args:
-        camera: A pinhole camera.
-        keypoints: Of all hands, in the world [m].
-        share: Of the square's side that the keypoints span.
-        size: Side of its picture [px].
-        rng: Source of where in the square the hands are.
+    The keypoints of all hands, in the world [m], span this share of its side, somewhere in it.
     """
     pixels = camera.project(keypoints)
     low, high = pixels.min(axis=0), pixels.max(axis=0)

@@ -74,12 +74,9 @@ def faces_for(camera: Camera) -> list[Camera]:
 
 
 def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interpolation) -> NDArray[Any]:
-    """The picture through the lens; 0 where it sees nothing.
+    """The picture through the lens, from one for each of `faces_for`; 0 where it sees nothing.
 
-    Args:
-        camera: With the lens.
-        pictures: One per face of `faces_for`, (h, w) or (h, w, channels).
-        interpolation: `linear` for colors, `nearest` for ids.
+    The interpolation is `linear` for colors, `nearest` for ids.
 
     Raises:
         ArgumentError: The pictures are not those of the camera's faces.
@@ -95,14 +92,10 @@ def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interp
 
 
 def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis [m] from depths along the axes of its faces.
+    """Depth along the camera's axis [m] from depths along the axes of its faces, 0 where there is nothing.
 
     Between pixels of one surface the reciprocal is interpolated, which is exact for planes; at edges the
     nearest pixel counts. What is not ahead of the camera (a fisheye may see it) has depth 0.
-
-    Args:
-        camera: With the lens.
-        depths: One per face of `faces_for` [m], 0 where there is nothing.
 
     Raises:
         ArgumentError: The pictures are not those of the camera's faces.
@@ -125,11 +118,7 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 def warp_normals(
     camera: Camera, normals: Sequence[Float32[np.ndarray, "h w 3"]]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Normals in the camera's axes from those of its faces in theirs, of the nearest pixels.
-
-    Args:
-        camera: With the lens.
-        normals: One per face of `faces_for`, 0 where there is nothing.
+    """Normals in the camera's axes from those of its faces in theirs, of the nearest pixels; 0 for nothing.
 
     Raises:
         ArgumentError: The pictures are not those of the camera's faces.

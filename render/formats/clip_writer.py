@@ -45,11 +45,7 @@ class WebdatasetWriter:
         return shards_in(self.folder, suffix=TAR)
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard, or write it anew.
-
-        Args:
-            shard: Its number, from 0.
-            frames: Those of one number, from different cameras, follow one another.
+        """Write a shard, or write it anew; frames of one number, from different cameras, follow one another.
 
         Raises:
             HandSimError: They do not, a frame has two hands of one side, or the disk takes no more.
@@ -105,12 +101,7 @@ def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
 def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     """`hand_crops.json` of one time: for each side the crop's camera in each stream that sees the hand.
 
-    Args:
-        frames: One a stream.
-
-    Returns:
-        For `left` and `right`, by stream: `T_world_from_crop_camera`, and `crop_camera_fov`, the full angle
-        of view [rad].
+    By stream: `T_world_from_crop_camera`, and `crop_camera_fov`, the full angle of view [rad].
 
     Raises:
         HandSimError: Two hands are of the same side.
@@ -131,14 +122,9 @@ def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
 def crop_camera(
     camera: Camera, keypoints: Float[np.ndarray, "21 3"]
 ) -> tuple[Float[np.ndarray, "4 4"], float] | None:
-    """The pose of a camera for one hand alone, and its full angle of view [rad].
+    """The pose of a camera for one hand alone, from its keypoints [m], and its full angle of view [rad].
 
-    Args:
-        camera: The camera that sees the hand.
-        keypoints: Of the hand, in the world [m].
-
-    Returns:
-        None for a hand beside or behind the camera, or one that no flat picture of 120 degrees holds.
+    None for a hand beside or behind the camera, or one that no flat picture of 120 degrees holds.
     """
     local = camera.local(keypoints)
     if local[:, 2].mean() < _NEAREST:

@@ -48,9 +48,7 @@ _KINDS: Final = {"rgb": ".jpg", "mask": ".jpg", "depth": ".png"}
 def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dict[str, Any]]]:
     """The visible hands: their indices in the frame, and their entries in each of the lists.
 
-    Args:
-        frame: Of a pinhole camera.
-        vertices: Whether to add the skin, some 150 kB a hand.
+    The skin is added where `vertices`, some 150 kB a hand.
 
     Raises:
         HandSimError: The camera's lens is not a pinhole.

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
+from handsim.files.outputs import check_free
 from render.formats.annotations.common import to_json
 from render.formats.clip_writer import TAR
 from render.formats.folder_writers import PICTURES, FolderWriter

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from pathlib import Path
 from typing import Any, Final
 
 import cv2
@@ -16,15 +15,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.errors import DatasetError, HandSimError
 from handsim.kernels.kernel import kernel
 from render.formats.annotations.common import as_sensed
 from render.frames import Pictures, RenderedFrame
 
 METERS_PER_UNIT: Final = 1e-4
-"""Unit of a depth picture [m], unless its file contains another."""
+"""Unit of a depth picture [m]."""
 _KEYWORD: Final = b"metres_per_unit"
-_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
 _MOST: Final = 65535
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
@@ -42,69 +39,27 @@ def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QU
     return _encode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def encode_depth(depth: Float32[np.ndarray, "H W"], *, meters_per_unit: float = METERS_PER_UNIT) -> bytes:
+def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
     """Depth [m] as 16-bit gray PNG, with its unit in a text chunk `metres_per_unit`.
 
-    Args:
-        depth: Meters; 0, NaN and what does not fit into 65535 units become 0.
-        meters_per_unit: Depth of one unit [m].
-
-    Raises:
-        HandSimError: The unit is not a positive number.
+    0, NaN and what does not fit into 65535 units become 0.
     """
-    if not 0.0 < meters_per_unit < np.inf:
-        raise HandSimError(f"meters_per_unit is {meters_per_unit:g}, expected a positive number of meters")
-    data = _encode(".png", _depth_steps(np.ascontiguousarray(depth), meters_per_unit))
-    text = _KEYWORD + b"\0" + repr(float(meters_per_unit)).encode("ascii")
+    data = _encode(".png", _depth_steps(np.ascontiguousarray(depth)))
+    text = _KEYWORD + b"\0" + repr(METERS_PER_UNIT).encode("ascii")
     end = _FIRST_CHUNK.stop
     return data[:end] + _chunk(b"tEXt", text) + data[end:]
 
 
 @kernel
-def _depth_steps(depth: NDArray[np.float32], meters_per_unit: float) -> Any:
+def _depth_steps(depth: NDArray[np.float32]) -> Any:
     """Depth (H, W) in whole units; 0 for what does not fit."""
     steps = np.zeros(depth.shape, np.uint16)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
-            step = np.rint(depth[row, column] / meters_per_unit)
+            step = np.rint(depth[row, column] / METERS_PER_UNIT)
             if 0.0 < step <= _MOST:  # never so for NaN
                 steps[row, column] = int(step)
     return steps
-
-
-def decode_depth(data: bytes, *, name: str = "depth picture") -> Float32[np.ndarray, "H W"]:
-    """Depth [m] of a 16-bit gray PNG, 0 where there is nothing.
-
-    Args:
-        data: The file; without a chunk `metres_per_unit`, steps are taken for tenths of a millimeter.
-        name: What to call it in messages.
-
-    Raises:
-        DatasetError: It is not such a picture.
-    """
-    unit = _unit(data, name)
-    steps = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if steps is None:
-        raise DatasetError(f"{name}: damaged: it is not a whole PNG picture")
-    if steps.dtype != np.uint16 or steps.ndim != 2:
-        raise DatasetError(
-            f"{name}: {steps.dtype} of shape {steps.shape}, expected a 16-bit gray picture of depth"
-        )
-    depth: NDArray[np.float32] = (steps * unit).astype(np.float32)
-    return depth
-
-
-def read_depth(path: str | Path) -> Float32[np.ndarray, "H W"]:
-    """Depth [m] of a file that `encode_depth` made.
-
-    Raises:
-        DatasetError: The file cannot be read, or is not such a picture.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    return decode_depth(data, name=str(path))
 
 
 def encode_ids(pictures: Pictures) -> bytes | None:
@@ -169,24 +124,3 @@ def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None
 def _chunk(name: bytes, content: bytes) -> bytes:
     checksum = zlib.crc32(name + content)
     return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
-
-
-def _unit(data: bytes, name: str) -> float:
-    """Unit that a PNG states, ours when it states none."""
-    if not data.startswith(_SIGNATURE):
-        raise DatasetError(f"{name}: not a PNG file")
-    offset = len(_SIGNATURE)
-    while offset + 8 <= len(data):
-        length, kind = struct.unpack(">I4s", data[offset : offset + 8])
-        content = data[offset + 8 : offset + 8 + length]
-        keyword, _, text = content.partition(b"\0")
-        if kind == b"tEXt" and keyword == _KEYWORD:
-            try:
-                unit = float(text)
-            except ValueError:
-                unit = np.nan
-            if not 0.0 < unit < np.inf:
-                raise DatasetError(f"{name}: damaged: its unit '{text!r}' is not a number of meters")
-            return unit
-        offset += 12 + length
-    return METERS_PER_UNIT

@@ -64,11 +64,7 @@ NEED_COLORS: Final = ("coco", "yolo", "freihand", "interhand")
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
-    """The writer of a format.
-
-    Args:
-        name: One of `FORMATS`.
-        folder: Where its files shall be; made when it is not there.
+    """The writer of one of `FORMATS`, into a folder that is made when it is not there.
 
     Raises:
         HandSimError: There is no such format.

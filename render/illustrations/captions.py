@@ -81,7 +81,6 @@ def with_names(
     """The picture between two columns of names, with a thin line from each name to its point in the picture.
 
     Args:
-        picture: The picture.
         pixels: Points in it, x right and y down [px]; NaN rows get no name.
         names: One per point.
         colors: sRGB in [0, 1] of each name; ink when not given.

@@ -43,14 +43,9 @@ def write_clip(
     shown: Float[np.ndarray, "N 3"],
     radius: float,
 ) -> None:
-    """Write a video, whole or not at all.
+    """Write a video (.mp4) of frames with the fields of `ClipFrame`, whole or not at all.
 
-    Args:
-        path: The file, .mp4.
-        frames: The fields of a `ClipFrame` each.
-        rate: Frames per second [Hz].
-        shown: Points in the world that the view shows [m].
-        radius: Radius of the points [m].
+    The view shows some points in the world [m]; points of frames have this radius [m].
 
     Raises:
         ArgumentError: The file's name ends otherwise.
@@ -78,8 +73,6 @@ def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:
     """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out.
 
     Args:
-        frame: What to draw.
-        view: From where.
         radius: Radius of the points [m].
     """
     hands = tuple(PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all())

@@ -26,12 +26,9 @@ _EMPTY: Final = tuple(round(255 * level) for level in BACKGROUND)
 
 
 def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:
-    """Some frames in rows; hidden keypoints are hollow.
+    """Some frames in rows of `columns`, at most so wide each [px]; hidden keypoints are hollow.
 
-    Args:
-        frames: At least one; a frame without colors shows its depth alone.
-        columns: Frames per row.
-        width: Width of each picture [px]; smaller ones keep theirs.
+    A frame without colors shows its depth alone.
 
     Raises:
         HandSimError: There are no frames, or one has neither colors nor depth.

@@ -50,6 +50,10 @@ SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
     "thumb side": (0.0, -1.0, -0.25),
 }
 _GAP: Final = 0.025  # between hands in a row [m]
+_WIDTH, _COLUMNS = 2000, 4  # of a picture of rows [px]; gloves in a row
+_HEIGHT: Final = 900  # of a glove from one side [px]
+_CAMERA_SIZE: Final = (1100, 900)  # [px], without names
+_LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
 
 
 def draw_row(
@@ -57,15 +61,13 @@ def draw_row(
     *,
     direction: Float[np.ndarray, "3"] | tuple[float, float, float] = SIDES_OF_HAND["back"],
     covering: Covering = "skin",
-    width: int = 2000,
+    width: int = _WIDTH,
 ) -> Picture:
     """Hands side by side at one scale, wrists on one line, each with its caption.
 
     Args:
         hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
         direction: Direction of view.
-        covering: Bare skin or a dark glove.
-        width: Width of the picture [px].
     """
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
@@ -102,25 +104,19 @@ def draw_sizes() -> Picture:
     )
 
 
-def draw_gloves(fits: Sequence[GloveFit], *, columns: int = 4, width: int = 2000) -> Picture:
-    """Gloves on flat hands from the back, each with its name and number of markers, in rows.
-
-    Args:
-        fits: Hands in their gloves, at least one.
-        columns: Gloves per row.
-        width: Width of the picture [px].
-    """
+def draw_gloves(fits: Sequence[GloveFit]) -> Picture:
+    """Gloves (one at least) on flat hands from the back, with name and number of markers, in rows."""
     spread = join_qpos(gesture("spread")[None])[0]
     cells = [(f"{fit.layout.name}: {fit.layout.num_markers}", fit, spread) for fit in fits]
     rows = [
         draw_row(
-            cells[start : start + columns],
+            cells[start : start + _COLUMNS],
             covering="glove",
-            width=width * min(columns, len(cells) - start) // columns,
+            width=_WIDTH * min(_COLUMNS, len(cells) - start) // _COLUMNS,
         )
-        for start in range(0, len(cells), columns)
+        for start in range(0, len(cells), _COLUMNS)
     ]
-    return np.concatenate([pad(row, (0, 0), (0, width - row.shape[1])) for row in rows])
+    return np.concatenate([pad(row, (0, 0), (0, _WIDTH - row.shape[1])) for row in rows])
 
 
 def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:
@@ -135,15 +131,8 @@ def draw_glove(
     fit: GloveFit,
     *,
     sides: Sequence[str] = tuple(SIDES_OF_HAND),
-    height: int = 900,
 ) -> Picture:
-    """A glove on a flat hand from several sides, with the names of the markers that each side shows.
-
-    Args:
-        fit: The hand in the glove.
-        sides: Some of `SIDES_OF_HAND`.
-        height: Height of the hand's pictures [px].
-    """
+    """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows."""
     colors = marker_colors(fit.layout)
     hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
     vertices, markers = hand.vertices(), hand.markers()
@@ -153,7 +142,7 @@ def draw_glove(
         ahead = mirror * SIDES_OF_HAND[side]
         across = np.cross(ahead, FINGERS_UP) / np.linalg.norm(ahead)
         shape = float(np.ptp(vertices @ across) / np.ptp(vertices[:, 0]))
-        size = (round(height * max(0.45, shape)), height)
+        size = (round(_HEIGHT * max(0.45, shape)), _HEIGHT)
         view = view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
         scene = HandScene(view, (hand,))
         radius = fit.layout.radius
@@ -169,21 +158,9 @@ def draw_camera(
     qpos: Float[np.ndarray, "27"],
     rig: CameraRig,
     camera: int,
-    *,
-    size: tuple[int, int] = (1100, 900),
 ) -> tuple[Picture, Bool[np.ndarray, "M"]]:
-    """The view of one camera of a rig, zoomed in: seen markers green, hidden ones as red rings.
-
-    Args:
-        fit: The hand in the glove.
-        qpos: Its pose.
-        rig: The cameras.
-        camera: Index of the camera.
-        size: Width and height of the picture without names [px].
-
-    Returns:
-        The picture, and which markers this camera sees.
-    """
+    """The view of a camera of a rig, zoomed in, and which markers it sees: green, the others red rings."""
+    size = _CAMERA_SIZE
     transforms = fit.model.forward_kinematics(qpos[None])
     markers, normals = fit.attachment.markers(fit.model, transforms)
     capsules = fit.model.capsules
@@ -220,18 +197,9 @@ def draw_labels(
     points: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
     layout: MarkerLayout,
-    *,
-    size: tuple[int, int] = (640, 800),
 ) -> Picture:
-    """A frame's points without labels, and beside them with their labels.
-
-    Args:
-        hand: The hand behind the points, drawn faintly on the labeled side.
-        points: All points of the frame [m], ghosts among them.
-        labels: Marker of each point in `layout`, -1 for a ghost.
-        layout: The glove.
-        size: Width and height of one side without names [px].
-    """
+    """A frame's points [m] without labels, and beside them with their labels (-1: a ghost) and the hand."""
+    size = _LABELS_SIZE
     ghost = labels < 0
     palette = np.concatenate([marker_colors(layout), [HIDDEN_COLOR]])
     names = [*layout.names, "ghost"]

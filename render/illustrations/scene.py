@@ -48,14 +48,7 @@ class View:
             raise HandSimError(f"field_of_view is {self.field_of_view:g}, expected radians between 0 and pi")
 
     def camera(self, size: tuple[int, int]) -> Camera:
-        """The pinhole camera of this view.
-
-        Args:
-            size: Width and height of its pictures [px].
-
-        Raises:
-            ArgumentError: No picture has that size.
-        """
+        """The pinhole camera of this view; an `ArgumentError` if no picture has that size [px]."""
         focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
         return pinhole("view", size, float(focal)).at(self.T_world_camera)
 
@@ -139,15 +132,10 @@ def view_along(
     field_of_view: float = np.deg2rad(24.0),
     margin: float = 0.06,
 ) -> View:
-    """The nearest view in a given direction that has all points in the picture.
+    """The nearest view in a given direction that has all points [m] in the picture.
 
-    Args:
-        direction: Direction of view in the world.
-        up: Direction in the world that points up in the picture.
-        points: Points that must be in the picture [m].
-        size: Width and height of the picture [px].
-        field_of_view: Full vertical opening angle [rad].
-        margin: Free margin on each side [share of the picture].
+    `up` is the direction in the world that points up in the picture, the field of view its full vertical
+    opening angle [rad], and the margin on each side a share of the picture.
     """
     ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     right = np.cross(ahead, up)
@@ -214,16 +202,7 @@ def _surface(
 def render_rgb(
     scene: HandScene, size: tuple[int, int], *, behind: UInt8[np.ndarray, "H W 3"] | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Color picture, sRGB.
-
-    Args:
-        scene: What to draw.
-        size: Width and height [px].
-        behind: Picture behind the scene; the scene's background when not given.
-
-    Raises:
-        ArgumentError: No picture has that size.
-    """
+    """Color picture, sRGB, before a picture or the scene's background."""
     width, height = size
     camera = scene.view.camera(size)
     K = camera.K.copy()
@@ -238,10 +217,6 @@ def render_rgb(
 
 def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
     """Depth picture: distance along the camera's axis [m] at each pixel's center, 0 where there is nothing.
-
-    Args:
-        scene: What to draw.
-        size: Width and height [px].
 
     Raises:
         ArgumentError: No picture has that size.
@@ -261,7 +236,6 @@ def unoccluded(
 
     Args:
         depth: The picture [m], 0 where there is nothing.
-        view: Its camera.
         points: Points in the world [m].
         slack: How far behind the first surface a point still counts [m], such as a marker's radius.
     """

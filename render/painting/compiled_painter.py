@@ -166,17 +166,8 @@ def _spots(
 ) -> Any:
     """The surface points that are shaded: their table, the pixel of each, and its share of four samples.
 
-    Args:
-        nearness: One over the depth (2 H, 2 W) [1/m].
-        first: Nearest face of each sample (2 H, 2 W), counted over all surfaces; -1 for none.
-        covered: See `_covered` (N,).
-        begin: Number of this surface's first face.
-        faces: Triangles (F, 3).
-        corners: See `_Mesh.corners` (V, 3).
-        rows: See `_Mesh.rows` (V, 11).
-        texels: Texture (h, w, 8), empty for none; see `Material.texels`.
-        finish: Linear color (3), roughness, glow and scatter (3).
-        to_linear: `shading.TO_LINEAR` (256,).
+    `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
+    all surfaces from `begin`, -1 for none; `texels` is empty without a texture.
     """
     width = first.shape[1] // 2
     end, most = begin + len(faces), 4 * len(covered)  # what is not used of these arrays takes no memory
@@ -228,21 +219,10 @@ def _add_colors(
     to_display: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> None:
-    """Add one surface's colors, and how many of four samples per pixel it fills.
+    """Add one surface's colors, and how many of four samples per pixel it fills, to `sums` (H, W, 4).
 
-    Args:
-        spots: Rows (N, 23) as the columns of `shading.SPOT`.
-        pixels: Pixel of each (N,).
-        shares: Samples of the pixel that each stands for (N,).
-        mapped: Whether the surface has a texture.
-        finish: Linear color (3), roughness, glow and scatter (3).
-        lamps: Rows (L, 9) of `_lamp_table`.
-        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
-        to_map: `ShadowMap.to_map` (3, 4).
-        nearest: `ShadowMap.nearest` (N, N) [m].
-        bias: `ShadowMap.bias` [m].
-        to_display: `shading.TO_DISPLAY` (2048,).
-        sums: Sums of display colors and samples (H, W, 4), added to.
+    Rows (N, 23) of `spots` are the columns of `shading.SPOT`, and each stands for some samples of a pixel;
+    `lamps` are the rows (L, 9) of `_lamp_table`, and `nearest` and `bias` those of the `ShadowMap` [m].
     """
     flat = sums.reshape(-1, 4)
     for start in range(0, len(pixels), _BLOCK):
@@ -259,16 +239,7 @@ def _add_colors(
 def _samples(
     nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
 ) -> Any:
-    """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths.
-
-    Args:
-        nearness: One over the depth (2 H, 2 W) [1/m].
-        first: Nearest face of each sample (2 H, 2 W).
-        begin: Number of the surface's first face.
-        end: Number after its last face.
-        row: Row of the pixel.
-        column: Column of the pixel.
-    """
+    """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths."""
     count, most, least = 0, 0.0, np.inf
     for i in range(2):
         for j in range(2):
@@ -296,19 +267,7 @@ def _write_spot(
 ) -> None:
     """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
 
-    Args:
-        corners: See `_Mesh.corners` (V, 3).
-        rows: See `_Mesh.rows` (V, 11).
-        a: The first of the face's vertices, as `b` and `c` the others.
-        b: See `a`.
-        c: See `a`.
-        x: Column in the doubled picture [px].
-        y: Row in the doubled picture [px].
-        texels: See `_spots`.
-        finish: See `_spots`.
-        to_linear: See `_spots`.
-        spots: Rows as the columns of `shading.SPOT`; one is written.
-        spot: Which.
+    The face has the vertices a, b and c; x and y are column and row in the doubled picture [px].
     """
     ax, ay = corners[a, 0], corners[a, 1]
     bx, by = corners[b, 0] - ax, corners[b, 1] - ay

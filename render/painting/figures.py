@@ -100,10 +100,8 @@ def sample_people(
     """Hands of one person: both have the same skin and the same sleeves.
 
     Args:
-        count: Number of hands.
         glove: Whether the hands wear marker gloves.
         tones: Ranges of typology angles of the skin [deg]; see `render.skin.look.sample_skin_look`.
-        rng: Source of the random choices.
     """
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
     cloth = sample_glove_look(rng=rng) if glove else None
@@ -114,8 +112,6 @@ class HandFigure:
     """One hand to draw; its texture is painted once.
 
     Args:
-        fit: The hand in its glove.
-        look: Appearance of the hand.
         first_marker: Number of markers of the hands before it.
     """
 
@@ -143,7 +139,6 @@ class HandFigure:
         """Skin, and markers where a glove is worn.
 
         Args:
-            qpos: The pose.
             number: Index of the hand among those in the picture.
             upper_arm: Unit direction of its upper arm; see `PosableSkin.posed`.
         """
@@ -189,7 +184,6 @@ class BodyFigure:
     """One rigid body to draw.
 
     Args:
-        body: The body.
         color: Color of its surface, sRGB in [0, 1].
     """
 
@@ -204,7 +198,6 @@ class BodyFigure:
         """Its surface, where that is known, and its markers.
 
         Args:
-            T_world_body: Pose of the body [m].
             instance: Number of the body among the instances of the picture.
         """
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []

@@ -87,16 +87,10 @@ def add_lights(
     scene: Any,
     lighting: Lighting,
     T_world_camera: Float[np.ndarray, "4 4"],
-    extent: float | None = None,
 ) -> None:
-    """Light a pyrender scene that holds its meshes already.
+    """Light a pyrender scene that holds its meshes already; its ambient light is replaced.
 
-    Args:
-        pyrender: The module.
-        scene: The scene; its ambient light is replaced.
-        lighting: What to add.
-        T_world_camera: Pose of the camera whose axes the lamps' directions are in.
-        extent: How large the meshes are together, corner to corner [m]; measured unless given.
+    The lamps' directions are in the axes of the camera.
     """
     rotation = T_world_camera[:3, :3]
     scene.ambient_light = np.array(lighting.ambient)
@@ -107,7 +101,7 @@ def add_lights(
         if number == 0:
             pose[:3, :3] = frame_with_z(towards)
             light = pyrender.DirectionalLight(color=color, intensity=intensity)
-            _cast_shadows(pyrender, light, float(scene.scale) if extent is None else extent)
+            _cast_shadows(pyrender, light, float(scene.scale))
         else:
             pose[:3, 3] = T_world_camera[:3, 3] + towards * _DISTANCE
             light = pyrender.PointLight(color=color, intensity=intensity * _DISTANCE**2)

@@ -34,13 +34,9 @@ def choose_painter(choice: PainterChoice) -> Painter:
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors over black (sRGB), and in the fourth channel the covered share of each pixel.
+    """Colors over black (sRGB) by a pinhole camera, and fourth the covered share of each pixel.
 
-    Args:
-        camera: A pinhole camera.
-        drawn: The surfaces.
-        lighting: Light in the camera's axes.
-        painter: What paints; both give nearly the same picture.
+    Light is in the camera's axes; both painters give nearly the same picture.
 
     Raises:
         HandSimError: OpenGL is requested and missing on this machine; the message says what to install.
@@ -91,13 +87,7 @@ def put_before(
 
 @kernel
 def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
-    """See `put_before`.
-
-    Args:
-        painted: Colors and coverage (P, 4).
-        background: sRGB from 0 to 255 (P, 3).
-        mixed: Written (P, 3).
-    """
+    """Write painted colors with coverage (P, 4) over a background; see `put_before`."""
     for pixel in range(len(mixed)):
         clear = 1.0 - painted[pixel, 3] / _WHITE
         for channel in range(3):

@@ -53,12 +53,9 @@ def join(surfaces: Sequence[Triangles]) -> Triangles:
 
 
 def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Pictures:
-    """Depth, normals, parts, instances and markers as a pinhole camera sees them.
+    """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
 
-    Args:
-        camera: A pinhole camera; for other lenses see `render.cameras.warp`.
-        surface: A closed surface; the backs of its faces are not drawn.
-        with_normals: Whether to compute normals.
+    The surface is closed; the backs of its faces are not drawn.
 
     Raises:
         ArgumentError: The camera's lens is not a pinhole.
@@ -90,11 +87,11 @@ def nearest_faces(
 ) -> tuple[Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
     """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
 
+    Faces that run counter-clockwise in the picture, where y is down, are drawn.
+
     Args:
         corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
             as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
-        faces: Triangles that run counter-clockwise in the picture, where y is down, are drawn.
-        size: Width and height of the picture [px].
         farthest: Nearness of nothing.
     """
     nearness = np.full(size[::-1], farthest, dtype=np.float32)
@@ -138,14 +135,7 @@ def _draw(
     nearness: NDArray[np.float32],
     first: NDArray[np.int32],
 ) -> None:
-    """Draw faces into a z-buffer; see `nearest_faces`.
-
-    Args:
-        corners: Pixels and nearness (V, 3) of the vertices.
-        faces: Triangles (F, 3).
-        nearness: The z-buffer (H, W), written.
-        first: Numbers of the nearest faces (H, W), written.
-    """
+    """Draw faces into a z-buffer `nearness` with their numbers `first`, both (H, W); see `nearest_faces`."""
     height, width = nearness.shape
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -197,17 +187,7 @@ def _write(
     instances: NDArray[np.uint8],
     markers: NDArray[np.uint8],
 ) -> None:
-    """Write depth and ids of the nearest faces.
-
-    Args:
-        inverse: One over the depth (H, W) [1/m].
-        first: Nearest faces (H, W), -1 for none.
-        labels: Part, instance and marker of each face (F, 3).
-        depth: Written (H, W) [m].
-        parts: Written (H, W).
-        instances: Written (H, W).
-        markers: Written (H, W).
-    """
+    """Write depth [m] and ids of the nearest faces, -1 for none; `inverse` is one over the depth (H, W)."""
     height, width = first.shape
     for row in range(height):
         for column in range(width):
@@ -227,15 +207,7 @@ def _interpolate(
     first: NDArray[np.int32],
     picture: NDArray[np.float32],
 ) -> None:
-    """Write the unit normals behind the centers of all pixels with a face.
-
-    Args:
-        faces: Triangles (F, 3).
-        normals: Unit normals of the vertices (V, 3) in the camera's axes.
-        corners: Pixels and one over the depth (V, 3) of the vertices.
-        first: Nearest faces (H, W), -1 for none.
-        picture: Written (H, W, 3).
-    """
+    """Write the unit normals behind the centers of all pixels with a face into `picture` (H, W, 3)."""
     height, width = first.shape
     for row in range(height):
         for column in range(width):

@@ -57,13 +57,9 @@ def display(light: float, table: NDArray[np.float32]) -> float:
 
 @kernel(inline=True)
 def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float, v: float) -> Any:
-    """Linear color (3), roughness and normal (3) of a texture; bilinear.
+    """Linear color (3), roughness and normal (3) of a texture (h, w, 8) at u, right, and v, up; bilinear.
 
-    Args:
-        texels: Texture (h, w, 8); see `Material.texels`.
-        table: `TO_LINEAR` (256,).
-        u: Texture coordinate to the right.
-        v: Texture coordinate upwards.
+    See `Material.texels`; the table is `TO_LINEAR` (256,).
     """
     rows, columns = texels.shape[:2]
     across = min(max(u * columns - 0.5, 0.0), columns - 1.001)
@@ -181,12 +177,10 @@ def _normalize(vectors: NDArray[np.float32]) -> None:
 def _map_normals(
     normals: NDArray[np.float32], tangents: NDArray[np.float32], bumps: NDArray[np.float32]
 ) -> None:
-    """Replace unit normals by those of a relief.
+    """Replace unit normals (3, N) by those of a relief.
 
-    Args:
-        normals: Unit normals (3, N), written.
-        tangents: Any vectors (3, N) on the side of the way in which u grows; made unit tangents.
-        bumps: The relief's normals (3, N): along the tangent, normal x tangent, and the normal.
+    Tangents are any vectors on the side of the way in which u grows, and are made unit tangents; bumps are
+    the relief's normals along the tangent, normal x tangent, and the normal.
     """
     along = np.empty_like(normals[0])
     _dot(normals, tangents, along)
@@ -222,15 +216,7 @@ def _add_ambient(
     i: int,
     light: NDArray[np.float32],
 ) -> None:
-    """Write what one color of light from everywhere and a glow give to surface points.
-
-    Args:
-        spots: See `SPOT`.
-        around: The color's ambient light by the normal (9,).
-        glow: Emitted light, as a share of the color.
-        i: Index of the color.
-        light: Written (N,).
-    """
+    """Write what one color of light from everywhere (9,) and a glow give to surface points (N,)."""
     x, y, z, color = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2], spots[COLOR + i]
     a, b, c, d, e = around[0], around[1], around[2], around[3], around[4]
     f, g, h, k = around[5], around[6], around[7], around[8]
@@ -251,17 +237,7 @@ def _reflect(
     fresnel: NDArray[np.float32],
     mirrored: NDArray[np.float32],
 ) -> None:
-    """Write how surface points reflect a lamp.
-
-    Args:
-        spots: See `SPOT`.
-        x: Of the unit vector to the lamp, as `y` and `z`.
-        y: See `x`.
-        z: See `x`.
-        cosine: Written (N,), between normal and lamp.
-        fresnel: Written (N,), Schlick's term.
-        mirrored: Written (N,), the mirrored share of the light.
-    """
+    """Write how surface points reflect a lamp at (x, y, z): cosine, Schlick's term and mirrored share."""
     nx, ny, nz = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2]
     vx, vy, vz = spots[VIEW], spots[VIEW + 1], spots[VIEW + 2]
     facing, roughness = spots[FACING], spots[ROUGH]
@@ -305,15 +281,7 @@ def _cast_shadows(
 ) -> None:
     """Write the share (N,) of the first lamp that surface points see.
 
-    Args:
-        spots: See `SPOT`.
-        lamp: Its row (9,); see `shade`.
-        scatter: How far red light travels under the surface.
-        cosine: Between normals and the lamp (N,).
-        to_map: `ShadowMap.to_map` (3, 4).
-        nearest: `ShadowMap.nearest` (N, N) [m].
-        bias: `ShadowMap.bias` [m].
-        lit: Written (N,).
+    `scatter` is how far red light travels under the surface; the map is a `ShadowMap` in its fields.
     """
     for n in range(len(lit)):
         if cosine[n] <= -scatter:
@@ -339,18 +307,10 @@ def _add_lamp(
     lit: NDArray[np.float32],
     light: NDArray[np.float32],
 ) -> None:
-    """Add one color of a lamp's light.
+    """Add one color of a lamp's light to `light` (N,).
 
-    Args:
-        color: Of the surface points (N,).
-        scatter: Cosine beyond grazing at which the lamp still lights them.
-        hard: The lamp's light that objects hide.
-        soft: Its light without shadows.
-        cosine: See `_reflect` (N,).
-        fresnel: See `_reflect` (N,).
-        mirrored: See `_reflect` (N,).
-        lit: Share of the hard light (N,).
-        light: Added to (N,).
+    `hard` is the lamp's light that objects hide, of which points see the share `lit`, and `soft` its light
+    without shadows; `scatter` is the cosine beyond grazing at which it still lights them.
     """
     diffuse = (_ONE - _FACING) / (_PI * (_ONE + scatter))
     for n in range(len(light)):

@@ -48,7 +48,6 @@ def shadow_map(
 
     Args:
         points: Vertices [m], in any frame.
-        faces: Triangles.
         towards: Unit vector to the lamp, in the same frame.
         seen: Around which of the vertices shadows are needed; all when none is.
     """
@@ -62,13 +61,7 @@ def shadow_map(
 
 @kernel
 def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: NDArray[np.bool_]) -> Any:
-    """Points in a map that has room for those seen (V, 3), `ShadowMap.to_map`, and its texels a meter.
-
-    Args:
-        points: Vertices (V, 3) [m].
-        rotation: Rows are the map's axes: right, down, to the lamp (3, 3).
-        seen: Which the map has room for (V,).
-    """
+    """Points in a map that has room for those seen (V, 3), `ShadowMap.to_map`, and its texels a meter."""
     corners = np.empty((len(points), 3))
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for point in range(len(points)):
@@ -93,15 +86,9 @@ def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: 
 def lit_share(
     to_map: NDArray[np.float64], nearest: NDArray[np.float32], bias: float, x: float, y: float, z: float
 ) -> float:
-    """Visible share of the lamp at a position: the mean over a square of three texels around it.
+    """Visible share of the lamp at (x, y, z) [m]: the mean over a square of three texels around it.
 
-    Args:
-        to_map: `ShadowMap.to_map` (3, 4).
-        nearest: `ShadowMap.nearest` (N, N) [m].
-        bias: `ShadowMap.bias` [m].
-        x: Position in the frame of the map's points [m], as `y` and `z`.
-        y: See `x`.
-        z: See `x`.
+    The map is that of a `ShadowMap`, by its fields.
     """
     across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
@@ -125,11 +112,7 @@ def light_behind(
 ) -> Float32[np.ndarray, "H W"] | None:
     """Share of its light that a backdrop keeps at each pixel; None where no shadow falls on it.
 
-    Args:
-        camera: A pinhole camera.
-        drawn: The surfaces that cast the shadow.
-        lighting: Light in the camera's axes; the first lamp casts the shadow.
-        backdrop: Where it falls.
+    The drawn surfaces cast the shadow of the first lamp, in the axes of a pinhole camera.
     """
     if not drawn or not lighting.lamps:
         return None
@@ -172,18 +155,12 @@ def _fall(
     fallen: NDArray[np.float64],
     distance: NDArray[np.float64],
 ) -> None:
-    """Where the shadows of points fall on a backdrop, whose place is told by the points in the picture.
+    """Write where the shadows of points (V, 3) [m] fall on a backdrop, placed by those in the picture.
 
-    Args:
-        points: In the camera's axes (V, 3) [m].
-        normal: Of the backdrop, towards the camera (3,).
-        towards: Unit vector to the lamp (3,).
-        gap: From the backdrop to the nearest point in the picture [m].
-        K: Camera matrix (3, 3) [px].
-        size: Of the picture (2,) [px].
-        fallen: Written (V, 3) [m]; points behind the backdrop cast none and keep what stands there.
-        distance: Written (2,) [m]: from the points in the picture to the backdrop, and its depth there, both
-            in the mean; zeros where no point is in the picture.
+    All is in the camera's axes; `normal` is the backdrop's, towards the camera, and `gap` its distance from
+    the nearest point in the picture [m]. Points behind the backdrop cast none and keep what stands there.
+    `distance` (2,) gets the mean distance from the points to the backdrop, and the backdrop's mean depth
+    there [m]; zeros where no point is in the picture.
     """
     seen = np.zeros(len(points), dtype=np.bool_)
     nearest = np.inf

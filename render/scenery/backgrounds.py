@@ -125,10 +125,6 @@ def kept_background(background: Background, size: tuple[int, int]) -> Float32[np
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white.
 
-    Args:
-        background: What to draw.
-        size: Width and height [pixels].
-
     Raises:
         HandSimError: The kind is unknown, or the photograph cannot be read.
     """
@@ -252,14 +248,7 @@ def _lay_over(
     shadow: NDArray[np.uint8],
     color: NDArray[np.float32],
 ) -> None:
-    """Lay a color over a part of a picture.
-
-    Args:
-        part: Of the picture (h, w, 3), written.
-        covered: Where the color covers it (h, w), 255 for wholly.
-        shadow: Where it takes half of the light (h, w), likewise.
-        color: Linear (3,).
-    """
+    """Lay a linear color over a part (h, w, 3) of a picture; 255 covers it, or takes half its light."""
     for row in range(part.shape[0]):
         for column in range(part.shape[1]):
             if covered[row, column] or shadow[row, column]:

@@ -95,12 +95,7 @@ def _corner(point: NDArray[np.float64]) -> Corner:
 
 
 def draw_surroundings(background: Background, enclosure: Enclosure, camera: Camera) -> Surroundings:
-    """What a camera sees of the box; what stands still is drawn once.
-
-    Args:
-        background: Its kind, colors and seed.
-        enclosure: The box.
-        camera: A camera inside it, with any lens.
+    """What a camera inside the box, with any lens, sees of it; what stands still is drawn once.
 
     Raises:
         HandSimError: The photograph cannot be read.

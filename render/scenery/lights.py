@@ -130,11 +130,7 @@ def sample_surroundings(
 ) -> tuple[Background, Lighting]:
     """A random background, and random lamps in the light that it gives.
 
-    Args:
-        config: Which backgrounds.
-        skin: Whose hands the picture is exposed for; None for gloves.
-        size: Of the picture that it will be behind [px]: the background is then painted once.
-        rng: Where the choices come from.
+    The picture is exposed for this skin, or for gloves; of a known size [px] the background is painted once.
 
     Raises:
         HandSimError: There is no photograph that can be read.
@@ -163,7 +159,6 @@ def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: flo
     """Give light from everywhere the colors of a picture; how much there is of it stays.
 
     Args:
-        lighting: The light.
         picture: Linear light, taken for all that is before the hand, and mirrored for what is behind.
         share: How much of the light from everywhere comes from the picture.
     """

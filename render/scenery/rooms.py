@@ -63,12 +63,7 @@ class _Boxes(NamedTuple):
 
 
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
-    """A random room from a random position, linear light.
-
-    Args:
-        size: Width and height [pixels].
-        seed: Seed of the random choices.
-    """
+    """A random room from a random position, linear light."""
     width, height = size
     scene = _scene(seed)
     rays = _rays(width, height, *scene.lens)
@@ -115,14 +110,13 @@ def cast_room(
     *,
     rng: np.random.Generator,
 ) -> RoomLight:
-    """A random room of a given size, seen from a given position.
+    """A random room of a given size, seen from a position; an equal rng gives the same from another.
 
     Args:
         rays: Unit directions in the room's axes, z up, no component 0.
         eye: Where they begin [m], the room's low corner at the origin.
         room: The room's far corner [m].
         free: Low and high corner of a box without furniture [m].
-        rng: Source of the room; the same one gives the same room from another position.
     """
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)
@@ -261,13 +255,7 @@ def _cast(
 
 @kernel
 def _nearest_box(inverse: NDArray[np.float64], offsets: NDArray[np.float64], distance: float) -> Any:
-    """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
-
-    Args:
-        inverse: One over the ray's unit direction (3,).
-        offsets: Low and high corners of boxes (B, 2, 3) from the ray's origin [m].
-        distance: Largest distance [m].
-    """
+    """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none."""
     nearest, face = -1, 0
     for box in range(len(offsets)):
         enter, leave, side = -np.inf, np.inf, 0

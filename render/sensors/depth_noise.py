@@ -96,16 +96,11 @@ def apply_depth_noise(
     reflectance: Float32[np.ndarray, "H W"] | None = None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth as a sensor has it [m], 0 where it has none.
+    """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
 
-    Args:
-        depth: Along the camera's axis [m], 0 where there is nothing.
-        normals: Of the surfaces in the camera's axes; without them, all surfaces face the camera.
-        noise: The sensor; None leaves everything as it is.
-        camera: Whose picture it is.
-        reflectance: Share of infrared light that surfaces send back, for time-of-flight sensors; without it,
-            all are white. See `reflectance_of`.
-        rng: Randomness.
+    Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
+    infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
+    nothing.
 
     Raises:
         ArgumentError: A picture is not as large as the camera's.
@@ -139,15 +134,7 @@ def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]
 
 @kernel
 def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: float, cy: float) -> Any:
-    """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 where there is no surface.
-
-    Args:
-        normals: In the camera's axes (H, W, 3).
-        fx: Focal length across [px], as `fy` is down.
-        fy: See `fx`.
-        cx: Column of the principal point [px], as `cy` is its row.
-        cy: See `cx`.
-    """
+    """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
     height, width = normals.shape[:2]
     cosines = np.zeros((height, width), np.float32)
     for row in range(height):

@@ -82,12 +82,7 @@ def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
 def expose(
     linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture that a sensor takes of light, sRGB.
-
-    Args:
-        linear: Light, 1 for white; more than that is as white.
-        exposure: How it is taken.
-        rng: Randomness.
+    """The picture that a sensor takes of light (1 is white, more is as white), sRGB.
 
     Raises:
         ArgumentError: The light is not a picture of three colors.
@@ -139,20 +134,11 @@ def _expose(
     curve: NDArray[np.uint8],
     rgb: NDArray[np.uint8],
 ) -> None:
-    """Write what a sensor makes of light, row by row, in loops that are compiled into vector instructions.
+    """Write what a sensor makes of light (H, 3 W), row by row, in loops that compile to vector instructions.
 
-    Args:
-        linear: The light (H, 3 W).
-        gain: See `_Sensor`, as the next three.
-        lost: See `gain`.
-        shot: See `gain`.
-        dark: See `gain`.
-        words: Random numbers (H, 3 W), empty for no noise.
-        normal: `quantiles` (65536,).
-        away: Squared distance of a row's values from the middle column (3 W,) [px^2].
-        balance: Factor on each of them (3 W,).
-        curve: `_root_curve` (4096,).
-        rgb: Written (H, 3 W).
+    `gain`, `lost`, `shot` and `dark` are those of `_Sensor`; `words` are random, and empty for no noise;
+    `away` is the squared distance of a row's values from the middle column [px^2], `balance` a factor on
+    each.
     """
     height, width = linear.shape
     corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))

@@ -94,9 +94,8 @@ def combine(
 ) -> Float32[np.ndarray, "H W 3"]:
     """Light of the picture that a shutter makes of moments, for `render.sensors.exposure.expose`.
 
-    Args:
-        sub_frames: The moments in their order, as sRGB bytes or as light; one is held at a time.
-        weights: See `shutter_times`.
+    Moments come in their order, as sRGB bytes or as light; one is held at a time. Weights are those of
+    `shutter_times`.
 
     Raises:
         ArgumentError: There are not as many moments as weights, or one has another size.

@@ -58,14 +58,10 @@ def measure(
     *,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth as the sensor has it [m], 0 where it has none.
+    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
 
-    Args:
-        depth: Along the camera's axis [m], 0 where there is nothing.
-        cosines: Of the angles between normals and the rays that come back; None: all surfaces face.
-        noise: The sensor.
-        focal: The camera's horizontal focal length [px].
-        rng: Randomness.
+    Cosines are of the angles between normals and the rays that come back (None: all surfaces face), `focal`
+    is the camera's horizontal focal length [px].
     """
     scale = np.float32(noise.baseline * focal)
     with np.errstate(divide="ignore"):

@@ -59,14 +59,10 @@ def measure(
     *,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth as the sensor has it [m], 0 where it has none.
+    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
 
-    Args:
-        depth: Along the camera's axis [m], 0 where there is nothing.
-        cosines: Of the angles between normals and the rays that come back; None: all surfaces face.
-        reflectance: Share of light that surfaces send back; None: all are white walls.
-        noise: The sensor.
-        rng: Randomness.
+    Cosines are of the angles between normals and the rays that come back (None: all surfaces face),
+    reflectance the share of light that surfaces send back (None: all are white walls).
     """
     there = depth > 0.0
     measured = _mixed(depth, noise, rng=rng)

@@ -22,7 +22,6 @@ def noise(
     Args:
         positions: Where to evaluate it (N, 3) [m].
         sizes: Size of the blots of each octave [m].
-        rng: Source of the noise.
     """
     total = np.zeros(len(positions), dtype=np.float32)
     for size in sizes:
@@ -40,15 +39,7 @@ def _add_octave(
     knots: NDArray[np.float32],
     total: NDArray[np.float32],
 ) -> None:
-    """Add the trilinear interpolation of knots, which repeat.
-
-    Args:
-        positions: Where (N, 3) [m].
-        start: Place of the origin among the knots (3,).
-        scale: Knots a meter.
-        knots: Values (32, 32, 32).
-        total: Added to (N,).
-    """
+    """Add the trilinear interpolation of knots (32, 32, 32), which repeat, to `total` (N,)."""
     far = float(64 * _KNOTS)  # so that no place is negative
     for number in range(len(positions)):
         x = positions[number, 0] * scale + start[0] + far

@@ -41,7 +41,6 @@ class Flexion:
     """The shapes of one hand.
 
     Args:
-        model: The hand.
         rest: Vertices (U, 3) at rest, in the wrist's frame [m].
         normals: Their outward unit normals (U, 3).
         bony: Factor on all heights.

@@ -101,8 +101,6 @@ def forearm_rings(
     """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m].
 
     Args:
-        shape: Shape of the hand.
-        forearm: The forearm.
         wrist: The wrist's ring, which the arm continues [m].
         rings: Number of rings.
     """

@@ -64,10 +64,8 @@ def glove_texture(
     """The texture of a glove over painted skin; only the forearm behind the cuff stays visible.
 
     Args:
-        look: The glove.
         skin: The texture of the skin under it.
         forearm: The forearm of the skin; its length scales the cuff.
-        side: Of the hand.
     """
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size

@@ -127,7 +127,6 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
 
     Args:
         tones: Ends of ranges of typology angles [deg], drawn from uniformly; see `named_tones`.
-        rng: Source of the random choices.
     """
     angle = _draw_angle(tones, rng)
     yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))

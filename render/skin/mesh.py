@@ -15,8 +15,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.skinning import skin_frames
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.skin.surface import skin_frames, vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import quaternion_matrix
@@ -51,7 +50,6 @@ class PosableSkin:
     """The drawn skin of one person's hand.
 
     Args:
-        model: The hand.
         forearm: The forearm behind it.
         bony: Factor on what joints make of the skin around them, see `render.skin.flexion`; 0 for the hand
             model's own surface.
@@ -99,11 +97,7 @@ class PosableSkin:
     def posed(
         self, qpos: Float[np.ndarray, "27"], upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> DrawnSkin:
-        """The skin in one pose.
-
-        Args:
-            qpos: The pose.
-            upper_arm: Unit direction of the upper arm in the world; without it the arm is straight and short.
+        """The skin in one pose; without the upper arm's direction in the world the arm is straight and short.
 
         Raises:
             ArgumentError: `qpos` is not (27,) or not finite.
@@ -178,12 +172,6 @@ def _occluded_share(
     """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
 
     The inner loop has no branches and writes one array, so that it is compiled into vector instructions.
-
-    Args:
-        points: Positions (V, 3) [m].
-        normals: Unit normals (V, 3).
-        segments: Ends of the capsules (K, 2, 3) [m].
-        radii: Radii of the capsules (K,) [m].
     """
     count = len(points)
     x, y, z = _columns(points)

@@ -190,17 +190,10 @@ def _draw_line(
     texels: NDArray[np.int64],
     depth: NDArray[np.float32],
 ) -> None:
-    """Draw a line across a digit.
+    """Draw a line of this width [m] and depth across a digit.
 
-    Args:
-        along: Distance of its texels from its first joint (K,) [m].
-        bent: How far the line is from its position (K,) [m].
-        share: Factor on its depth (K,).
-        position: Distance of the line from the joint [m].
-        width: Of the line [m].
-        strength: Its depth.
-        texels: Indices of the texels (K,).
-        depth: Of all texels (N,), written.
+    `along` are the distances of its K texels from its first joint, `bent` how far the line is from its
+    position there [m], `share` factors on its depth; `depth` is that of all texels.
     """
     for n in range(len(texels)):
         away = (along[n] - position - bent[n]) / width

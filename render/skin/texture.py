@@ -73,7 +73,6 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
     """Paint a skin; equal looks give equal texels.
 
     Args:
-        look: The skin.
         forearm: Forearm whose sleeve is painted too.
         side: Side of the hand; colors are equal on both.
     """

@@ -295,7 +295,7 @@ def onnx(folder: Path) -> list[Path]:
 
 
 def dataset(folder: Path) -> list[Path]:
-    from handsim.hand.records import HAND_DTYPE, pack_hand
+    from handsim.hand.shape import HAND_DTYPE, pack_hand
     from train.data.shards import CONFIG, MANIFEST, Manifest, hands_name, row_dtype, rows_name, save_array
 
     names = load_layout("sparse13").names

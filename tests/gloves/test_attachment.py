@@ -17,8 +17,8 @@ from handsim.errors import LayoutError
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
-from handsim.hand.skin.surface import linear_blend_skinning
 from handsim.space.transforms import MIRROR
+from tests.handsim.hand.skin.blending import blend_skin
 
 MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
 
@@ -75,8 +75,8 @@ def test_markers_are_carried_as_the_skin_is(rng):
     bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(20, 20))))
     markers, normals = glove.markers(model, bones)
     weights = (glove.bone_indices, glove.bone_weights, model.rest_transforms, bones)
-    np.testing.assert_allclose(markers, linear_blend_skinning(glove.points, *weights), atol=1e-12)
-    ahead = linear_blend_skinning(glove.points + glove.normals, *weights) - markers
+    np.testing.assert_allclose(markers, blend_skin(glove.points, *weights), atol=1e-12)
+    ahead = blend_skin(glove.points + glove.normals, *weights) - markers
     np.testing.assert_allclose(normals, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), atol=1e-12)
     np.testing.assert_array_equal(glove.centers(model, bones), markers)
 

@@ -20,11 +20,11 @@ from handsim.space.camera import look_at, pinhole, preset
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import Drawing, draw
-from render.formats.png_depth import read_depth
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import TONES
 from render.subject import subject_of_take
+from tests.render.formats.reading import depth_of
 from train.simulation.takes import simulate_take
 
 
@@ -249,7 +249,7 @@ def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
 
 def test_depth_on_disk_is_in_meters(path, tmp_path):
     render_take(path, tmp_path / "out", ["png"], dataclasses.replace(PLAIN, passes=("depth",)), workers=1)
-    depth = read_depth(next((tmp_path / "out").rglob("depth/*/*.png")))
+    depth = depth_of(next((tmp_path / "out").rglob("depth/*/*.png")).read_bytes())
     assert 0.2 < depth.min() < 1.0 < np.median(depth) < 6.0
 
 

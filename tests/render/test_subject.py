@@ -15,8 +15,7 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.records import HAND_DTYPE, pack_hand
-from handsim.hand.shape import named_shape, sample_shape
+from handsim.hand.shape import HAND_DTYPE, named_shape, pack_hand, sample_shape
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
 from render.cameras.viewpoints import ViewConfig

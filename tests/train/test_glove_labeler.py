@@ -10,17 +10,10 @@ import pytest
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning, LayoutError, WeightsError
-from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import OwnLabeler
-from train.labelers.set_labeler import TrainedSetLabeler
-
-
-@pytest.fixture
-def quick(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 64, "seed": 0})
+from train.labelers.set_inference import TrainedSetLabeler
 
 
 class First:
@@ -42,7 +35,7 @@ def test_a_layout_that_is_a_shipped_one_has_its_labeler(tmp_path):
 
 
 @pytest.mark.parametrize("given", ["name", "object", "path"])
-def test_any_other_layout_is_learned_and_that_is_told(given, quick, tmp_path):
+def test_any_other_layout_is_learned_and_that_is_told(given, quickly_learned, tmp_path):
     layout = dataclasses.replace(load_layout("tips8"), name="mine")
     layout.save(tmp_path / "mine.toml")
     glove = {"name": "tips8", "object": layout, "path": tmp_path / "mine.toml"}[given]
@@ -53,7 +46,7 @@ def test_any_other_layout_is_learned_and_that_is_told(given, quick, tmp_path):
     assert labeling.labels.shape == (6,)
 
 
-def test_a_layout_of_the_same_name_and_other_places_is_another(quick):
+def test_a_layout_of_the_same_name_and_other_places_is_another(quickly_learned):
     layout = load_layout("sparse13")
     moved = dataclasses.replace(layout.markers[0], along=layout.markers[0].along + 0.1)
     with pytest.warns(HandSimWarning, match="'sparse13'"):
@@ -61,7 +54,7 @@ def test_a_layout_of_the_same_name_and_other_places_is_another(quick):
     assert isinstance(found, LayoutLabeler)
 
 
-def test_any_layout_needs_a_glove(quick):
+def test_any_layout_needs_a_glove(quickly_learned):
     with pytest.raises(ArgumentError, match="'any-layout' needs a glove, expected load_labeler"):
         load_labeler("any-layout")
     assert isinstance(load_labeler("tips8", "any-layout"), LayoutLabeler)

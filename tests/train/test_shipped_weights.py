@@ -8,7 +8,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from gloves.captures.collection import read_markers
+from gloves.captures.formats import read_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, WeightsError
 from train.data.augmentation import Corruption

@@ -24,9 +24,6 @@ def match_log_odds(
     """Log-odds of each point being a marker rather than a stray.
 
     Args:
-        points: Points [m].
-        positions: Predicted positions of markers [m].
-        covariances: Covariances of these [m^2].
         stray_density: Density of points that are no marker [1/m^3].
     """
     innovation = points[:, None] - positions
@@ -54,12 +51,8 @@ def match_points(
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
     """The most likely assignment of points to markers, one to one; either may stay alone.
 
-    Args:
-        log_odds: Log-odds of each pair.
-
-    Returns:
-        Marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the alternatives of
-        both.
+    Returns the marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the
+    alternatives of both.
     """
     _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:
@@ -89,7 +82,6 @@ def assign_jointly(
     """Assign points to digits: the best combination of hypotheses of all digits that share points.
 
     Args:
-        candidates: Candidate points of each digit.
         hypotheses: The best assignment of every set of them, digit by digit.
         markers: Markers of each digit, counted through the hands; -1 where there are fewer.
         assigned: Marker of each point, -1 for none; overwritten.

@@ -45,14 +45,7 @@ def find_candidates(
     table: MarkerTable,
     num_digits: int,
 ) -> DigitCandidates:
-    """The candidates of each digit.
-
-    Args:
-        points: The frame's points [m].
-        evidence: Evidence for the label of each point (log-odds).
-        table: The markers of all hands.
-        num_digits: Digits of all hands.
-    """
+    """The candidates of each digit."""
     found = DigitCandidates(
         np.full((num_digits, MAX_CANDIDATES), -1),
         np.zeros(num_digits, dtype=np.int64),
@@ -133,14 +126,7 @@ def _add_nearest(
     candidates: Int[np.ndarray, "7"],
     count: int,
 ) -> int:
-    """Append the nearest rivals to a digit's candidates while there is room; return the number of candidates.
-
-    Args:
-        distances: Distance of each point from the digit's nearest marker [m].
-        rivals: Points that may be appended; overwritten.
-        candidates: Candidates so far, overwritten.
-        count: How many there are so far.
-    """
+    """Append the nearest rivals to a digit's candidates while there is room; return their number."""
     while count < len(candidates):
         nearest = -1
         for point in range(len(rivals)):

@@ -41,8 +41,6 @@ def fit_hypothesis(
 
     Args:
         hand: The hand, its markers shifted by their biases.
-        digit: Index of the digit.
-        markers: Its markers.
         points: The candidates in the wrist's frame [m].
         variance: Variance of each marker of the hand [m^2].
         hypothesis: Candidate of each of the digit's markers, -1 for none.
@@ -50,7 +48,6 @@ def fit_hypothesis(
         precision: Precision of the digit's prior [1/rad^2].
         cutoff: Cost beyond which the fit stops early if it would end there.
         angles: Hinges to start from [rad], overwritten.
-        work: Buffers, overwritten.
 
     Returns:
         The cost of markers and prior (half squared standard deviations), and the complexity term: half the

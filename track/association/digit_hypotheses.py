@@ -80,7 +80,6 @@ def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> 
     """`DigitHypotheses` to be filled.
 
     Args:
-        num_digits: Digits.
         num_candidates: Candidates of each digit at most.
         num_markers: Markers of each digit at most.
     """
@@ -122,17 +121,9 @@ def evaluate_digit(
 ) -> None:
     """Evaluate all assignments of candidate points to the markers of one digit.
 
-    Args:
-        hand: The hand, its markers shifted by their biases.
-        model: Prior, noise and ranges of the digit.
-        digit: Index of the digit.
-        markers: Its markers.
-        points: The frame's points in the world [m].
-        candidates: Points that may be its markers.
-        log_odds: Log-odds of each label beside the fit, from IDs, presence and queries.
-        scores: The digit's row of `DigitHypotheses`, filled, as are the next two.
-        runners_up: See there.
-        assignments: See there.
+    The hand's markers are shifted by their biases; points are in the world [m]. Log-odds are those of each
+    label beside the fit, from IDs, presence and queries. The last three are the digit's rows of
+    `DigitHypotheses`, filled.
     """
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
@@ -185,19 +176,8 @@ def _fit_hypotheses(
 ) -> None:
     """Fit all hypotheses that can be the best of their points, those with fewer labels first.
 
-    Args:
-        hand: The hand, its markers shifted by their biases.
-        model: Prior, noise and ranges of the digit.
-        digit: Index of the digit.
-        markers: Its markers.
-        points: The candidates in the wrist's frame [m].
-        label_log_odds: Log-odds of each label beside the fit.
-        angles_before: Hinges of the hand [rad] as fitted to the labels so far.
-        mean: Mean of the digit's prior [rad].
-        precision: Precision of the digit's prior [1/rad^2].
-        scores: See `evaluate_digit`; so for the next two.
-        runners_up: See there.
-        assignments: See there.
+    The candidates are in the wrist's frame [m], the hinges of the hand [rad] as fitted to the labels so far;
+    mean and precision are the digit's prior. The results are those of `evaluate_digit`.
     """
     count, choices = len(markers), len(points) + 1
     work = workspace(len(hand.digits))

@@ -41,7 +41,6 @@ class Numbering:
         """Labels in which exactly these points are an owner's markers.
 
         Args:
-            owner: The owner.
             markers: Its marker that each point is; -1 where it is none of them.
             labels: Labels before; those of other owners stay, but where `markers` has a marker.
         """
@@ -112,7 +111,6 @@ def targets_of(
     """Labeled points in the layout's order [m], NaN where a marker has no point.
 
     Args:
-        points: Points [m].
         markers: Marker of each point, -1 for none.
         count: Markers of the layout.
     """

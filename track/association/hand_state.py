@@ -111,7 +111,6 @@ class HandState:
     """Filter state of one of the user's hands.
 
     Args:
-        hand: The hand and its glove.
         config: Noise of the markers, and density of strays.
         is_calibrated: Whether it is the user's hand, not one of the same size.
     """
@@ -184,7 +183,6 @@ class HandState:
             targets: Labeled markers [m]; NaN where missing. With fewer than four of them the pose is the
                 predicted one and has no RMS.
             start: A pose near the solution.
-            prediction: The predicted pose.
         """
         qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
@@ -259,7 +257,6 @@ class HandState:
         Args:
             qpos: A pose near the solution.
             targets: Labeled markers [m]; NaN where missing.
-            time: Time of the frame [s].
         """
         self._velocity[:] = 0.0
         self._last_seen[:] = time
@@ -308,9 +305,7 @@ class HandState:
         """Take over the pose of the next frame, and learn the biases of markers with settled labels.
 
         Args:
-            estimate: The fitted pose.
             settled: Which markers have a settled label.
-            time: Time of the frame [s].
         """
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
@@ -347,7 +342,12 @@ class HandState:
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
-        """Shift the markers of `adapted` by their biases."""
+        """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m].
+
+        A bias is in the frame of its bone, and known if averaged over any frames; it changes by a share
+        `variation` of the typical one as the hand moves. Variances below the least are overwritten, as are
+        the first `positions` of each marker in `HandArrays`.
+        """
         self._typical_bias = _shift_markers(
             self._bias_frames,
             self._bias,
@@ -384,14 +384,8 @@ def _learn_bias(
 ) -> None:
     """Average the residuals of markers with settled labels in the frames of their bones, and their variance.
 
-    Args:
-        residuals: Model minus marker in the world [m], NaN where a marker is missing.
-        rotations: Rotation of each marker's bone in the world.
-        settled: Which markers have a settled label.
-        averaging_frames: Frames that the averages go over.
-        bias_frames: Frames that each average has seen, at most `averaging_frames`; overwritten.
-        bias: Mean residual of each marker in the frame of its bone [m], overwritten.
-        variance: Variance of each marker in one direction [m^2], overwritten.
+    Residuals are model minus marker in the world [m], rotations those of the markers' bones. `bias_frames`,
+    `bias` [m] and `variance` [m^2] are overwritten; an average goes over `averaging_frames` at most.
     """
     residual = np.empty(3)
     for marker in range(len(residuals)):

@@ -93,7 +93,6 @@ class HandInitializer:
     """Initializes hands without any history.
 
     Args:
-        states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
         at_once: Look at a group of points along all directions in one call. Otherwise a call looks along one
@@ -185,15 +184,10 @@ class HandInitializer:
         return found if len(found) == 2 and better else hands
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
-        """Log-odds of labeled points being a hand against their being strays.
+        """Log-odds of `count` labeled points being a hand against their being strays.
 
-        Few points fit any pose; what a pose takes from them does not count.
-
-        Args:
-            count: Labeled points.
-            rms: Their RMS distance from the hand's markers [m].
-            spread: Known standard deviation around the markers in each direction [m]; estimated from the fit
-                when not given.
+        Few points fit any pose; what a pose takes from them does not count. `spread` is the known standard
+        deviation around the markers in each direction [m], estimated from the fit when not given.
         """
         taken = min(_FREE_COORDINATES, 3.0 * count)
         square = count * rms**2

@@ -30,11 +30,8 @@ _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard norm
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
     """Exchange the labels of two points where that explains both much better: the system exchanged their IDs.
 
-    A motion that the prediction misses moves both points alike and cancels in the comparison.
-
-    Args:
-        frame: The frame; a hand without a prediction has no labels.
-        positions: Predicted position of the marker of each label [m].
+    A motion that the prediction misses moves both points alike and cancels in the comparison. A hand without
+    a prediction has no labels.
     """
     labels = frame.labels.copy()
     points = _exchange(frame.points, labels, positions)
@@ -52,18 +49,10 @@ def _exchange(
     labels: NDArray[np.int64],
     positions: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Kernel of `exchange_labels`.
+    """Kernel of `exchange_labels`: overwrites the labels (P,), returns the points whose label has changed.
 
     What an exchange of i and j gains, (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is
     -(p_i-p_j).(m_i-m_j) / s^2. The pair that gains most comes first; a point is exchanged once.
-
-    Args:
-        points: The frame's points (P, 3) [m].
-        labels: Label of each point (P,), -1 for none; overwritten.
-        positions: Predicted position of the marker of each label (K, 3) [m].
-
-    Returns:
-        The points whose label has changed (E,).
     """
     labeled = np.flatnonzero(labels >= 0)
     changed = np.empty(len(labeled), dtype=np.int64)
@@ -101,12 +90,6 @@ def gate_labels(frame: FrameState, hand: int, state: HandState, prediction: Pred
 
     The gate is as wide as the innovations of the hand's other markers in this frame are large. Where too many
     labels are outside, the prediction is wrong, and all labels stay.
-
-    Args:
-        frame: The frame.
-        hand: Index of the hand.
-        state: The hand.
-        prediction: Its predicted pose.
     """
     markers = frame.markers(hand)
     _gate(frame.points, markers, prediction.positions, state.variance)
@@ -120,14 +103,7 @@ def _gate(
     positions: NDArray[np.float64],
     variance: NDArray[np.float64],
 ) -> None:
-    """Kernel of `gate_labels` for one hand.
-
-    Args:
-        points: The frame's points (P, 3) [m].
-        markers: The hand's marker that each of them is (P,), overwritten.
-        positions: Predicted markers (M, 3) [m].
-        variance: Their variance (M,) [m^2].
-    """
+    """Kernel of `gate_labels` for one hand; its markers (P,) are overwritten."""
     labeled = np.flatnonzero(markers >= 0)
     if len(labeled) == 0:
         return
@@ -146,12 +122,6 @@ def fit_labels(
     """Fit the pose to the labeled points.
 
     Labels that are inconsistent with the others are dropped, the worst first.
-
-    Args:
-        frame: The frame.
-        hand: Index of the hand.
-        state: The hand.
-        prediction: Its predicted pose.
     """
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
@@ -179,14 +149,7 @@ def _worst_label(
     positions: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
 ) -> int:
-    """The labeled point that is farthest from its fitted marker, if it is outside the gate; else -1.
-
-    Args:
-        points: The frame's points [m].
-        markers: The hand's marker that each of them is, -1 for none.
-        positions: Fitted markers [m].
-        variance: Their variance [m^2].
-    """
+    """The labeled point that is farthest from its fitted marker, if it is outside the gate; else -1."""
     worst, most = -1, -1.0
     for point in range(len(markers)):
         marker = markers[point]
@@ -207,7 +170,6 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
     Args:
         before: The frame with the labels that `track` was fitted to.
         frame: The frame now.
-        track: The hand.
     """
     if (before.markers(track.hand) == frame.markers(track.hand)).all():
         return frame, track

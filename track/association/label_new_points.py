@@ -53,9 +53,7 @@ def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: Digi
     """Label points without a label, and reassign labels that are not settled.
 
     Args:
-        frame: The frame.
         tracks: The hands that have a pose.
-        table: The digits of all hands.
     """
     if not tracks:
         return frame

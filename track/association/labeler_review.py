@@ -54,7 +54,6 @@ class LabelerReview:
 
     Args:
         labeler: Labels the points of a cloud of one hand.
-        num_hands: Number of hands.
         config: Density of strays, and the longest time between reviews.
     """
 

@@ -13,7 +13,6 @@ def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDA
     """Indices of the points that are linked by steps of at most `distance` [m], the largest group first.
 
     Args:
-        points: Points of a frame [m].
         distance: Longest step [m].
     """
     number = _single_linkage(points, distance)
@@ -58,11 +57,7 @@ def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np
 
 @kernel
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
-    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree.
-
-    Args:
-        points: Points of each frame [m].
-    """
+    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
     longest = np.zeros(len(points))
     for frame in range(len(points)):
         nearest = np.full(points.shape[1], np.inf)

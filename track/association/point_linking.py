@@ -54,9 +54,7 @@ class PointHistory:
         """The next frame with the labels and the evidence that its points carry over.
 
         Args:
-            points: The points [m].
             ids: The stream's IDs, -1 for none.
-            time: Time of the frame [s].
             expected: Predicted position of the marker of each label [m]; NaN where there is none.
         """
         if time - self._last_time > self._silence:
@@ -102,15 +100,8 @@ class PointLinker:
     ) -> Int[np.ndarray, "P"]:
         """Number the points of the next frame, as the stream does where most of its IDs last.
 
-        Args:
-            points: The points [m].
-            ids: The stream's IDs, -1 for none.
-            labels: Label of the numbers that had one in the last frame. Where there are any, the IDs of these
-                count: ghosts have short lives.
-            expected: Predicted position of the marker of each label [m]; NaN where there is none.
-
-        Returns:
-            The number of each point; a point without an ID in a stream that has them gets a new one.
+        Where numbers had labels in the last frame, the IDs of these count: ghosts have short lives. A point
+        without an ID in a stream that has them gets a new one.
         """
         again = [self._numbers.get(number, -1) for number in ids.tolist()]
         known = np.array(again, dtype=np.int64)

@@ -45,12 +45,6 @@ def label_alone(
 
     A hand is there where a pose fits. In a capture that shows hands in most frames, a frame with enough
     points holds one also where none fits: the labeler can be right where too many labels are wrong for a fit.
-
-    Args:
-        frames: Points of each frame [m].
-        hands: The hands that may be there.
-        labeler: Labeler of their glove.
-        told: Called with the number of frames that are done.
     """
     finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []

@@ -35,10 +35,8 @@ def fit_inliers(
     without which the others fit best is removed, one at a time, until all agree.
 
     Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        points: Points (N, 3) [m].
-        assignment: Point of each marker (Q,); those that are not kept are overwritten by -1.
-        pose: Overwritten by the pose (7,); left as it is when fewer than three points agree.
+        assignment: Points that are not kept are overwritten by -1.
+        pose: Overwritten; left as it is when fewer than three points agree.
         tight: Largest residual of the points that determine the pose [m].
         gate: Largest residual of a point that is kept [m].
 
@@ -76,11 +74,7 @@ def _fit_pose(
     assignment: NDArray[np.int64],
     pose: NDArray[np.float64],
 ) -> tuple[int, float, float]:
-    """Fit the pose (7,), overwritten, to all assigned points, three at least.
-
-    Returns:
-        Number of assigned points, sum of squared residuals and largest of them [m^2].
-    """
+    """Fit the pose to all assigned points; their number, and sum and largest of their squares [m^2]."""
     target, count = np.full_like(positions, np.nan), 0
     for marker in range(len(positions)):
         if assignment[marker] >= 0:
@@ -125,17 +119,7 @@ def assign_by_id(
     last_ids: NDArray[np.int64],
     assignment: NDArray[np.int64],
 ) -> int:
-    """Assign to every marker the point that has its ID of the last frame.
-
-    Args:
-        points: Points (N, 3) [m].
-        ids: ID of each point (N,).
-        last_ids: ID of each marker's point in the last frame (Q,), -1 for none.
-        assignment: Overwritten by the point of each marker (Q,).
-
-    Returns:
-        How many markers have a point.
-    """
+    """Assign to every marker the point that has its ID of the last frame, -1 for none; how many have one."""
     count = 0
     for marker in range(len(last_ids)):
         assignment[marker] = -1
@@ -191,17 +175,10 @@ def shift_to_points(
     predicted: NDArray[np.float64],
     gate: float,
 ) -> tuple[int, float]:
-    """Shift a predicted pose to the one or two points that are assigned, if they agree with it.
+    """Shift a predicted pose to the one or two points that are assigned, if they agree with it; else none is.
 
-    Args:
-        points: Points (N, 3) [m].
-        assignment: Point of each marker (Q,); -1 for all where the points do not agree.
-        pose: Predicted pose (7,); its position is changed.
-        predicted: Markers at the predicted pose (Q, 3) [m].
-        gate: Largest shift, and largest residual after it [m].
-
-    Returns:
-        How many points agree, and their RMS distance from their markers [m].
+    The gate is the largest shift, and the largest residual after it [m]. Returns how many points agree, and
+    their RMS distance from their markers [m].
     """
     shift, count = np.zeros(3), 0
     for marker in range(len(assignment)):
@@ -234,18 +211,7 @@ def track_by_ids(
 ) -> tuple[int, float]:
     """Assign points by the IDs of the last frame, fit the pose, and assign the rest from it.
 
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        points: Points (N, 3) [m].
-        ids: ID of each point (N,).
-        last_ids: ID of each marker's point in the last frame (Q,), -1 for none.
-        pose: Overwritten by the pose (7,); left as it is when fewer than three points agree.
-        tight: Largest residual of the points that determine the pose [m].
-        gate: Largest residual of a point that is kept [m].
-        assignment: Overwritten by the point of each marker (Q,).
-
-    Returns:
-        How many points agree, and their RMS distance from their markers [m].
+    Arguments and result are those of `assign_by_id` and `fit_inliers`.
     """
     if assign_by_id(points, ids, last_ids, assignment) < FEWEST:
         return 0, np.nan
@@ -263,14 +229,7 @@ def write_labels(
     labels: NDArray[np.int64],
     last_ids: NDArray[np.int64],
 ) -> None:
-    """Invert an assignment.
-
-    Args:
-        assignment: Point of each marker (Q,).
-        ids: ID of each point (N,).
-        labels: Written for assigned points (N,): the marker.
-        last_ids: Overwritten (Q,): ID of each marker's point, -1 for none.
-    """
+    """Write an assignment as labels of its points, and as last IDs of its markers, -1 for none."""
     for marker in range(len(assignment)):
         last_ids[marker] = -1
         if assignment[marker] >= 0:
@@ -312,7 +271,6 @@ def predict_pose(
     Args:
         pose: Pose now (7,).
         velocity: Linear [m/s] and angular [rad/s] velocity in world axes (6,).
-        seconds: Time [s].
     """
     later = pose.copy()
     later[:3] += seconds * velocity[:3]

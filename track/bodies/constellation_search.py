@@ -30,14 +30,11 @@ def search_constellation(
     """The largest set of points in the markers' constellation, from every triangle that fits.
 
     Args:
-        positions: Markers in the body's frame (Q, 3) [m].
         distances: Distances between markers (Q, Q) [m].
-        points: Points (N, 3) [m].
         expected: Expected positions of the markers in the world (Q, 3) [m].
         radius: Largest distance from there [m]; infinite when nothing is known.
         gate: Largest residual of a point after the fit [m].
-        assignment: Overwritten by the best assignment (Q,).
-        pose: Overwritten by its pose (7,).
+        assignment: Overwritten by the best assignment, as `pose` by its pose.
 
     Returns:
         Number of markers in the best assignment, its RMS distance [m], and number of markers in the best
@@ -81,19 +78,10 @@ def _try_triangles(
     pose: NDArray[np.float64],
     score: NDArray[np.float64],
 ) -> None:
-    """Try every triangle of a side that fits and a later marker.
+    """Try every triangle of a side (two markers and their points) that fits and a later marker.
 
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        distances: Distances between markers (Q, Q) [m].
-        points: Points (N, 3) [m].
-        apart: Distances between points (N, N) [m].
-        near: Whether a point is near enough to a marker's expected position (Q, N).
-        gate: Largest residual of a point after the fit [m].
-        side: Two markers and their points.
-        assignment: The best assignment so far (Q,), overwritten by a better one.
-        pose: Its pose (7,), overwritten.
-        score: See `_keep_better`.
+    `apart` are distances between points (N, N) [m], `near` is whether a point is near enough to a marker's
+    expected position (Q, N); the others are those of `_keep_better`.
     """
     a, b, i, j = side
     trial, slack = np.empty_like(assignment), 2.0 * gate
@@ -120,16 +108,9 @@ def _keep_better(
 ) -> None:
     """Keep a trial assignment if it has more markers than the best so far, or as many that fit better.
 
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        points: Points (N, 3) [m].
-        gate: Largest residual of a point after the fit [m].
-        trial: The trial assignment (Q,); points that do not fit are removed from it.
-        assignment: The best assignment so far (Q,), overwritten by a better one.
-        pose: Its pose (7,), overwritten.
-        score: Number of markers in the best assignment, its RMS distance [m], and number of markers in the
-            best other assignment (3,), overwritten. An assignment that shares three pairs with the best is
-            not another one.
+    Points that do not fit are removed from the trial. `score` (3,) is the number of markers in the best
+    assignment, its RMS distance [m], and the number of markers in the best other assignment; one that shares
+    three pairs with the best is not another one.
     """
     trial_pose = np.empty(7)
     count, rms = fit_inliers(positions, points, trial, trial_pose, gate, gate)
@@ -157,17 +138,7 @@ def _extend_triangle(
 ) -> int:
     """Assign to the other markers the free points where a triangle of markers predicts them.
 
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        points: Points (N, 3) [m].
-        slack: Largest distance from a predicted position [m].
-        assignment: Point of each marker (Q,), of three so far; the others are written.
-        a: First marker of the triangle.
-        b: Second marker.
-        c: Third marker.
-
-    Returns:
-        How many markers have a point; 0 where the triangle is too flat.
+    Returns how many markers have a point; 0 where the triangle is too flat.
     """
     model, seen = np.empty((3, 3)), np.empty((3, 3))
     if not _triangle_axes(positions[a], positions[b], positions[c], model):
@@ -190,11 +161,7 @@ def _triangle_axes(
     third: NDArray[np.float64],
     axes: NDArray[np.float64],
 ) -> bool:
-    """Write the axes of a triangle of points (3,) as rows (3, 3): first side, in its plane, normal.
-
-    Returns:
-        Whether it is not too flat.
-    """
+    """Write the axes of a triangle as rows: first side, in its plane, normal; False where it is too flat."""
     along, across = second - first, third - first
     length = np.sqrt((along**2).sum())
     axes[0] = along / length

@@ -90,7 +90,6 @@ def template_fault(
     """Why these markers are not a body that can be tracked, as a sentence; None if they are.
 
     Args:
-        name: Name of the body.
         marker_names: Names of its Q markers.
         positions: Markers in the body's frame [m].
     """
@@ -185,7 +184,6 @@ class BodyTracker:
             points: All points of the frame [m], in any order, with those of hands and ghosts. Points with
                 coordinates that are not finite are ignored.
             ids: The system's ID of each point, negative where it gives none.
-            time: Time of the frame [s].
 
         Raises:
             ArgumentError: `points` and `ids` do not fit together.
@@ -296,17 +294,9 @@ class BodyTracker:
         assignment: NDArray[np.int64],
         pose: NDArray[np.float64],
     ) -> tuple[int, float]:
-        """The unique match of the markers within a radius of a pose.
+        """The unique match of the markers within a radius of a pose, or anywhere; fills the last two arrays.
 
-        Args:
-            points: Points of the frame (N, 3) [m].
-            near: Pose (7,) around which to search; None for everywhere.
-            radius: Largest distance of a point from its marker at that pose [m].
-            assignment: Overwritten by the point of each marker (Q,), -1 for none.
-            pose: Overwritten by the pose (7,).
-
-        Returns:
-            Number of markers that match, 0 if there is no unique match, and their RMS distance [m].
+        Returns the number of markers that match, 0 if there is no unique match, and their RMS distance [m].
         """
         if len(points) > _MOST_POINTS:
             return 0, np.nan

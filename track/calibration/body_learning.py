@@ -31,7 +31,6 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
     Args:
         capture: A capture of the body in motion; gaps and a few false points are allowed. Marker names are
             not used.
-        name: Name of the body.
 
     Raises:
         ArgumentError: The capture is not in meters.

@@ -73,9 +73,7 @@ def find_touches(
 
     Args:
         model: A right hand.
-        angles: Its tracked motion [rad].
         complete: Whether all markers of a digit were seen.
-        rate: Frames per second [Hz].
     """
     by_finger = [thumb_contact(model, angles, finger) for finger in FINGERS]
     gaps = np.stack([-contact.overlap for contact in by_finger], axis=1)
@@ -123,7 +121,6 @@ def initialize_contacts(
     Args:
         model: A right hand.
         touches: Frame and finger of each.
-        T_world_bone: Its bones in those frames.
     """
     points = np.empty((2, len(touches), 3))
     for number, (_, finger) in enumerate(touches):
@@ -164,7 +161,6 @@ def slide_contacts(
     skin would fail where the skins overlap.
 
     Args:
-        contacts: Contacts with their current points.
         model: A right hand.
         T_world_bone: Its bones in the frame of each contact.
     """
@@ -187,7 +183,6 @@ def contact_geometry(
     """How the pads lie to each other.
 
     Args:
-        contacts: The contacts.
         corners: Triangles of the thumb's points, then of the fingers' (2 K).
         model: A right hand.
         T_world_bone: Its bones in the frame of each contact (K, L, 4, 4).

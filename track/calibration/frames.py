@@ -83,7 +83,6 @@ def solve_frames(
 
     Args:
         markers: All markers of the capture [m]; NaN where missing.
-        hand: The hand and its glove.
         frames: Numbers of the frames (K,).
         initial: Poses to start from (K, 27).
     """

@@ -84,13 +84,9 @@ def shape_jacobian(
 
 
 def skeleton_jacobian(start: HandShape, parameters: Float[np.ndarray, "53"]) -> Float[np.ndarray, "45 53"]:
-    """Derivative of what determines a skeleton by the parameters.
+    """Derivative of what determines a skeleton by the parameters, zero of which are the shape `start`.
 
     That is, in this order: bone lengths [m], knuckles [m] and base angles [rad], digit by digit.
-
-    Args:
-        start: Shape of zero parameters.
-        parameters: Where to differentiate.
     """
     along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
     lengths = start.bone_lengths.ravel() * along * np.exp(parameters[BONE_LENGTHS])
@@ -112,13 +108,8 @@ def skinned_shape_jacobian(
     """Derivative of skinned points by the skeleton (`skeleton_jacobian`), rest points and poses held fixed.
 
     A longer bone moves all bones beyond it, in the pose and at rest. Skinning undoes the rest transform, so
-    the derivative is the difference of the two.
-
-    Args:
-        model: A right hand.
-        T_world_bone: Its bones [m].
-        points: Rest positions in the wrist's frame [m].
-        weights: Skinning weights of all bones.
+    the derivative is the difference of the two. The model is a right hand, rest points are in the wrist's
+    frame [m].
     """
     rest = model.rest_transforms
     jacobian = np.zeros((len(T_world_bone), len(points), 3, 45))
@@ -153,16 +144,7 @@ def _fill_jacobian(
     axes: NDArray[np.float64],
     jacobian: NDArray[np.float64],
 ) -> None:
-    """Kernel of `skinned_shape_jacobian`.
-
-    Args:
-        bones: `T_world_bone` (T, L, 4, 4) [m].
-        rest: Rest transforms of the bones in the wrist's frame (L, 4, 4) [m].
-        points: Rest positions (M, 3) [m].
-        weights: Skinning weights (M, L).
-        axes: Axes of the base angles in the palm (5, 3, 3).
-        jacobian: Added to (T, M, 3, 45).
-    """
+    """Kernel of `skinned_shape_jacobian`; axes are those of the base angles in the palm (5, 3, 3)."""
     rotation = np.empty((3, 3))
     for frame in range(len(bones)):
         for bone in range(1, NUM_BONES):
@@ -191,18 +173,7 @@ def _add_bone(
     rotation: NDArray[np.float64],
     axes: NDArray[np.float64],
 ) -> None:
-    """Add one bone's share of a point's jacobian.
-
-    Args:
-        row: Jacobian of the point (3, 45), added to.
-        bone: Index of the bone, not the palm.
-        share: Its skinning weight.
-        point: Rest position (3,) [m].
-        bones: `T_world_bone` of one frame (L, 4, 4) [m].
-        rest: Rest transforms of the bones in the wrist's frame (L, 4, 4) [m].
-        rotation: The bone's rotation from rest to the world (3, 3).
-        axes: Axes of the base angles in the palm (5, 3, 3).
-    """
+    """Add one bone's share of a point's jacobian (3, 45); the arguments are those of `_fill_jacobian`."""
     digit, index, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
     carried, arm = np.empty(3), np.empty(3)
     for i in range(3):
@@ -236,15 +207,8 @@ def _add_rotation(
 ) -> None:
     """Add the derivative by one base angle: a rotation of the digit about its knuckle, posed minus at rest.
 
-    Args:
-        row: Jacobian of the point (3, 45), added to.
-        column: The base angle's column.
-        share: The bone's skinning weight.
-        wrist: `T_world_wrist` (4, 4) [m].
-        rotation: The bone's rotation from rest to the world (3, 3).
-        axis: Axis of the base angle in the palm (3,).
-        carried: Posed point minus knuckle, in the world (3,) [m].
-        arm: Rest point minus knuckle, in the wrist's frame (3,) [m].
+    `carried` is the posed point minus the knuckle, in the world, `arm` the same at rest, in the wrist's
+    frame.
     """
     x = wrist[0, 0] * axis[0] + wrist[0, 1] * axis[1] + wrist[0, 2] * axis[2]
     y = wrist[1, 0] * axis[0] + wrist[1, 1] * axis[1] + wrist[1, 2] * axis[2]
@@ -269,13 +233,7 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """The terms of linear blend skinning.
-
-    Args:
-        model: A right hand.
-        T_world_bone: Its bones [m].
-        points: Rest positions in the wrist's frame [m].
-        weights: Skinning weights of all bones.
+    """Terms of linear blend skinning of a right hand, with rest points in the wrist's frame [m].
 
     Returns:
         Derivative of each skinned point by its rest position (the blended rotation), and the position that

@@ -39,11 +39,8 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
     """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints.
 
     It is the correlation of each frame's residuals, in the wrist's frame, with those of the frame whose joint
-    angles are nearest. Noise that is independent from frame to frame gives zero.
-
-    Args:
-        qpos: Poses of a fitted hand, two or more.
-        residuals: Model minus marker [m], NaN where a marker is missing.
+    angles are nearest. Noise that is independent from frame to frame gives zero. There are two poses at
+    least.
     """
     from scipy.spatial import cKDTree
 
@@ -57,13 +54,8 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
 def effective_noise(noise: float, repeated: float, num_frames: int) -> float:
     """Noise [m] for the weights of the residuals, so that correlated frames do not count as independent ones.
 
-    What repeats in every similar pose is flesh that moves with the pose: many frames carry the information of
-    a few about it.
-
-    Args:
-        noise: Standard deviation of a marker's coordinates [m].
-        repeated: Share of its square that repeats, see `repeated_share`.
-        num_frames: Frames that are weighted.
+    What repeats (`repeated_share`) in every similar pose is flesh that moves with the pose: many frames carry
+    the information of a few about it.
     """
     flesh = repeated * noise**2
     return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
@@ -90,15 +82,7 @@ def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
 def _learned(
     squares: NDArray[np.float64], variances: NDArray[np.float64], axes: int, spread: float, usual: float
 ) -> float:
-    """A spread [m] of offsets from zero.
-
-    Args:
-        squares: Estimated offsets, squared, summed over the axes (M,) [m^2].
-        variances: Their posterior variances, summed over the axes (M,) [m^2].
-        axes: Number of axes.
-        spread: The spread before [m].
-        usual: Of gloves [m].
-    """
+    """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
     return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
 

@@ -179,10 +179,8 @@ def displace_markers(
 
     Args:
         worn: The glove as designed.
-        shape: The hand's shape.
         distance: Length of each marker's displacement, in a random direction [m].
         lift: Standard deviation of its height above the skin [m].
-        rng: Source of all randomness.
     """
     steps = rng.normal(size=worn.points.shape)
     steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
@@ -224,12 +222,7 @@ def project_onto_skin(
     """Coordinates of points, by Newton steps that walk from triangle to adjacent triangle.
 
     The height of a point is its signed distance along the normal. Where the skin folds and the walk does not
-    converge, the foot point stays on the last edge.
-
-    Args:
-        coordinates: Where to begin.
-        targets: The points, in the wrist's frame [m].
-        skin: The hand's skin.
+    converge, the foot point stays on the last edge. Targets are in the wrist's frame [m].
     """
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)

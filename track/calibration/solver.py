@@ -37,18 +37,9 @@ def levenberg_marquardt(
     progress: Progress | None,
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
-    """Minimize the energy until it hardly falls, or `most` steps have been made.
+    """Minimize the energy until a step gains less than a share of it, or step number `most` has been made.
 
-    Args:
-        problem: The data.
-        estimate: Where to start.
-        steps: Number of steps made before.
-        most: Number of the last step, at most.
-        progress: Called after each step.
-        small_gain: Share of the energy; a step that gains less is the last one.
-
-    Returns:
-        The estimate, its fit, and the number of the last step.
+    Returns the estimate, its fit, and the number of the last step; `steps` were made before.
     """
     fit, damping, better = problem.fit(estimate), _FIRST_DAMPING, True
     while better and steps < most:
@@ -81,7 +72,6 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 
     Args:
         right: A right hand in the same glove.
-        problem: The data.
         estimate: Shape and markers.
     """
     shape = shape_at(problem.shape, estimate.parameters)
@@ -91,11 +81,7 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 def eliminate_poses(
     equations: NormalEquations, damping: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Schur complement of the poses.
-
-    Args:
-        equations: Normal equations of all unknowns.
-        damping: Added to the diagonal of the poses' blocks, as a share of it.
+    """Schur complement of the poses, with `damping` times the diagonal of their blocks added to it.
 
     Returns:
         The reduced system with its gradient as the last column (S, S + 1), and the poses' blocks solved for

@@ -179,8 +179,6 @@ def calibrate_hand(
         markers: The markers of one hand in the glove's order [m]; NaN where missing. Of joints that do not
             move and tips that do not touch, what is usual among people stays.
         start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
-        rate: Frames per second [Hz].
-        progress: Called after each step.
 
     Returns:
         The calibrated hand in its glove, residuals [m] before and after, and standard errors [m].

@@ -1,4 +1,7 @@
-"""A search for a better layout near a given one: markers are moved, added and dropped, one at a time."""
+"""A search for a better layout near a given one: markers are moved, added and dropped, one at a time.
+
+Layouts are compared by labels of the same hands with the same losses (`judge`).
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,11 @@ import dataclasses
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+import torch
+from jaxtyping import Float
 
 from gloves.attachment import attach_markers
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
@@ -17,9 +22,13 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.space.cameras import CameraRig
 from track.glove_advice.joint_spread import palm_spread
-from track.glove_advice.layout_worth import Worth, judge
 from track.glove_advice.worn_places import Columns, WornPlaces
+from train.any_layout.layout_labeler import mean_features, shipped_network
 from train.any_layout.skin_bank import sample_places
+from train.data.augmentation import Corruption, corrupt
+from train.matching.assignment import match_probabilities, pair_probabilities
+from train.metrics import LabelCounts
+from train.threads import labeling_threads
 
 _PEOPLE, _POSES_EACH = 40, 40
 _CANDIDATES: Final = 10  # places that are tried at once
@@ -36,6 +45,9 @@ _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
 _PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
 _GAIN: Final = 0.05  # of a better layout, at least [points]
 _TRIES: Final = 20  # draws of a place
+_TESTED: Final = 240  # frames whose labels are counted
+_GHOSTS: Final = 2  # at most
+_OF_JOINTS: Final = 3.0  # percent of the slots that a degree of the joints counts for
 
 
 class Improvement:
@@ -43,9 +55,7 @@ class Improvement:
 
     Args:
         layout: Where to begin.
-        rig: The cameras.
         keep: Names of markers that stay where they are.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin of somebody, or a name to keep is none of the layout's.
@@ -85,12 +95,7 @@ class Improvement:
             self._take(self._shrunk())
 
     def search(self, seconds: float, told: Callable[[Worth], None]) -> None:
-        """Move markers while time lasts.
-
-        Args:
-            seconds: How long [s].
-            told: Called after every step.
-        """
+        """Move markers while time lasts."""
         places, until = self._columns.places, time.monotonic() + seconds
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
         while free and time.monotonic() < until:
@@ -247,3 +252,50 @@ class Improvement:
 
 def _digit(place: MarkerPlace) -> int:
     return BONES[BONE_NAMES.index(place.bone)].digit
+
+
+class Worth(NamedTuple):
+    """How good a layout is."""
+
+    slots: float
+    """Share of slots that are right, as a rig sees them and with ghosts."""
+    joints: float
+    """Root mean square spread of the joints [rad]."""
+    by_marker: Float[np.ndarray, "M"]
+    """Share of each marker's slots that are right."""
+
+    @property
+    def cost(self) -> float:
+        """What a better layout has less of: wrong slots [%] and, weighted, the spread of the joints [deg]."""
+        return 100.0 * (1.0 - self.slots) + _OF_JOINTS * float(np.rad2deg(self.joints))
+
+
+def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
+    """Label a layout with the network for any layout, without verification by a pose, and count.
+
+    Args:
+        seed: Of losses and ghosts: the same for layouts that are compared.
+    """
+    network = shipped_network()
+    features = mean_features(layout.positions, network.config)[None]
+    rng = np.random.default_rng(seed)
+    step = max(1, len(layout.positions) // _TESTED)
+    points = layout.positions[::step] - layout.positions[::step].mean(axis=1, keepdims=True)
+    observed = np.where(layout.seen[::step, :, None], points, np.nan)
+    half = len(layout.places) // 8  # the rig loses few; half of the paper's recipe on top
+    cloud = corrupt(observed, Corruption(occlude=half, ghosts=_GHOSTS), rng=rng)
+    with torch.inference_mode(), labeling_threads():
+        scores = network(
+            torch.from_numpy(cloud.points.astype(np.float32)), torch.from_numpy(cloud.present), features
+        )[-1]
+    count, right = len(layout.places), np.zeros(len(layout.places))
+    counts = LabelCounts(confusion=np.zeros((count + 1, count + 1), dtype=np.int64))
+    for by_point, by_label, here, truth in zip(
+        scores.points.numpy(), scores.labels.numpy(), cloud.present, cloud.truth, strict=True
+    ):
+        of_points = np.concatenate([by_label[:, :-1][:, here], by_label[:, -1:]], axis=1)
+        labels = match_probabilities(pair_probabilities(by_point[here], of_points))
+        right += counts.add(labels, truth[here], count)
+    by_marker = right / len(cloud.truth)
+    spreads = people.joint_spreads(layout)
+    return Worth(float(by_marker.mean()), float(np.sqrt((spreads**2).mean())), by_marker)

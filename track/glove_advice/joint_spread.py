@@ -64,12 +64,7 @@ def pose_spreads(
 def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
     """Standard deviation of the palm's rotation about its least certain axis, by its own markers [rad].
 
-    Args:
-        places: Markers of a layout.
-        model: A hand.
-
-    Returns:
-        Infinite with fewer than three markers on the palm, or three in a line.
+    Infinite with fewer than three markers on the palm, or three in a line.
     """
     palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
     if len(palm) < _FEWEST_OF_BODY:

@@ -17,7 +17,7 @@ from track.glove_advice.trials import Trial
 from train.data.augmentation import Corruption, corrupt
 from train.data.batches import paper_corruption
 from train.evaluate import evaluate_labeler
-from train.evaluation.labeler_evaluation import Report, evaluate_clouds
+from train.labeler_evaluation import Report, evaluate_clouds
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 
@@ -57,8 +57,6 @@ def score_layout(
     """Label and count what a rig sees of gloved hands.
 
     Args:
-        layout: The glove.
-        hands: Hands that wear it.
         labeler: A labeler of this layout; `train.any_layout.layout_labeler.LayoutLabeler` needs no training.
         rng: Order of points, and the random parts of the paper's recipe.
     """

@@ -37,10 +37,7 @@ def observe_poses(
     """Random people's hands in the poses and scenes of training sets, every frame by itself.
 
     Args:
-        layout: The glove.
-        rig: The cameras.
         num_frames: Frames at least, of all hands together.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin.
@@ -68,11 +65,7 @@ def observe_motion(
     """The hands of a take in another glove, its frames evenly chosen, in the middle of the rig.
 
     Args:
-        take: A tracked or simulated take.
-        layout: The glove.
-        rig: The cameras.
         num_frames: Frames of each hand at most.
-        rng: Source of all randomness.
 
     Raises:
         CaptureError: There is no frame in which all hands have a pose.

@@ -6,35 +6,40 @@ from collections.abc import Mapping
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.app.page import Section, write_page
-from handsim.hand.topology import DIGITS
+from handsim.hand.topology import DIGITS, JOINTS
 from track.glove_advice.advice import advice
-from track.glove_advice.joint_picture import SIZE, draw_joints
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
 from track.glove_advice.trials import METHODS, Trial
-from train.evaluation.metrics import percent
+from train.metrics import percent
 from train.reports import hand_plot
-from train.reports.flat_hand import flat_hand
-from train.reports.plot_style import picture
+from train.reports.flat_hand import FlatHand, flat_hand
+from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 _NOTHING: Final = "-"
+SIZE: Final = (8.4, 6.4)
+"""Of the picture [inch]."""
+_MOST: Final = 15.0  # [deg], the end of the colors' scale
+_DOT: Final = 15.0  # [points]
+_MARKER: Final = 5.0
 
 
 def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: bool = False) -> None:
     """Write the page: one HTML file with its pictures inside.
 
     Args:
-        path: The file.
-        score: What is known of the layout.
         seen_by: Whose motion was seen by which rig, in words.
-        trained: Whether the labeler was trained on the layout.
     """
     layout, frames = score.layout, score.observed.num_frames
     sections = [
@@ -161,3 +166,40 @@ def _joints_section(score: LayoutScore) -> Section:
         "limits of the joints. Tracking knows more: what the hand did before, and what hands usually do."
     )
     return Section("Joints", text, table=table, pictures=[(picture(SIZE, draw), caption)])
+
+
+def draw_joints(figure: Figure, hand: FlatHand, joints: Float[np.ndarray, "20"]) -> None:
+    """Draw a disk at each bone's near end: the worst joint there, in degrees.
+
+    Args:
+        figure: Where to draw, of `SIZE`.
+        joints: Standard deviation of each joint [rad].
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    panel = figure.subplots()
+    panel.set_axis_off()
+    panel.set_aspect("equal")
+    outline = Path.make_compound_path(*(Path(loop, closed=True) for loop in hand.outlines))
+    panel.add_patch(PathPatch(outline, facecolor=BAND, edgecolor=LINE, linewidth=1.0))
+    for bone in hand.bones:
+        panel.plot(*bone.T, color=LINE, linewidth=2.5, solid_capstyle="round", zorder=1)
+    panel.plot(*hand.markers.T, "o", color=SOFT, markersize=_MARKER, markerfacecolor=CARD, zorder=2)
+    colors, norm = (
+        LinearSegmentedColormap.from_list("spread", [BLUE, PALE, "#d9a441", WARM]),
+        Normalize(0, _MOST),
+    )
+    degrees = np.rad2deg(joints)
+    for bone in sorted({joint.bone for joint in JOINTS}):
+        worst = max(degrees[number] for number, joint in enumerate(JOINTS) if joint.bone == bone)
+        x, y = hand.bones[bone - 1][0]
+        panel.plot(x, y, "o", markersize=_DOT, color=colors(norm(worst)), markeredgecolor=INK, zorder=3)
+        panel.annotate(
+            f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=INK, zorder=4
+        )
+    bar = figure.colorbar(ScalarMappable(norm, colors), ax=panel, shrink=0.6, extend="max")
+    bar.set_label("standard deviation of the worst joint [deg]")
+    bar.outline.set_visible(False)

@@ -25,8 +25,8 @@ from track.config import BOTH
 from track.hand_size import sample_frames
 from track.setup import measured_user
 from track.streams.frame_source import checked_frames
-from train.evaluation.metrics import LabelCounts
 from train.labelers.protocol import Labeler
+from train.metrics import LabelCounts
 from train.simulation.room_settings import SimulatedKind
 from train.simulation.takes import simulate_take
 
@@ -96,13 +96,9 @@ def try_layout(
     """Label and track simulated captures of each kind of work that the glove is for.
 
     Args:
-        layout: The glove.
-        rig: The cameras.
-        labeler: A labeler of the glove.
         work: Kinds of work, of `WORK`.
         count: Captures of each kind, each of another person.
         first: Number of the first capture.
-        frames: Of each capture.
         told: Called before each capture with what it is.
     """
     found: dict[str, Trial] = {}
@@ -130,7 +126,6 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     Args:
         truth: The capture, whose gloves have slipped a little.
         layout: The glove as designed.
-        labeler: A labeler of it.
     """
     capture = truth.capture()
     sides = [side for side in BOTH if side in layout.sides]

@@ -74,11 +74,7 @@ class WornPlaces:
     """Right hands of random people in random poses before a rig.
 
     Args:
-        num_people: Number of people.
         poses_each: Poses of each.
-        radius: Of the markers [m].
-        rig: The cameras.
-        rng: Source of all randomness.
     """
 
     def __init__(

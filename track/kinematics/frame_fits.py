@@ -46,7 +46,6 @@ def fit_frames(
     """Solve frames one by one.
 
     Args:
-        hand: The hand and its glove.
         shapes: Shapes to start from where there are no initial poses.
         on_part: Markers on each digit, and on the palm (last).
         targets: Labeled markers [m]; NaN where missing.

@@ -73,7 +73,6 @@ def predict_joints(
 
     Args:
         angles: Predicted angles [rad], by velocity alone; they return to those of a resting hand.
-        covariance: Covariance of the estimate [rad^2].
         span: Time since the estimate [s].
     """
     kept = np.exp(-max(span, 0.0) / _JOINT_MEMORY)
@@ -90,14 +89,7 @@ def _predict_covariance(
     kept: float,
     prior: JointPrior,
 ) -> None:
-    """Fill covariance and precision of a prior.
-
-    Args:
-        known: Covariance of the estimate [rad^2].
-        resting: Covariance of the resting distribution [rad^2].
-        kept: Share of the first in the result, from 0 to 1.
-        prior: Filled, but for its angles.
-    """
+    """Fill covariance and precision of a prior: a share of what is known, the rest of a resting hand."""
     for row in range(len(known)):
         for column in range(len(known)):
             prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
@@ -115,16 +107,7 @@ def digit_prior(
     angles: Float[np.ndarray, "4"],
     precision: Float[np.ndarray, "4 4"],
 ) -> None:
-    """Prior of one digit's hinges, given the markers of the other digits.
-
-    Args:
-        prior: Distribution of the hinges before the markers were used.
-        information_matrix: See `MarkerPrediction`.
-        information_vector: See `MarkerPrediction`.
-        digit: Index of the digit.
-        angles: Its mean [rad], filled.
-        precision: Its precision [1/rad^2], filled.
-    """
+    """Fill mean and precision of one digit's hinges, given the others' markers; see `MarkerPrediction`."""
     count = len(information_vector)
     order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
     index = 0

@@ -46,7 +46,6 @@ def levenberg_marquardt(
     """Bring a pose to a minimum of its cost.
 
     Args:
-        hand: The hand and its glove.
         target: Markers in the world [m]; NaN where missing.
         qpos: Pose to start from, overwritten.
         prior_mean: Mean of the prior, a pose.
@@ -54,9 +53,7 @@ def levenberg_marquardt(
             [1/rad^2, 1/m^2, 1/rad^2]; zero where there is no prior.
         robust_scale: Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for
             plain least squares.
-        most_steps: Steps at most.
         small_gain: Expected decrease of the cost from which on a step is the last one.
-        work: Buffers, overwritten.
 
     Returns:
         The cost (squared standard deviations), and how many steps were tried.
@@ -95,9 +92,7 @@ def marker_residuals(
     """Forward kinematics, and the residuals of the markers in the wrist's frame.
 
     Args:
-        hand: The hand and its glove.
         target: Markers in the world [m]; NaN where missing.
-        qpos: The pose.
         work: Filled as by `compute_markers`, and `residuals` too.
     """
     compute_markers(hand, qpos[7:], work)
@@ -184,13 +179,7 @@ def _linearize(
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
     """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
 
-    Args:
-        skyline: First column of each row, see `HandArrays`.
-        damping: Share of the diagonal that is added to it.
-        work: `normal` and `gradient` are read.
-
-    Returns:
-        The expected decrease of the cost; a negative number when the matrix has no factor.
+    Returns the expected decrease of the cost; a negative number when the matrix has no factor.
     """
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):
@@ -242,13 +231,10 @@ def move_wrist(
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:
-    """Translation and rotation of the wrist between two poses, along its axes in the second.
+    """Fill the last six numbers of a step: translation and rotation of the wrist from one pose to another.
 
-    Args:
-        before: The first pose.
-        now: The second pose.
-        step: Its last six numbers are filled [m, rad]; the rotation is to first order, twice the vector part
-            of the quaternion.
+    They are along its axes in the second; the rotation is to first order, twice the vector part of the
+    quaternion.
     """
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
@@ -295,15 +281,10 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
-    """Eliminate unknowns of a symmetric positive-definite system (Schur complement).
+    """Eliminate unknowns `first` to before `last` of a symmetric positive-definite system (Schur complement).
 
-    The block below and right of the eliminated unknowns stays symmetric and complete.
-
-    Args:
-        matrix: The matrix, overwritten.
-        right_side: The right side, overwritten.
-        first: The first unknown that is eliminated from those after it.
-        last: The first unknown that is not eliminated.
+    Matrix and right side are overwritten; the block below and right of the eliminated unknowns stays
+    symmetric and complete.
     """
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]

@@ -139,8 +139,6 @@ def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Wor
     """Forward kinematics of all bones, hinge axes and markers, in the wrist's frame.
 
     Args:
-        hand: The hand and its glove.
-        angles: Hinge angles [rad].
         work: Its `rotations`, `origins`, `axes`, `bone_terms` and `markers` are filled.
     """
     for digit in range(NUM_JOINTS // 4):
@@ -154,9 +152,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
     """Forward kinematics of the bones and hinge axes of one digit, in the wrist's frame.
 
     Args:
-        hand: The hand and its glove.
         digit: Index of the digit, 0 for the thumb.
-        angles: The digit's hinge angles [rad].
         work: The digit's rows of `rotations`, `origins` and `axes` are filled.
     """
     for link in range(3):
@@ -180,8 +176,6 @@ def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Position of one marker in the wrist's frame [m].
 
     Args:
-        hand: The hand and its glove.
-        marker: Index of the marker.
         work: Its bones must be computed; the marker's rows of `bone_terms` and `markers` are filled.
     """
     work.markers[marker] = 0.0
@@ -201,14 +195,7 @@ def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
 def _rotate_bone(
     own: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float, outside: Float[np.ndarray, "3"]
 ) -> None:
-    """Rotate a bone about an axis of its own (Rodrigues' formula).
-
-    Args:
-        own: Rotation of the bone in the wrist's frame, overwritten.
-        axis: Unit axis in the bone's frame.
-        angle: Angle [rad].
-        outside: The axis in the wrist's frame, filled.
-    """
+    """Rotate a bone about its own unit axis (Rodrigues); `outside` gets the axis in the wrist's frame."""
     sine, cosine = np.sin(angle), np.cos(angle)
     x, y, z = axis[0], axis[1], axis[2]
     for i in range(3):
@@ -226,8 +213,6 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Derivatives of one marker by all unknowns, in the wrist's frame.
 
     Args:
-        hand: The hand and its glove.
-        marker: Index of the marker.
         work: Its bones and the marker must be computed; the marker's block of `jacobian` is filled.
     """
     jacobian = work.jacobian[marker]
@@ -260,7 +245,6 @@ def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"
     """Normal matrix and half gradient of the sum of the markers' weighted squared residuals.
 
     Args:
-        hand: The hand and its glove.
         weights: Weight of each marker [1/m^2]; zero for a missing one.
         work: Its markers and residuals must be computed; `jacobian`, `normal` (upper triangle) and `gradient`
             are filled.

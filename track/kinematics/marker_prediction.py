@@ -80,9 +80,7 @@ def predict_markers(
     """Fill a `MarkerPrediction`.
 
     Args:
-        hand: The hand and its glove.
         on_part: Markers on each digit, and on the palm (last).
-        pose: The fitted pose.
         target: The markers it was fitted to [m]; NaN where missing.
         joint_prior: Distribution of the hinges before the fit.
         wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before the fit.
@@ -141,17 +139,7 @@ def _marker_covariance(
     work: Workspace,
     covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Covariance of a marker in the world [m^2], written to `covariance`.
-
-    Args:
-        hand: The hand and its glove.
-        marker: Index of the marker.
-        posterior: Covariance of the unknowns [rad^2, m^2].
-        wrist: Rotation of the wrist in the world.
-        variance: The marker's own variance in each direction [m^2].
-        work: Its `jacobian` is read.
-        covariance: Filled.
-    """
+    """Covariance of a marker in the world [m^2], from the unknowns' posterior and its own variance."""
     first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
     jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
@@ -185,21 +173,10 @@ def _settle(
     work: Workspace,
     qpos: Float[np.ndarray, "27"],
 ) -> bool:
-    """Move the hinges of digits that lack markers to the optimum of prior and markers.
+    """Move hinges of digits that lack markers to the optimum of prior and markers; False without such digits.
 
     The hinges of the other digits are held, and inform those of their neighbors through the prior's
     covariance.
-
-    Args:
-        hand: The hand and its glove.
-        seen: Markers that are present on each digit, and on the palm (last).
-        on_part: All markers on each of them.
-        joint_prior: Distribution of the hinges before the fit.
-        work: Its `normal` and `gradient` are read.
-        qpos: The fitted pose; its hinges [rad] are overwritten.
-
-    Returns:
-        Whether there are such digits.
     """
     weak = np.zeros(NUM_JOINTS, dtype=np.int64)
     count = 0

@@ -64,7 +64,6 @@ class PoseSolver:
     """Solves poses of one hand in one glove; precomputes what does not depend on the frame.
 
     Args:
-        fit: The hand in its glove.
         outlier_distance: Scale [m] of a robust loss (Geman and McClure 1987), so that a wrong label does not
             bend the hand; it needs a good start. Plain least squares when not given.
 
@@ -201,17 +200,7 @@ class PoseSolver:
         variance: Float[np.ndarray, "M"],
         noise: float,
     ) -> MarkerPrediction:
-        """Positions and covariances of a fitted pose's markers; see `marker_prediction.predict_markers`.
-
-        Args:
-            qpos: The fitted pose.
-            target: The markers that it was fitted to [m]; NaN where missing.
-            joint_prior: Distribution of the hinges before the fit.
-            wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before
-                the fit.
-            variance: Variance of each marker around its position on the hand [m^2].
-            noise: Standard deviation of the markers around the pose's [m].
-        """
+        """Positions and covariances of a fitted pose's markers; see `marker_prediction.predict_markers`."""
         predicted = empty_prediction(len(self.hand.digits))
         predict_markers(
             self.hand, self._on_part, qpos, target, joint_prior, wrist_spread, variance, noise, predicted

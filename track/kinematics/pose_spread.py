@@ -106,13 +106,9 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
 
 
 def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
-    """Of a calibrated hand, which is as near to its user's as the noise of its markers lets it be.
+    """Of a calibrated hand, which is as near to its user's as the noise of its markers [m] lets it be.
 
     A digit with a single marker remains half as doubtful as on a hand of which the size is known.
-
-    Args:
-        digits: Digit of each marker, -1 for the palm.
-        noise: Standard deviation of a marker around its place, from frame to frame [m].
     """
     before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
@@ -135,7 +131,6 @@ class SpreadModel:
     """Standard deviations of the poses of one hand.
 
     Args:
-        fit: The hand in its glove.
         is_calibrated: Whether it is its user's; otherwise only the size is.
     """
 
@@ -156,7 +151,6 @@ class SpreadModel:
         """Of each joint angle [rad], and of each keypoint in each direction [m].
 
         Args:
-            qpos: The poses.
             unseen: Time since each marker was last seen [s]; infinite if it never was.
             rms: Usual RMS distance of markers from the pose's [m]; NaN if it is not known.
         """
@@ -184,11 +178,8 @@ def pose_spreads(
     """Standard deviations of each joint angle [rad] and of each keypoint in each direction [m].
 
     Args:
-        hand: The hand and its glove.
         tips: Lengths of the last bones [m].
         prior: Precision of the hinges before any marker is seen [1/rad^2].
-        doubt: What is not known of the hand.
-        qpos: The poses.
         unseen: Time since each marker was last seen [s]; infinite if it never was.
     """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
@@ -228,18 +219,10 @@ def _add_systematic(
     own: Float[np.ndarray, "5 10 26"],
     whole: Float[np.ndarray, "26"],
 ) -> None:
-    """Covariance of the unknowns: the posterior, and what the hand's own doubt makes of it.
+    """Covariance of the unknowns (lower triangle): the posterior, and what the hand's own doubt makes of it.
 
-    Args:
-        hand: The hand and its glove.
-        doubt: What is not known of the hand.
-        weights: Weight of each marker [1/m^2].
-        work: Its markers and their `jacobian` are read, `factor` is overwritten.
-        posterior: Covariance of the unknowns on a hand that is known.
-        covariance: Lower triangle, filled.
-        own: How the gradient of the fit changes by each digit's own numbers, in their standard deviations;
-            filled.
-        whole: The same by the size of the whole hand; filled.
+    `own` and `whole` get how the gradient of the fit changes by each digit's own numbers, and by the size of
+    the whole hand, in their standard deviations.
     """
     forces = work.factor
     forces[:], own[:], whole[:] = 0.0, 0.0, 0.0
@@ -353,15 +336,7 @@ def _shift_digit(
     share: float,
     shift: Float[np.ndarray, "10 3"],
 ) -> None:
-    """Fill how a point of a digit moves with its knuckle and direction, in their standard deviations [m].
-
-    Args:
-        doubt: What is not known of the hand.
-        digit: Index of the digit.
-        point: From the knuckle [m], times the share.
-        share: Of the point that moves with the digit.
-        shift: Its first six rows are filled.
-    """
+    """Fill how a point of a digit, times its share, moves with knuckle and direction, in their spreads."""
     turns = doubt.directions[digit]
     shift[:6] = 0.0
     for i in range(3):
@@ -433,12 +408,8 @@ def _keypoint_square(
 ) -> float:
     """Mean square of a keypoint's error, over all directions together [m^2].
 
-    Args:
-        jacobian: Derivatives of the keypoint by the unknowns that move it.
-        unknowns: Which these are.
-        covariance: Of all unknowns, its lower triangle.
-        answers: See `_answer`.
-        shift: How the keypoint of the hand moves by each of its numbers [m].
+    `unknowns` move it, `covariance` is of all unknowns, and `shift` how the hand's keypoint moves by each of
+    its numbers [m].
     """
     total, cross = 0.0, np.empty(3)
     for one in range(_CHAIN):
@@ -482,14 +453,10 @@ def _answer(
 def _move_keypoint(
     digit: int, part: int, point: Float[np.ndarray, "3"], work: Workspace, jacobian: Float[np.ndarray, "10 3"]
 ) -> None:
-    """Fill the derivatives of a digit's keypoint by its hinges and by the wrist's rotation.
+    """Fill the derivatives of a digit's keypoint by its hinges and by the wrist's rotation and translation.
 
-    Args:
-        digit: Index of the digit.
-        part: Its joint, 0 to 2, or its tip, 3; ascending, since further hinges are left as they are.
-        point: The keypoint in the wrist's frame [m].
-        work: Its `origins` and `axes` are read.
-        jacobian: Rows of the four hinges, and of the wrist's translation and rotation [m/rad, m/m].
+    Parts are its joints, 0 to 2, and its tip, 3, in ascending order, since further hinges are left as they
+    are.
     """
     for hinge in range(part + 1 if part > 0 else 0):
         origin, axis = work.origins[1 + 3 * digit + max(0, hinge - 1)], work.axes[4 * digit + hinge]

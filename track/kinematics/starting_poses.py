@@ -64,11 +64,6 @@ def initial_poses(
 
     The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
     aligned with the markers first.
-
-    Args:
-        shapes: The shapes.
-        digits: Digit of each marker, -1 for the palm.
-        target: Markers in the world [m]; NaN where missing.
     """
     count = len(shapes.angles)
     aligned, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
@@ -98,15 +93,7 @@ def _choose_digits(
     pose: Float[np.ndarray, "27"],
     markers: Float[np.ndarray, "M 3"],
 ) -> None:
-    """Take each digit from the shape whose markers are nearest, the wrist held.
-
-    Args:
-        shapes: The shapes.
-        digits: Digit of each marker, -1 for the palm.
-        target: Markers in the world [m]; NaN where missing.
-        pose: Its wrist is read, its hinge angles are overwritten.
-        markers: Markers of the result in the wrist's frame [m], filled.
-    """
+    """Take each digit from the shape whose markers are nearest, the wrist held."""
     rotation = np.empty((3, 3))
     write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     squares = np.zeros((5, len(shapes.angles)))

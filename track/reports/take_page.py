@@ -22,7 +22,7 @@ from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
 from track.user import MEASURED, are_calibrated
-from train.evaluation.metrics import percent
+from train.metrics import percent
 from train.reports.plot_style import picture
 
 _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by line
@@ -40,15 +40,7 @@ _CALIBRATE: Final = (
 
 
 def write_take_page(out: Path, take: Take, *, source: str) -> tuple[Path, ...]:
-    """Write the page on a take and its tables beside it, all or none.
-
-    Args:
-        out: The page, an .html file; `take_tables` says what its tables are.
-        take: What was tracked, or the truth of a simulation.
-        source: The take's file, for the command that shows it.
-
-    Returns:
-        The page and its tables.
+    """Write the page (.html) on a take of this file and its tables (`take_tables`) beside it, all or none.
 
     Raises:
         ArgumentError: The page's name does not end in .html.

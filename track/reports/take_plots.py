@@ -88,7 +88,6 @@ def decimated(
     """A curve of at most twice 750 values: the least and the largest of each bin of frames.
 
     Args:
-        times: Time of each frame [s].
         values: NaN where there is none; of a bin without any too.
     """
     starts, ends = _bins(len(times))

@@ -1,26 +1,104 @@
-"""Messages as UDP datagrams: each frame is one, and the header comes again every second."""
+"""Messages as UDP datagrams: each frame is one, and the header comes again every second.
+
+A datagram is a document, or a bundle of Open Sound Control 1.0 by python-osc (docs/live_output.md has the
+addresses).
+"""
 
 from __future__ import annotations
 
+import math
+import re
 import socket
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
 
+import numpy as np
+
+from handsim._extras import import_extra
 from handsim.errors import ArgumentError
 from track.sinks.documents import Encode, frame_document, header_document
-from track.sinks.message import LiveHeader, LiveMessage
-from track.sinks.osc_bundles import OscEncoder
+from track.sinks.message import SCHEMA, LiveHeader, LiveMessage
 
+_RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an address
+_MOST_NUMBER: Final = 0x7FFFFFFF
+
+_Content = tuple[str, str, Sequence[Any]]
+"""Address, types and values of an OSC message."""
 _HEADERS: Final = 1.0  # [s] between two headers: whoever listens later has not heard the first one
+
+
+class OscEncoder:
+    """Makes bundles of messages.
+
+    Raises:
+        ArgumentError: The package python-osc is missing.
+    """
+
+    def __init__(self) -> None:
+        self._messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
+        self._bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
+
+    def header(self, header: LiveHeader) -> bytes:
+        """The names in the order of the numbers."""
+        names = {
+            "sides": header.sides,
+            "angles": header.angles,
+            "positions": header.positions,
+            "bodies": [_part(name) for name in header.bodies],
+        }
+        contents = [_strings(f"/handsim/{name}", values) for name, values in names.items()]
+        return self._bundle([("/handsim/schema", "i", [SCHEMA]), *contents])
+
+    def frame(self, message: LiveMessage) -> bytes:
+        """A frame; of a hand or a body without a pose only the status."""
+        number = message.number & _MOST_NUMBER
+        contents: list[_Content] = [("/handsim/frame", "idi", [number, message.time, int(message.silent)])]
+        if not math.isnan(message.lag):
+            contents.append(("/handsim/lag", "f", [message.lag]))
+        for hand in message.hands:
+            address = f"/handsim/{hand.side}"
+            contents.append(_strings(f"{address}/status", [hand.status.value]))
+            if hand.has_pose:
+                contents.append(_floats(f"{address}/wrist", hand.position, hand.quaternion))
+                contents.append(_floats(f"{address}/angles", hand.angles))
+                contents.append(_floats(f"{address}/positions", hand.positions.ravel()))
+        for body in message.bodies:
+            address = f"/handsim/body/{_part(body.name)}"
+            contents.append(_strings(f"{address}/status", [body.status.value]))
+            if body.has_pose:
+                contents.append(_floats(f"{address}/pose", body.position, body.quaternion))
+        return self._bundle(contents)
+
+    def _bundle(self, contents: Iterable[_Content]) -> bytes:
+        bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
+        for address, types, values in contents:
+            message = self._messages.OscMessageBuilder(address)
+            for kind, value in zip(types, values, strict=True):
+                message.add_arg(value, kind)
+            bundle.add_content(message.build())
+        datagram: bytes = bundle.build().dgram
+        return datagram
+
+
+def _part(name: str) -> str:
+    """A name as a part of an address."""
+    return _RESERVED.sub("_", name)
+
+
+def _floats(address: str, *values: np.ndarray) -> _Content:
+    numbers = np.concatenate(values).tolist()
+    return address, "f" * len(numbers), numbers
+
+
+def _strings(address: str, values: Sequence[str]) -> _Content:
+    return address, "s" * len(values), values
 
 
 class DatagramSink:
     """Sends datagrams to one address and never waits: what the network does not take is dropped and counted.
 
     Args:
-        host: Name or address of the receiver.
-        port: Its UDP port.
         header: Makes the datagram of a header.
         frame: Makes the datagram of a frame.
 
@@ -79,9 +157,6 @@ def document_sink(host: str, port: int, encode: Encode, *, points: bool) -> Data
     """A sink of documents.
 
     Args:
-        host: Name or address of the receiver.
-        port: Its UDP port.
-        encode: Makes bytes of a document.
         points: Whether the points are sent too.
 
     Raises:

@@ -38,7 +38,6 @@ def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, A
     """A frame: what is NaN in the message is null here.
 
     Args:
-        message: The message.
         points: Whether all points and their labels are in it.
     """
     document = {

@@ -28,9 +28,6 @@ class Channel(NamedTuple):
 class LabStreamingSink:
     """Pushes a sample per frame; a number that is missing is NaN.
 
-    Args:
-        name: Name of the stream.
-
     Raises:
         ArgumentError: The package pylsl or its library is missing.
     """

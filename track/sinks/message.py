@@ -119,12 +119,7 @@ class LiveSink(Protocol):
 
 
 class MessageEncoder:
-    """Makes messages of the frames of one tracker.
-
-    Args:
-        hands: The tracker's hands.
-        bodies: Its rigid bodies.
-    """
+    """Makes messages of the frames of one tracker."""
 
     def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         self._models = [hand.model for hand in hands]

@@ -34,9 +34,7 @@ class WebSocketSink:
     served, and programs that are no browsers; on another address everybody is.
 
     Args:
-        host: Address to listen at.
         port: TCP port to listen at; 0 for a free one.
-        encode: Makes bytes of a document.
         text: Whether these are text.
         points: Whether the points are sent too.
 

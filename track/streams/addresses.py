@@ -19,6 +19,15 @@ GROUP: Final = "handsim.frame_sources"
 """Entry points of packages that bring frame sources."""
 
 
+def check_address(address: str) -> None:
+    """Refuse by an `ArgumentError` what is not an address of a stream; nothing is asked for it."""
+    check_type("address", address, str, f"one of {', '.join(VALID)}")
+    scheme, _, rest = address.rpartition("://")
+    name = rest.partition("?")[0]
+    if scheme not in ("natnet", "qtm") and (scheme or not (is_plugin(name) or name in list_plugins(GROUP))):
+        raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
+
+
 def open_source(
     address: str, *, silence: float = SILENCE, ended: Callable[[], bool] = lambda: False
 ) -> LiveStream:
@@ -36,16 +45,12 @@ def open_source(
         ArgumentError: The address is invalid, or there is no such source.
         CaptureError: No server answers.
     """
-    check_type("address", address, str, f"one of {', '.join(VALID)}")
-    scheme = address.partition("://")[0] if "://" in address else ""
-    if scheme == "natnet":
+    check_address(address)
+    if address.startswith("natnet://"):
         return LiveStream(open_stream(address), silence=silence, ended=ended)
-    if scheme == "qtm":
+    if address.startswith("qtm://"):
         parts = split_address(address, options={}, port=PORT)
         source = SourceStream(QualisysSource(parts.host, parts.port), address, waits=False)
         return LiveStream(source, silence=silence, ended=ended)
-    name = address.partition("?")[0]
-    if scheme or not (is_plugin(name) or name in list_plugins(GROUP)):
-        raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
-    source = SourceStream(make_plugin(address, group=GROUP, noun="frame source"), name)
+    source = SourceStream(make_plugin(address, group=GROUP, noun="frame source"), address.partition("?")[0])
     return LiveStream(source, silence=silence, ended=ended)

@@ -36,11 +36,9 @@ def open_stream(
     *,
     local: str | None = None,
 ) -> PointStream:
-    """Connect to a NatNet server.
+    """Connect to a NatNet server at `natnet://host` or `natnet://host:port`, with the port for commands.
 
-    Args:
-        url: `natnet://host` or `natnet://host:port`, with the port for commands.
-        local: Address of the network card to listen at; the one that leads to the host when not given.
+    It listens at the network card of this address, or at the one that leads to the host.
 
     Raises:
         CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.

@@ -34,7 +34,6 @@ class QualisysSource:
 
     Args:
         host: The machine that QTM runs on.
-        port: Its port.
 
     Raises:
         ArgumentError: The package qtm-rt is missing.

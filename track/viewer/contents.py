@@ -20,16 +20,12 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
 from handsim.space.cameras import CameraRig, list_rigs, load_rig
 from track.user import load_user
+from track.viewer.corrector import Corrector
+from track.viewer.frame_view import FrameView
 from track.viewer.label_editor import LabelEditor
 from track.viewer.layout_editor import LayoutEditor, edited_path
-from track.viewer.recordings.captures import CaptureRecording
-from track.viewer.recordings.corrector import Corrector
-from track.viewer.recordings.datasets import DatasetRecording
-from track.viewer.recordings.recording import Recording
-from track.viewer.recordings.takes import TakeRecording
-from track.viewer.scene.frame_view import FrameView
-from track.viewer.scene.rig_view import show_rig, show_volume
-from track.viewer.scene.stage import set_stage
+from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
+from track.viewer.stage import set_stage, show_rig, show_volume
 from track.viewer.status_panel import StatusPanel
 from track.viewer.timeline import Timeline
 from track.viewer.user_view import UserView
@@ -116,11 +112,7 @@ def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, t
 
 
 def _frame_at(recording: Recording, time: float, name: str) -> int:
-    """The frame that is nearest to a time [s].
-
-    Raises:
-        ArgumentError: The time lies outside.
-    """
+    """The frame that is nearest to a time [s]; an `ArgumentError` if it lies outside."""
     begin, end = float(recording.times[0]), float(recording.times[-1])
     nearest = int(np.argmin(np.abs(recording.times - time)))
     if not begin - _ROUNDED <= time <= end + _ROUNDED:
@@ -180,8 +172,6 @@ def show_recording(
     """Put a recording into a page, with its timeline.
 
     Args:
-        server: Where the page is.
-        recording: What is shown.
         corrector: Where its labels can be corrected: the tracked take that the recording shows.
         first: The frame that is shown first.
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from gloves.takes.corrections import NO_MARKER
 from handsim.errors import CaptureError
-from track.viewer.recordings.corrector import Corrector, label_of
-from track.viewer.recordings.takes import TakeRecording
+from track.viewer.corrector import Corrector, label_of
+from track.viewer.recordings import TakeRecording
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -26,9 +26,6 @@ class LabelEditor:
     """The folder of the panel in which labels are corrected, and a halo around the chosen point.
 
     Args:
-        server: Where the page is.
-        recording: What is shown.
-        corrector: The take that it shows.
         changed: Called when the take has changed.
     """
 

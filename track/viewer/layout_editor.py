@@ -18,9 +18,9 @@ from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.model import HandModel
 from handsim.hand.topology import NUM_QPOS
-from track.viewer.scene.hand_skin import HandSkin
-from track.viewer.scene.point_balls import PointBalls
-from track.viewer.scene.stage import set_stage
+from track.viewer.hand_skin import HandSkin
+from track.viewer.point_balls import PointBalls
+from track.viewer.stage import set_stage
 
 if TYPE_CHECKING:
     from viser import SceneNodePointerEvent, ViserServer
@@ -33,10 +33,7 @@ class LayoutEditor:
     """The markers of a layout on one hand.
 
     Args:
-        server: Where the page is.
-        path: The layout's file.
         layout: What it says.
-        model: The hand.
         out: Where the changed layout is saved.
     """
 

@@ -13,10 +13,9 @@ from handsim.hand.topology import NUM_QPOS
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
-from track.viewer.recordings.recording import Recording, ShownFrame
-from track.viewer.recordings.takes import shown_body
-from track.viewer.scene.frame_view import FrameView
-from track.viewer.scene.stage import set_stage
+from track.viewer.frame_view import FrameView
+from track.viewer.recordings import Recording, ShownFrame, shown_body
+from track.viewer.stage import set_stage
 from track.viewer.timeline import PICTURES
 
 if TYPE_CHECKING:
@@ -30,12 +29,7 @@ _TEXT_EVERY: Final = 0.2  # [s]
 
 
 class LiveRecording(Recording):
-    """The frames of a tracker that runs: there is only the newest one.
-
-    Args:
-        tracker: The tracker.
-        rig: The cameras, where they are known.
-    """
+    """The frames of a tracker that runs: there is only the newest one."""
 
     def __init__(self, tracker: Tracker, rig: CameraRig | None = None) -> None:
         self._hands = tracker.hands
@@ -78,13 +72,7 @@ class LiveRecording(Recording):
 
 
 class LiveView:
-    """Shows the newest frame of a tracker from a thread of its own; frames in between are left out.
-
-    Args:
-        server: Where the page is.
-        tracker: The tracker.
-        rig: The cameras, where they are known.
-    """
+    """Shows the newest frame of a tracker from a thread of its own; frames in between are left out."""
 
     def __init__(self, server: ViserServer, tracker: Tracker, rig: CameraRig | None = None) -> None:
         self._server, self._recording = server, LiveRecording(tracker, rig)

@@ -33,7 +33,6 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
     """A running web server; the end of the block closes it and its pages.
 
     Args:
-        host: Address to listen at.
         port: Port to listen at; the first free one from 8080 on when None, any free one when 0.
         title: Title of the page's panel.
 

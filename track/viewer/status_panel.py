@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from track.viewer.recordings.recording import Recording, ShownFrame
+from track.viewer.recordings import Recording, ShownFrame
 
 if TYPE_CHECKING:
     from viser import GuiButtonHandle, GuiFolderHandle, GuiUplotHandle, ViserServer, uplot
@@ -21,12 +21,7 @@ _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
 
 
 class StatusPanel:
-    """Text of the shown frame, plots, and rows that lead to doubtful frames.
-
-    Args:
-        server: Where the page is.
-        recording: What is shown.
-    """
+    """Text of the shown frame, plots, and rows that lead to doubtful frames."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording, self._due = server, recording, 0.0

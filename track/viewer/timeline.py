@@ -27,7 +27,6 @@ class Timeline:
     """Chooses frames; `run` shows them in the thread that calls it, everything else only asks for one.
 
     Args:
-        server: Where the page is.
         times: Time of each frame [s], increasing.
         show: Called with the index of each frame that is to be shown.
     """

@@ -11,9 +11,9 @@ import numpy as np
 from gloves.fit import GloveFit, nominal_fit
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
-from track.viewer.scene.hand_skin import HandSkin
-from track.viewer.scene.point_balls import PointBalls
-from track.viewer.scene.stage import set_stage
+from track.viewer.hand_skin import HandSkin
+from track.viewer.point_balls import PointBalls
+from track.viewer.stage import set_stage
 
 if TYPE_CHECKING:
     from viser import FrameHandle, GuiCheckboxHandle, GuiEvent, ViserServer
@@ -24,12 +24,7 @@ _BEFORE: Final = (150, 150, 150)
 
 
 class UserView:
-    """Hands of a user's file, flat and side by side; lines lead from the designed markers to the real ones.
-
-    Args:
-        server: Where the page is.
-        hands: The user's hands.
-    """
+    """Hands of a user's file, flat, side by side; lines lead from the designed markers to the real ones."""
 
     def __init__(self, server: ViserServer, hands: Sequence[GloveFit]) -> None:
         self.before = [nominal_hand(hand) for hand in hands]

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from track.viewer.recordings.recording import Recording
-from track.viewer.scene.point_balls import GHOST_COLOR, label_colors
+from track.viewer.point_balls import GHOST_COLOR, label_colors
+from track.viewer.recordings import Recording
 
 _RATE: Final = 30.0  # [Hz] at most
 
@@ -28,7 +28,6 @@ def write_video(
 
     Args:
         path: The file, .mp4.
-        recording: What is shown.
         shown: Points [m] that the view holds.
         write_clip: What draws and encodes the pictures, `render.illustrations.clip.write_clip`.
         progress: Called after each picture with the number of pictures and of all.

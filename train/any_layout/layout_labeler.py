@@ -23,11 +23,14 @@ from handsim._version import __version__
 from handsim.errors import WeightsError
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
+from handsim.hand.topology import SIDES
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
-from train.any_layout.worn_markers import sample_worn_markers
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.matching.pose_prior import PosePrior
 from train.matching.prior_learning import learn_pose_prior
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import sample_single_hand
+from train.simulation.people import sample_hands, wear_gloves
 from train.threads import labeling_threads
 
 NUM_POSES: Final = 40_000
@@ -36,14 +39,13 @@ WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
 _CHUNK: Final = 500  # poses
+_POSES_EACH: Final = 100  # of a person
 
 
 class LayoutLabeler:
     """Labels a glove that no network was trained on.
 
     Args:
-        layout: The glove.
-        network: The network.
         distances: What the network gets of the layout, see `mean_features`.
         prior: What it knows of hands as wholes.
     """
@@ -63,7 +65,6 @@ class LayoutLabeler:
         """The shipped network with what a few seconds of simulation tell of a layout.
 
         Args:
-            layout: The glove.
             num_poses: Poses from which the layout is known.
             seed: Of those poses.
 
@@ -161,3 +162,23 @@ def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -
     with atomic_write(folder / WEIGHTS) as temporary:
         temporary.write_bytes(save(tensors))
     save_json(folder / CARD, card)
+
+
+def sample_worn_markers(
+    layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T M 3"]:
+    """Markers [m] of right hands in valid poses; every hundred are another person, whose glove has slipped.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    config = DatasetConfig()
+    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
+    parts = []
+    for first in range(0, num_frames, _POSES_EACH):
+        count = min(_POSES_EACH, num_frames - first)
+        right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
+        scene = sample_single_hand(right, count, config.poses, config.volume, rng=rng)
+        (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
+        parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
+    return np.concatenate(parts)

@@ -79,7 +79,6 @@ class LayoutNetwork(nn.Module):
 
         Args:
             points: Clouds [m], padded where not `present`; those of one layout follow each other.
-            present: Which points are there.
             layouts: Mean of `distance_features` over the poses of each layout; G divides B.
         """
         graphs = _Graphs.of(points, present, layouts, self.config)

@@ -43,12 +43,7 @@ _SAVED_EVERY, _TOLD_EVERY = 500, 100  # steps
 
 
 class LayoutBatches:
-    """Draws random layouts on a bank of places, and corrupted clouds of them.
-
-    Args:
-        bank: Places on the skin in many poses.
-        rng: Source of all randomness.
-    """
+    """Draws random layouts on a bank of places, and corrupted clouds of them."""
 
     def __init__(self, bank: SkinBank, rng: np.random.Generator) -> None:
         self._bank, self._rng = bank, rng
@@ -115,7 +110,6 @@ class LayoutTraining:
 
     Args:
         steps: Steps of the run.
-        config: Size of the network.
     """
 
     def __init__(self, steps: int, config: LayoutNetworkConfig = _CONFIG) -> None:

@@ -58,7 +58,6 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
     Args:
         num_places: Places on the skin.
         num_people: People, of whom each strikes up to 64 poses with one slip of every marker.
-        rng: Source of all randomness.
     """
     places = sample_places(num_places, rng=rng)
     gloves = [
@@ -80,7 +79,6 @@ def sample_places(
 
     Args:
         num_places: Number of places; there are fewer where no more fit.
-        rng: Source of all randomness.
         apart: Least distance between two of them on the flat hand [m].
     """
     model = HandModel.named("M")

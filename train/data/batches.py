@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from handsim.hand.topology import SIDES
 from train.data.augmentation import Cloud, Corruption, corrupt
-from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import OwnCorruption, draw_cloud
+from train.data.shards import MappedRows
 
 
 class Weights(NamedTuple):
@@ -87,7 +87,6 @@ def draw_batch(
     Args:
         rows: Rows of a training set, see `train.data.shards.row_dtype`.
         recipe: Size of the batch, and how to corrupt it.
-        rng: Source of all randomness.
     """
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)

@@ -58,7 +58,6 @@ def own_cloud(
         corruption: A function like `OwnCorruption`; `module:name` of one or of a class whose instances are;
             or an entry point of the group `handsim.corruptions`.
         markers: Clean markers.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There is none of that name, it does not take these arguments, or what it returns has

@@ -1,7 +1,8 @@
 """Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
 
 A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are drawn
-when training (`train.data.augmentation`).
+when training (`train.data.augmentation`). Rows stay in their files (`MappedRows`): the operating
+system keeps one copy for all processes.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ import dataclasses
 import io
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Int, Shaped
 from numpy.typing import NDArray
 from upath import UPath
 
@@ -29,10 +30,8 @@ from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
-from handsim.hand.records import HAND_DTYPE, unpack_hand
-from handsim.hand.shape import HandShape
+from handsim.hand.shape import HAND_DTYPE, HandShape, unpack_hand
 from handsim.hand.topology import NUM_QPOS
-from train.data.mapped_rows import MappedRows
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
@@ -306,11 +305,7 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
 
 
 def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """A memory-mapped list of records of this type.
-
-    Raises:
-        DatasetError: The file holds something else.
-    """
+    """A memory-mapped list of records of this type; a `DatasetError` if the file holds something else."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)
@@ -320,3 +315,50 @@ def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
     if records.dtype != dtype or records.ndim != 1:
         raise DatasetError(f"{file} holds other records than those of this set; expected {dtype.names}")
     return records
+
+
+class MappedRows:
+    """Rows of several arrays one after the other, none of which is copied before it is asked for.
+
+    Args:
+        shards: The arrays, memory-mapped or not, of one type of records (`train.data.shards.row_dtype`).
+        start: First row of the span that this is.
+        stop: The row after its last one; all rows when not given.
+    """
+
+    def __init__(
+        self, shards: Sequence[NDArray[np.void]], *, start: int = 0, stop: int | None = None
+    ) -> None:
+        self._shards = shards
+        self._ends = np.cumsum([len(shard) for shard in shards])
+        self._start, self._stop = start, int(self._ends[-1]) if stop is None else stop
+
+    def __len__(self) -> int:
+        return self._stop - self._start
+
+    def span(self, start: int, stop: int) -> MappedRows:
+        """The rows from `start` to before `stop`, left where they are."""
+        return MappedRows(self._shards, start=self._start + start, stop=self._start + stop)
+
+    def __getitem__(self, wanted: str | Int[np.ndarray, "B"]) -> Shaped[np.ndarray, "B *rest"]:
+        """A copy of the rows of these numbers (0 or more), or of a field of all rows."""
+        if isinstance(wanted, str):
+            return np.concatenate([part[wanted] for part in self._parts()])
+        numbers = np.asarray(wanted) + self._start
+        if len(numbers) and not self._start <= numbers.min() <= numbers.max() < self._stop:
+            raise IndexError(f"rows {wanted.min()} to {wanted.max()} of {len(self)}")
+        rows: NDArray[Any] = np.empty(len(numbers), dtype=self._shards[0].dtype)
+        holders = np.searchsorted(self._ends, numbers, side="right")
+        for holder in np.unique(holders):
+            here = holders == holder
+            shard = self._shards[holder]
+            rows[here] = shard[numbers[here] - (self._ends[holder] - len(shard))]
+        return rows
+
+    def _parts(self) -> list[NDArray[np.void]]:
+        """What each array has of the rows."""
+        firsts = [int(end) - len(shard) for end, shard in zip(self._ends, self._shards, strict=True)]
+        return [
+            shard[max(self._start - first, 0) : max(self._stop - first, 0)]
+            for first, shard in zip(firsts, self._shards, strict=True)
+        ]

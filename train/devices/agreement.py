@@ -24,11 +24,7 @@ class PeerError(HandSimError):
 
 
 class Agreement:
-    """The agreement of this process with the others; with none but itself it does nothing.
-
-    Args:
-        fabric: The launched devices.
-    """
+    """The agreement of this process with the others; with none but itself it does nothing."""
 
     def __init__(self, fabric: Fabric) -> None:
         self._fabric = fabric

@@ -71,8 +71,6 @@ def check_devices(config: TrainConfig, size: int, local_size: int) -> None:
     """Refuse more processes than there are clouds in a batch, or than there are GPUs.
 
     Args:
-        config: Settings of the run.
-        size: Number of processes.
         local_size: Of these on this machine.
 
     Raises:

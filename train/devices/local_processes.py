@@ -47,9 +47,6 @@ def in_local_processes(job: Job, count: int, *, progress: Progress | None, told:
 
     Args:
         job: What to do; the processes are spawned and unpickle it.
-        count: Number of processes.
-        progress: Called in this process.
-        told: Called in this process.
 
     Raises:
         Exception: What ended the first process that failed on its own.

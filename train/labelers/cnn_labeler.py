@@ -47,8 +47,6 @@ class CNNLabeler:
     Args:
         positions: The trained network: from images (B, 1, 52, 52) to positions (B, M, 3) in view units.
         hand: The mean hand of its training set.
-        config: How the network is used.
-        marker_names: Markers in label order.
     """
 
     def __init__(

@@ -67,7 +67,6 @@ def depth_images(
 
     Args:
         points: Clouds [m]; padding is ignored.
-        present: Which points are there.
         rotations: From the clouds' frame into the camera's; with determinant -1 the image is mirrored.
 
     Returns:

@@ -1,8 +1,12 @@
-"""The kinds of network: how each is built, its loss, and how it becomes a labeler."""
+"""The kinds of network: how each is built, its loss, and how it becomes a labeler.
+
+Batches go through a copy on a GPU where there is one, else through the network itself.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+import copy
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -11,14 +15,14 @@ from torch import nn
 
 from train.config import CNNConfig, NetworkConfig, TrainConfig, batch_recipe
 from train.data.batches import Batch, Part, draw_batch
-from train.data.mapped_rows import MappedRows
-from train.labelers.batch_network import BatchNetwork
+from train.data.shards import MappedRows
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
 from train.labelers.protocol import Labeler
-from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_inference import TrainedSetLabeler
 from train.labelers.set_network import SetLabeler, set_loss
 from train.labelers.views import MeanHand
+from train.threads import labeling_threads
 
 _PREPARED: Final = 20_000  # frames
 
@@ -77,3 +81,33 @@ def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
         return cnn_labeler(network, marker_names)
     assert isinstance(network, SetLabeler)
     return TrainedSetLabeler(network.config, network.numpy_weights(), network.prior, marker_names)
+
+
+def batch_device() -> torch.device:
+    """Where batches are labeled."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+class BatchNetwork:
+    """A trained network for batches; a copy on a GPU is made for the first of them.
+
+    Args:
+        network: The network, on the CPU.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        self._network = network
+        self._placed: tuple[nn.Module, torch.device] | None = None
+
+    def __call__(self, *inputs: torch.Tensor) -> Any:
+        """What the network makes of inputs on the CPU; its tensors stay on the network's device.
+
+        A GPU computes in 32 bits too, so that labels are the CPU's but for ties in the last bits.
+        """
+        if self._placed is None:
+            device, here = batch_device(), next(self._network.parameters()).device
+            network = self._network if device == here else copy.deepcopy(self._network).to(device)
+            self._placed = network, device
+        network, device = self._placed
+        with labeling_threads(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            return network(*(tensor.to(device) for tensor in inputs))

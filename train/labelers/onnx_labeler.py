@@ -68,9 +68,6 @@ _HINT: Final = "install it with: pip install 'handsim[onnx]'"
 class OnnxLabeler:
     """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it.
 
-    Args:
-        path: The .onnx file.
-
     Raises:
         HandSimError: onnxruntime is not installed.
         WeightsError: The file is missing, damaged, or not a labeler.
@@ -159,11 +156,7 @@ def _packed(prior: PosePrior) -> str:
 
 
 def _place_of_digest(content: bytes) -> slice:
-    """Where the digest stands in a file: a text of 64 bytes after its key.
-
-    Raises:
-        ValueError: It is not there once.
-    """
+    """Where the digest stands: a text of 64 bytes after its key; a `ValueError` unless it is there once."""
     key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
     if content.count(key) != 1:
         raise ValueError("the file has no SHA-256")

@@ -73,7 +73,6 @@ def label_in_batches(
     """Check frames and label them in batches of similar size, so that padding stays small.
 
     Args:
-        frames: Points of each frame [m].
         label: Labels a batch of frames; the last one holds the most points, and at least one.
 
     Returns:

@@ -1,11 +1,12 @@
-"""The set labeler on one cloud, compiled and without torch, whose time for so few points goes to its calls.
+"""The set labeler with weights, one cloud at a time: compiled, and without torch.
 
-Operations in their order are those of `train.labelers.set_network`.
+For so few points torch's time goes to its calls. Operations in their order are those of
+`train.labelers.set_network`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
 from train.config import SetLabelerConfig
+from train.labelers.protocol import Labeling, check_clouds, check_output
+from train.matching.pose_prior import PosePrior
+from train.matching.verification import match_scores
 
 Floats = NDArray[np.float32]
 Weights = Mapping[str, Floats]
@@ -31,6 +35,37 @@ _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 # Minimax coefficients of Cephes' expf (Moshier).
 _P5, _P4, _P3 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
 _P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
+
+
+class TrainedSetLabeler:
+    """The set labeler with weights, ready to use.
+
+    Args:
+        weights: Its weights; later changes of them have no effect.
+        prior: What it knows of hands as wholes.
+    """
+
+    def __init__(
+        self,
+        config: SetLabelerConfig,
+        weights: Weights,
+        prior: PosePrior | None,
+        marker_names: tuple[str, ...],
+    ) -> None:
+        self.prior = prior
+        self.marker_names = marker_names
+        self._scorer = CloudScorer(config, weights)
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return [self._label(cloud) for cloud in check_clouds(frames)]
+
+    def _label(self, cloud: NDArray[np.float64]) -> Labeling:
+        if not len(cloud):
+            return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
+        by_point, by_label = self._scorer.score(cloud)
+        check_output(by_label)
+        return Labeling(*match_scores(cloud, by_point, by_label, self.prior))
 
 
 class _Norm(NamedTuple):
@@ -75,7 +110,6 @@ class CloudScorer:
     """Scores of one cloud without padding.
 
     Args:
-        config: Size of the network.
         weights: Its weights, of the names and shapes of `weight_shapes`.
     """
 
@@ -182,15 +216,7 @@ def _score(
     rounds: _Rounds,
     ends: _Ends,
 ) -> tuple[Floats, Floats]:
-    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels.
-
-    Args:
-        points: Points [m].
-        centers: Distances around which the bumps stand [m].
-        sharpness: Of the bumps, -0.5 over their squared width [1/m^2].
-        rounds: Weights of the rounds.
-        ends: Weights of the other layers.
-    """
+    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels; bumps stand around `centers` [m]."""
     count, width = len(points), ends.embed.weight.shape[2]
     bits = np.empty(max(len(centers) * count * count, 2 * width * count), dtype=np.int32)
     scale = bits.view(np.float32)

@@ -85,9 +85,6 @@ class PairedScores(nn.Module):
     They are as `train.matching.assignment` makes them of the scores: the probabilities of pairs of a point
     and a label, ghosts last (B, N, M+1); and what each label costs each point, and each point as a ghost
     (B, N, M+N).
-
-    Args:
-        network: The network.
     """
 
     def __init__(self, network: nn.Module) -> None:

@@ -48,7 +48,6 @@ class SideClassifier:
         """The side of one hand, and the clearness of the vote [0, 1].
 
         Args:
-            points: A frame's points [m].
             labels: Marker of each point, -1 for a ghost.
 
         Returns:
@@ -84,13 +83,7 @@ def _mean_orientation(
 def _vote(
     markers: Float[np.ndarray, "M 3"], fours: Int[np.ndarray, "F 4"], votes: Float[np.ndarray, "F"]
 ) -> tuple[float, float]:
-    """The sum of the votes of all groups of four, and the greatest sum that they could have.
-
-    Args:
-        markers: Markers [m], NaN where missing.
-        fours: Groups of markers.
-        votes: Vote of each group, if its orientation is that of most right hands.
-    """
+    """The sum of the votes of all groups of four, and the greatest sum that they could have."""
     vote, most = 0.0, 0.0
     for number in range(len(fours)):
         volume = _volume(markers, fours[number])

@@ -142,11 +142,7 @@ def _pool(features: SparseFeatures) -> SparseFeatures:
 def _connect(
     pixels: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Which inputs of a 3x3 convolution without padding reach which outputs.
-
-    Args:
-        pixels: Rows of the inputs (B, S, S), -1 for background.
-        count: Their number P.
+    """Which of P inputs (B, S, S), -1 for background, of a 3x3 convolution reach which outputs.
 
     Returns:
         Rows of the outputs (B, S - 2, S - 2), -1 for background; the products (row x 9 + tap) that each of
@@ -178,11 +174,7 @@ def _connect(
 
 @kernel
 def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Which inputs a 2x2 pooling joins.
-
-    Args:
-        pixels: Rows of the inputs (B, S, S), -1 for background.
-        count: Their number P.
+    """Which of P inputs (B, S, S), -1 for background, a 2x2 pooling joins.
 
     Returns:
         Rows of the outputs (B, S / 2, S / 2), -1 for background, and the inputs (Q, 4) of each of the Q

@@ -26,8 +26,7 @@ from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
-from train.labelers.set_inference import weight_shapes
-from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_inference import TrainedSetLabeler, weight_shapes
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
@@ -187,11 +186,7 @@ def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _check_shapes(tensors: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse tensors that are not those of a network.
-
-    Raises:
-        ValueError: One lacks, is too many, or has another shape.
-    """
+    """Refuse tensors that are not those of a network, by a `ValueError`."""
     for name, shape in expected.items():
         if name not in tensors:
             raise ValueError(f"it lacks {name}")

@@ -57,7 +57,6 @@ class MeanHand:
         Args:
             markers: Markers of right hands [m].
             points: What a camera system made of them [m].
-            present: Which points are there.
         """
         mean = markers[0]
         for _ in range(_ROUNDS):
@@ -105,10 +104,7 @@ class MeanHand:
         """Views (B, 3, 3) of clouds of right hands: what labeling begins with, and what it is turned to.
 
         Args:
-            points: Clouds [m].
-            present: Which points are there.
             markers: The markers behind them [m].
-            rng: Source of all randomness.
         """
         aligned = self.align(markers, np.ones(len(markers)))
         axes = _nearest_axes(points, present, aligned)

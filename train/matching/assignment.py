@@ -133,11 +133,9 @@ def _shortest_path(
 ) -> tuple[float, int, int, int]:
     """The shortest path by reduced costs from a point to a free label, or to a point that may be a ghost.
 
-    The last four arrays are overwritten: length to each label, the point before it, whether it was reached,
-    and the reached labels in their order.
-
-    Returns:
-        Its length, the number of reached labels, the free label or -1, and the point that is a ghost then.
+    Returns its length, the number of reached labels, the free label or -1, and the point that is a ghost
+    then. The last four arrays are overwritten: length to each label, the point before it, whether it was
+    reached, and the reached labels in their order.
     """
     shortest[:] = np.inf
     reached[:] = False
@@ -171,16 +169,9 @@ def _shortest_path(
 def balance(
     point_scores: NDArray[np.float64], label_scores: NDArray[np.float64], weight: float, rounds: int
 ) -> NDArray[np.float64]:
-    """Sinkhorn's iteration on the weighted sum of two log-probabilities.
+    """Sinkhorn's iteration on the weighted sum of log-probabilities by point (N, M + 1) and label (M, N + 1).
 
-    Args:
-        point_scores: Log-probabilities (N, M + 1) by point, the last column "a ghost".
-        label_scores: Log-probabilities (M, N + 1) by label, the last column "occluded".
-        weight: Weight of each.
-        rounds: Number of iterations.
-
-    Returns:
-        Probabilities (N + 1, M + 1), the last column "a ghost", the last row "occluded".
+    Returns probabilities (N + 1, M + 1), the last column "a ghost", the last row "occluded".
     """
     count, num_labels = len(point_scores), len(label_scores)
     plan = np.zeros((count + 1, num_labels + 1))

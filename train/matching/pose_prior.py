@@ -74,7 +74,6 @@ class PosePrior:
         """Logarithm of the density of labeled points; -inf for fewer than four.
 
         Args:
-            points: Points [m].
             labels: Marker of each point, no marker twice.
             mirrored: Whether the hand is a left one.
             among: The components that count, see `nearest`; all when not given.
@@ -97,7 +96,6 @@ class PosePrior:
         """The components whose mean hands are nearest to labeled points, the nearest first.
 
         Args:
-            points: Points [m].
             labels: Marker of each point, no marker twice.
             mirrored: Whether the hand is a left one.
             count: How many, at most.

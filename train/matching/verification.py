@@ -80,7 +80,6 @@ def match_scores(
     equation 1 with a reject option).
 
     Args:
-        points: Points [m].
         point_scores: Log-probability of each label, and last of ghost, for each point.
         label_scores: Log-probability of each point, and last of occluded, for each label.
         prior: What hands look like; None to believe the scores alone.
@@ -112,16 +111,7 @@ def _verify(
     spreads: Float32[np.ndarray, "K"],
     log_weights: Float32[np.ndarray, "K"],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label.
-
-    Args:
-        points: Points [m].
-        probabilities: Of pairs, see `pair_probabilities`.
-        means: This and the following tables are those of `PosePrior`.
-        directions: See `PosePrior`.
-        spreads: See `PosePrior`.
-        log_weights: See `PosePrior`.
-    """
+    """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label."""
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
     near, mirrored = _near_components(points, labels, means, directions, spreads, log_weights)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from handsim.app.page import Section, write_page
 from handsim.errors import DatasetError
 from handsim.hand.topology import JOINTS, SIDES
@@ -35,7 +35,6 @@ def write_report(
     """Write the report of a training set: one HTML file with its pictures inside, complete or not at all.
 
     Args:
-        dataset: A finished training set.
         path: The page; `report.html` in the set's folder when not given. An older one is replaced.
         present: Which markers a continuous take of this glove and rig holds, for the lengths of gaps; a
             training set's frames are independent and have none.
@@ -70,10 +69,6 @@ def write_report(
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
     """Lengths of the gaps in a continuous take, beside published figures of real finger markers.
-
-    Args:
-        present: Which markers are there in each frame.
-        rate: Frames per second [Hz].
 
     Raises:
         DatasetError: `present` is not a table of frames and markers, or the rate is not positive.

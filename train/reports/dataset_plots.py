@@ -30,7 +30,6 @@ def draw_angles(
     """Small multiples: one column per digit, one row per joint angle from the knuckle outwards.
 
     Args:
-        figure: Where to draw.
         shares: Share of frames in each bin of a joint angle's range.
         edges: The bins' edges [deg].
         middle: Angles between which 98 % of the frames lie [deg].

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from train.evaluation.metrics import percent
+from train.metrics import percent
 
 
 def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:

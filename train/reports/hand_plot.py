@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -9,7 +10,6 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from train.reports.flat_hand import FlatHand
-from train.reports.name_placement import DISTANCES, DOT_RADIUS, FONT_SIZE, name_extent, place_names
 from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
 from train.reports.run_plots import short
 
@@ -17,12 +17,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
 HAND_SIZE: Final = (10.8, 9.6)
 """Of the picture [inch]."""
 MOST_ARROWS: Final = 12
 _MARGIN: Final = 34.0  # around the hand [points]
 _BEND: Final = 0.22  # of the arrows, so that two that lead to and fro lie side by side
 _BAR: Final = (0.90, 0.2, 0.016, 0.6)  # the colors' scale, in shares of the picture
+FONT_SIZE: Final = 7.5
+"""Of names [points]."""
+DOT_RADIUS: Final = 4.2
+"""Of a marker's dot [points]."""
+DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)
+"""Tried from a dot to its name [points]."""
 
 
 class Mistake(NamedTuple):
@@ -60,7 +67,6 @@ def draw_hand(
 
     Args:
         figure: Where to draw, of `HAND_SIZE`.
-        hand: Hand and markers.
         names: Markers in label order.
         accuracy: Slot accuracy of each, 0 to 1.
         arrows: From what points are to what they were called, the most frequent first.
@@ -146,3 +152,52 @@ def arrow_curve(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDAr
         (1 - along) ** 2 * first + 2 * along * (1 - along) * middle + along**2 * second
     )
     return curve
+
+
+def place_names(
+    names: list[str],
+    dots: Float[np.ndarray, "M 2"],
+    curves: Sequence[Float[np.ndarray, "K 2"]],
+    size: tuple[float, float],
+) -> Float[np.ndarray, "M 2"]:
+    """Centers of the names [points], each placed in turn where it overlaps least with what is there.
+
+    Args:
+        dots: Markers [points].
+        curves: Points along the arrows [points].
+        size: Width and height of the picture [points].
+    """
+    extents = np.array([name_extent(name) for name in names])
+    taken = np.concatenate([dots, *curves])
+    half_sizes = np.concatenate(
+        [np.full((len(dots), 2), DOT_RADIUS + 1.0), np.full((len(taken) - len(dots), 2), 1.5)]
+    )
+    angles = np.deg2rad(np.arange(0.0, 360.0, 22.5))
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    centers = np.zeros_like(dots)
+    crowd = np.linalg.norm(dots[:, None] - dots, axis=-1)
+    # The most crowded dots come first.
+    for number in np.argsort(np.sort(crowd, axis=1)[:, : min(4, len(dots))].sum(axis=1), kind="stable"):
+        half = extents[number] / 2.0
+        offsets = np.concatenate([around * (distance + half) for distance in DISTANCES])
+        cost = np.repeat(np.array(DISTANCES), len(around)) - 2.0 * np.tile(around[:, 0], len(DISTANCES))
+        candidates = dots[number] + offsets
+        overlap = (half + half_sizes - np.abs(candidates[:, None] - taken)).clip(0.0, None).prod(axis=-1)
+        others = np.arange(len(taken)) != number
+        cost = cost + 4.0 * overlap[:, others].sum(axis=1) + 60.0 * (overlap[:, others] > 0.0).sum(axis=1)
+        cost += 1e4 * ((candidates - half < 2.0) | (candidates + half > size)).any(axis=1)
+        centers[number] = candidates[cost.argmin()]
+        taken = np.concatenate([taken, centers[number, None]])
+        half_sizes = np.concatenate([half_sizes, half[None] + 1.0])
+    return centers
+
+
+def name_extent(name: str) -> tuple[float, float]:
+    """Width and height of a name as it is drawn [points]."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextToPath
+
+    width, _, _ = TextToPath().get_text_width_height_descent(
+        name, FontProperties(size=FONT_SIZE), ismath=False
+    )
+    return float(width), 1.15 * FONT_SIZE

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.files.atomic import atomic_write
-from train.evaluation.metrics import percent
+from train.metrics import percent
 
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
@@ -21,15 +21,9 @@ _NAMES: Final = {
 
 
 def write_model_card(out: Path, card: dict[str, Any]) -> Path:
-    """Write the README of a run's folder, complete or not at all.
+    """Write the README of a run's folder, complete or not at all, from its card; the page's path.
 
-    Args:
-        out: The run's folder. A README there is replaced, unless somebody has named a license in it: then it
-            is theirs.
-        card: The run's card, see `train.loop.train_labeler`.
-
-    Returns:
-        The page's path.
+    A README there is replaced, unless somebody has named a license in it: then it is theirs.
     """
     path = out / MODEL_CARD
     if path.is_file() and _license_line(UNKNOWN_LICENSE) not in path.read_text("utf-8", "replace"):

@@ -11,9 +11,9 @@ import numpy as np
 
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.app.page import Section, write_page
-from train.evaluation.labeler_evaluation import Report
-from train.evaluation.metrics import LEAST_SURE, percent, reliability
 from train.history import History
+from train.labeler_evaluation import Report
+from train.metrics import LEAST_SURE, percent, reliability
 from train.reports import hand_plot as _hand_plot
 from train.reports import run_plots as _run_plots
 from train.reports.flat_hand import flat_hand
@@ -24,16 +24,9 @@ _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: Report) -> Path:
-    """Write the page of a run: one HTML file with its pictures inside, complete or not at all.
+    """Write the page of a run: one HTML file with its pictures inside, complete or not at all; its path.
 
-    Args:
-        out: The run's folder; an older page there is replaced.
-        card: The run's model card, see `train.loop.train_labeler`.
-        history: Loss and accuracy over the run.
-        report: Evaluation on held-out frames with the paper's corruption.
-
-    Returns:
-        The page's path.
+    The report is of held-out frames with the paper's corruption.
     """
     layout = stored_layout(card["dataset"]["layout"])
     sections = [

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Int
 
-from train.evaluation.metrics import BINS, Reliability
 from train.history import History
+from train.metrics import BINS, Reliability
 from train.reports.plot_style import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
@@ -101,8 +101,6 @@ def light(
     """Cast all lines of sight.
 
     Args:
-        scenes: Hands at work.
-        rig: The cameras.
         room: Losses and stray reflections of this work, see `train.simulation.room_settings.usual_room`.
         rng: Source of the strays, and of the spots of markers that are seen past an edge.
 
@@ -130,7 +128,6 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
 
     Args:
         lit: Scenes as this rig sees them.
-        rig: The cameras.
         seed: Of noise and losses.
     """
     rng = np.random.default_rng(seed)
@@ -222,7 +219,6 @@ def covariances(
     Args:
         points: In the world [m].
         seen: Which cameras see each: two or more, from different directions.
-        rig: The cameras.
         noise: Standard deviation of each point's blob per axis [px].
     """
     total, shifts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))

@@ -45,7 +45,6 @@ def places(
             its middle below that of the volume [m].
         mounts: Which mounts there are.
         center: Middle of the volume that hands work in [m].
-        sides: Its sides [m].
 
     Raises:
         ArgumentError: There is no place outside the reach of the hands.

@@ -1,4 +1,4 @@
-"""The search for a rig: what candidate cameras see of hands at work, and which of them are chosen.
+"""The search for a rig: what candidate cameras see of hands at work, which are chosen, and their forecast.
 
 Cameras are chosen one after the other, then exchanged while that helps. What a candidate sees are bits of
 marker-frames, and what it tells of points.
@@ -6,7 +6,8 @@ marker-frames, and what it tells of points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -14,11 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt64
 from numpy.typing import NDArray
 
+from gloves.layout import MarkerLayout
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, CameraRig
-from train.rig_advice.forecast import OPTICS
+from train.rig_advice.forecast import OPTICS, Forecast, forecast, light_work
+from train.rig_advice.mounts import Mount, places
+from train.rig_advice.work import sample_work
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
@@ -35,6 +39,10 @@ _EXCHANGES: Final = 200
 _WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170.0)))
 """A camera in whose view hands are wherever it is aimed."""
 _SAMPLED: Final = 1200  # marker-frames whose error is looked at
+_PEOPLE: Final = 3  # of each kind of work
+_FRAMES: Final = 900  # of each
+_SKIPPED: Final = 12  # every so many frames count
+_JUDGED: Final = 600  # frames of a person that the plan did not see
 
 
 class CandidateViews(NamedTuple):
@@ -57,8 +65,6 @@ def view_candidates(
     """Cast the lines of sight from every marker to every candidate, once for candidates at one position.
 
     Args:
-        scenes: Hands at work.
-        candidates: The cameras.
         rng: Source of visible spots, and of the marker-frames whose error is looked at.
     """
     centers_of = np.stack([one.T_world_camera[:3, 3] for one in candidates])
@@ -82,7 +88,6 @@ class Planning:
     """Cameras chosen among candidates.
 
     Args:
-        views: What each candidate sees.
         positions: Where each is [m].
         kept: Candidates that are chosen before and stay.
     """
@@ -221,3 +226,72 @@ def _packed(views: NDArray[np.bool_]) -> NDArray[np.uint64]:
     padded = np.zeros((len(views), -(-views.shape[1] // 64) * 64), dtype=bool)
     padded[:, : views.shape[1]] = views
     return np.packbits(padded, axis=1).view(np.uint64)
+
+
+class Plan(NamedTuple):
+    """A rig, and the forecast of it."""
+
+    rig: CameraRig
+    targets: Float[np.ndarray, "C 3"]
+    """What each camera looks at [m]; of cameras that were kept a point one meter ahead."""
+    before: Forecast | None
+    """Of the cameras that were kept alone."""
+    after: Forecast
+
+
+def plan(
+    num_cameras: int,
+    room: Float[np.ndarray, "3"],
+    mounts: Sequence[Mount],
+    layout: MarkerLayout,
+    center: Float[np.ndarray, "3"],
+    sides: Float[np.ndarray, "3"],
+    camera: Camera,
+    kept: CameraRig | None = None,
+    *,
+    name: str,
+    told: Callable[[str], None] = lambda line: None,
+    seed: int = 0,
+) -> Plan:
+    """Look for the best places of cameras.
+
+    Args:
+        num_cameras: Cameras of the rig, with those that are kept.
+        room: Width, depth and height of the room or truss [m].
+        center: Middle of the volume that hands work in [m].
+        camera: What every new camera is, but for its pose.
+        kept: Cameras that stay.
+        seed: Of people and motion.
+
+    Raises:
+        ArgumentError: There is no room for so many cameras.
+    """
+    free = places(room, mounts, center, sides)
+    old = () if kept is None else tuple(kept.cameras)
+    candidates = [*old, *(camera.at(pose) for pose in free.T_world_camera)]
+    ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
+    targets = np.array([*ahead, *free.targets])
+    rng = np.random.default_rng(seed)
+    work = sample_work(layout, center, sides, _FRAMES, _PEOPLE, rng=rng)
+    scenes = [one.faster(_SKIPPED) for part in work.values() for one in part]
+    told(f"what cameras at {len(free.targets)} places would see")
+    views = view_candidates(scenes, candidates, rng=rng)
+    positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
+    search = Planning(views, positions, range(len(old)))
+    search.grow(num_cameras)
+    search.exchange(lambda value: told(f"moving cameras: {value:.4f}"))
+    chosen = [candidates[number] for number in search.chosen]
+    new = [
+        dataclasses.replace(one, name=f"camera{number}")
+        for number, one in enumerate(chosen[len(old) :], len(old) + 1)
+    ]
+    rig = CameraRig(name, [*old, *new])
+    told("forecasting")
+    fresh = sample_work(layout, center, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
+    before = None if kept is None else _forecast(fresh, kept, seed)
+    return Plan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
+
+
+def _forecast(work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, seed: int) -> Forecast:
+    lit = light_work(work, rig, rng=np.random.default_rng(seed))
+    return forecast([one for scenes in lit.values() for one in scenes], rig, seed=seed)

@@ -13,8 +13,7 @@ from handsim.app.page import Section, write_page
 from handsim.space.cameras import CameraRig
 from train.reports.plot_style import BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
 from train.rig_advice.forecast import CameraLoss, Forecast
-from train.rig_advice.rig_score import RigScore, sentences
-from train.rig_advice.volume_map import GRID, VolumeMap
+from train.rig_advice.rig_score import GRID, RigScore, VolumeMap, sentences
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,8 +48,6 @@ def write_rig_page(path: Path, score: RigScore, *, work: str) -> None:
     """Write the page: one HTML file with its pictures inside.
 
     Args:
-        path: The file.
-        score: What is known of the rig.
         work: Whose hands did what, in words.
     """
     rig = score.rig
@@ -123,13 +120,7 @@ def _volume_section(score: RigScore) -> Section:
 
 
 def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
-    """Draw the volume colored by the share of markers that two cameras see, averaged along the view.
-
-    Args:
-        figure: Where to draw, of `_MAP_SIZE`.
-        volume: The map.
-        rig: Its cameras.
-    """
+    """Draw the volume colored by the share of markers that two cameras see, averaged along the view."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -155,13 +146,7 @@ def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
 
 
 def _draw_worth(figure: Figure, losses: list[CameraLoss], missing: float) -> None:
-    """Draw what is missing without each camera, beside what is missing with all.
-
-    Args:
-        figure: Where to draw, of `_WORTH_SIZE`.
-        losses: Of each camera.
-        missing: Share of marker-frames that is missing with all cameras.
-    """
+    """Draw what share of marker-frames is missing without each camera, beside what is missing with all."""
     panel = figure.subplots()
     numbers = np.arange(1, len(losses) + 1)
     without = [100.0 if one.without is None else 100 * one.without.missing for one in losses]

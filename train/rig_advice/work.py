@@ -47,7 +47,6 @@ def sample_work(
         sides: Its sides [m]; where they are longer than hands reach, people walk through it.
         num_frames: Frames of each person and kind.
         people: People of each kind.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: The glove does not fit, or is for one hand.
@@ -98,7 +97,6 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
     """The hands of a take where they were, in stretches in which every hand has a pose.
 
     Args:
-        take: A tracked or simulated take.
         layout: Another glove for its hands; their own when not given.
         num_frames: Frames to use, from the first.
 

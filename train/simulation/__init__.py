@@ -18,5 +18,4 @@ Training sets, frame by frame:
 - frame_scenes: poses of one hand, two hands, or a hand with an object.
 - training_frames: such poses through sight and optics into rows.
 - generation: `make_dataset` writes rows in shards, with a manifest.
-- held_out: test frames that no training set holds.
 """

@@ -15,9 +15,8 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
 from handsim.space.cameras import CameraRig, as_rig, rig_setting
-from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion
-from poses.motion.rest_paths import can_be_left
+from poses.motion.paths import MotionConfig, can_be_left
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from poses.shapes.library import gesture
 from poses.shapes.touch import FINGERS, touching_angles
@@ -63,11 +62,6 @@ def simulate_calibration(
 ) -> Take:
     """What cameras see of a user who makes a calibration capture with one hand or both.
 
-    Args:
-        hands: One or two hands in their gloves.
-        config: What the user does.
-        rng: Source of all randomness.
-
     Raises:
         ArgumentError: There are no hands or more than two.
         PoseError: A hand finds no way from its touches to free motion.
@@ -83,11 +77,6 @@ def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
     """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
-
-    Args:
-        hands: One or two hands in their gloves.
-        config: What the user does.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: There are no hands or more than two.
@@ -110,11 +99,6 @@ def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
-
-    Args:
-        model: The hand.
-        config: How many rounds, and how long the free motion is.
-        rng: Source of all randomness.
 
     Raises:
         PoseError: This hand finds no way from its touches to free motion.

@@ -65,17 +65,10 @@ def sample_frame_scene(
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> FrameScene:
-    """A random scene that fills a number of rows; where the hands cannot do it, one of a hand alone.
+    """A random scene that fills a number of rows, which two hands share.
 
-    Args:
-        models: A person's left and right hand.
-        num_rows: Rows to fill; two hands share them.
-        scenes: How often each kind of scene is drawn.
-        poses: How single hands are posed.
-        volume: Half side of the cube the wrist is in [m].
-        sampler: Draws the poses of single hands instead.
-        redrawn: Counts the scenes that became one of a hand alone, by reason.
-        rng: Source of all randomness.
+    Where the hands cannot do it, it is one of a hand alone, counted in `redrawn` by reason. Wrists are in a
+    cube of half side `volume` [m]; a sampler replaces the poses of single hands.
     """
     shares = np.array(dataclasses.astuple(scenes))
     kind = int(rng.choice(len(shares), p=shares / shares.sum()))

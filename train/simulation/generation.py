@@ -24,10 +24,10 @@ from handsim.app.interrupts import Stopped
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import DatasetError, HandSimWarning
-from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
+from handsim.files.outputs import check_free
 from handsim.hand.model import HandModel
-from handsim.hand.records import HAND_DTYPE, pack_hand
+from handsim.hand.shape import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
 from poses.shapes.sampling import PoseSampler, load_sampler
@@ -113,12 +113,10 @@ def make_dataset(
     """As `generate_dataset`.
 
     Args:
-        config: What to make.
         out: Folder to make it in; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. A set
             there may have fewer frames and must have the same settings else.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
-        progress: Called after every shard.
 
     Returns:
         The manifest, which is also the file `manifest.json` beside the `.npy` shards; `Dataset(out)` reads

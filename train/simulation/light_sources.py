@@ -37,11 +37,6 @@ class LightSources(NamedTuple):
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
     """All that shines, and which cameras have a free view of it.
 
-    Args:
-        sight: The scene and the cameras.
-        config: Strays, mirror images and the size of visible spots.
-        rng: Source of all randomness.
-
     Raises:
         ArgumentError: A camera stands in the hands.
     """
@@ -91,10 +86,8 @@ def mirror_images(
     """Mirror images of all markers in the object's shiny patches, those that a camera ever sees.
 
     Args:
-        sight: The scene and the cameras.
         radii: Radii of all markers [m].
         reflectance: Share of the images that are bright enough.
-        rng: Source of all randomness.
     """
     markers, _ = sight.markers
     parts: list[LightSources] = []

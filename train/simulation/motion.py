@@ -16,7 +16,7 @@ from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject, named_object
 from poses.contact.keeping_apart import keep_apart, point_pen
 from poses.contact.pointing import pointing_path
-from poses.contact.two_hands import TwoHandConfig, sample_two_hand_motion
+from poses.contact.two_hands import sample_two_hand_motion
 from poses.grasps.object_motion import sample_object_motion
 from poses.motion.scripts import scripted_motion
 from poses.motion.wrist_paths import WristConfig, wrist_path
@@ -79,10 +79,8 @@ def sample_scene_motion(
     """Random motion of a right and a left hand, and of the object that the right hand holds.
 
     Args:
-        kind: What the hands do.
         fits: A right and a left hand in their gloves.
         num_frames: Frames at `RATE`.
-        rng: Source of all randomness.
 
     Raises:
         PoseError: These hands cannot do this: they do not grasp the object, say.
@@ -101,8 +99,9 @@ def sample_scene_motion(
 
 def _two_hands(right: GloveFit, left: GloveFit, num_frames: int, rng: np.random.Generator) -> SceneMotion:
     """Hands that meet and part."""
-    config = TwoHandConfig(apart=_PAUSE_BETWEEN_CONTACTS)
-    motions = sample_two_hand_motion(right.model, left.model, num_frames / RATE, config, rng=rng)
+    motions = sample_two_hand_motion(
+        right.model, left.model, num_frames / RATE, pause=_PAUSE_BETWEEN_CONTACTS, rng=rng
+    )
     return SceneMotion(_gloved((right, left), motions, num_frames))
 
 

@@ -40,9 +40,7 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
     Wrists, elbows and shoulders come first, then a thing in a hand, then head and back, then another person.
 
     Args:
-        scene: The hands in motion.
         count: Markers.
-        rng: Source of all randomness.
     """
     wrists = np.stack([hand.qpos[:, :3] for hand in scene.hands], axis=1)
     ahead = np.stack(

@@ -28,10 +28,7 @@ def sample_hands(
 ) -> tuple[HandModel, ...]:
     """A random person's left and right hand, whose fingers do not overlap at rest.
 
-    Args:
-        population: Whom to draw from.
-        redrawn: Counts the people who were drawn again, by reason.
-        rng: Source of all randomness.
+    Those who were drawn again are counted in `redrawn`, by reason.
 
     Raises:
         ArgumentError: No hand of this population can rest.
@@ -69,11 +66,8 @@ def wear_gloves(
     """The same glove on each hand, its markers slipped a little.
 
     Args:
-        layout: The glove.
-        models: The hands that wear it.
         along: Standard deviation of the slip along the bones [bone lengths].
         around: Standard deviation of the slip around the bones [rad].
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: A marker misses the skin however it slips.

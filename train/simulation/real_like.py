@@ -38,7 +38,6 @@ def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.ran
     Args:
         layout: The glove on both hands.
         num_frames: Frames at `train.simulation.motion.RATE`.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: The glove does not fit.
@@ -51,12 +50,7 @@ def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.ran
 
 
 def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
-    """Displacement of a hand's markers in the world [m]: what repeats with the pose, and noise.
-
-    Args:
-        hand: The hand in motion.
-        rng: Source of all randomness.
-    """
+    """Displacement of a hand's markers in the world [m]: what repeats with the pose, and noise."""
     turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
     moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
     for marker, bone in enumerate(hand.fit.attachment.main_bones):

@@ -31,9 +31,7 @@ def record_take(
     Args:
         scene: What moves: T frames of one or more gloved hands and perhaps an object.
         rig: C cameras around them.
-        config: Noise, losses, strays and mirror images.
         settings: Kept in the take as they are.
-        rng: Source of all randomness.
 
     Raises:
         ArgumentError: A camera stands in the hands.
@@ -54,12 +52,8 @@ def pack_take(
     """A take of points triangulated from light sources, in columns and with IDs that do not tell the marker.
 
     Args:
-        scene: What moves.
         sources: What shines.
-        rig: The cameras.
-        config: Noise and losses.
         settings: Kept in the take as they are.
-        rng: Source of all randomness.
     """
     optics = config.optics
     found = reconstruct(
@@ -100,15 +94,9 @@ def label_false_points(
     labels: Int[np.ndarray, "S"],
     max_distance: float,
 ) -> Int[np.ndarray, "T F"]:
-    """Labels of false points: the nearest marker that has no other point, -1 where none is near.
+    """Labels of false points: the nearest marker that has no other point, -1 where none is near enough [m].
 
     A person who labels a capture takes such a point for the marker, although it is a little off.
-
-    Args:
-        found: What the optical system made of the sources.
-        positions: True positions of the sources [m].
-        labels: Marker of each source, -1 for a source that is not a marker.
-        max_distance: Largest distance from the marker to its false point [m].
     """
     false_labels = np.full(found.false_points.shape[:2], -1)
     markers = np.flatnonzero(labels >= 0)

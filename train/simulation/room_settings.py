@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
-from gloves.captures.gaps import GapCounts
+from gloves.captures.capture import GapCounts
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import StrayConfig
 

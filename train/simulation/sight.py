@@ -20,12 +20,7 @@ SKIN_CHUNK: Final = 16
 
 
 class SceneSight:
-    """What a rig can see of hands and an object in motion.
-
-    Args:
-        scene: What moves.
-        rig: The cameras.
-    """
+    """What a rig can see of hands and an object in motion."""
 
     def __init__(self, scene: SceneMotion, rig: CameraRig) -> None:
         self.scene, self.rig = scene, rig
@@ -76,7 +71,6 @@ class SceneSight:
 
         Args:
             radii: Radius around each marker's center in which the visible spot lies [m].
-            rng: Source of the spots.
         """
         markers, normals = self.markers
         seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)

@@ -185,11 +185,7 @@ def record_config(config: TakeConfig) -> Take:
 
 
 def _worn_hands(config: TakeConfig, layout: MarkerLayout) -> tuple[Side, ...]:
-    """The hands that a capture asks for and the glove is for.
-
-    Raises:
-        LayoutError: The glove is for the other hand, or this kind of capture needs both.
-    """
+    """The hands that a capture asks for and the glove is for; a `LayoutError` if there are none."""
     if len(layout.sides) == 1 and set(config.hands) == set(BOTH):
         if config.kind not in APART:
             raise LayoutError(
@@ -208,10 +204,8 @@ def sample_scene(
     """A random person in gloves who does what this kind of capture asks for.
 
     Args:
-        kind: What the hands do.
         layout: The glove on both hands.
         num_frames: Frames at `train.simulation.motion.RATE`.
-        rng: Source of all randomness.
 
     Raises:
         LayoutError: The glove does not fit.

@@ -59,12 +59,8 @@ def simulate_frames(
 
     Args:
         block: Rows to fill, see `train.data.shards.row_dtype`.
-        models: The person's left and right hand.
         layout: The glove on both.
-        rig: The cameras.
-        config: What to draw.
         redrawn: Counts scenes that these hands could not do, by reason.
-        rng: Source of all randomness.
     """
     scene = sample_frame_scene(
         models,
@@ -115,12 +111,8 @@ def observe_scene(
     """What the rig sees of every hand past all hands (as capsules) and the object, and what becomes of it.
 
     Args:
-        scene: Poses of the hands.
         fits: Each hand in its glove.
-        rig: The cameras.
-        optics: The optical system.
         ghosts: Mirror images and strays.
-        rng: Source of all randomness.
     """
     bones = [fit.model.forward_kinematics(qpos) for fit, qpos in zip(fits, scene.qpos, strict=True)]
     worn = [fit.attachment.markers(fit.model, frames) for fit, frames in zip(fits, bones, strict=True)]

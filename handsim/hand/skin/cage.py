@@ -264,12 +264,7 @@ class CageHands(NamedTuple):
         return row / shared[:, None]
 
     def _shape_thumb_base(self, cages: NDArray[np.float64], topology: CageTopology) -> None:
-        """Thenar muscle and first web: the palm's rows around the thumb's metacarpal, in the thumb's frame.
-
-        Args:
-            cages: Vertices (B, 3, K, 3) [m], changed in place.
-            topology: Of the cage.
-        """
+        """Thenar muscle and first web, in place: the palm's rows around the thumb's metacarpal."""
         length, radius = self.bone_lengths[:, None, :1, :1], self.radii[:, None, :1, :1]
         moved = topology.palm[_THUMB_BASE_ROWS, _THUMB_BASE_COLUMNS]
         along, across, share = np.split(_THUMB_BASE, [1, 3], axis=1)

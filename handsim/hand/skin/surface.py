@@ -1,27 +1,36 @@
-"""The hand's skin: a smooth closed mesh that is a function of the shape, and linear blend skinning."""
+"""The hand's skin: a smooth closed mesh that is a function of the shape, and linear blend skinning.
+
+Shares of the bones are given on the cage, and spread by the same subdivision as its vertices. Skinning is
+compiled: the whole skin in every frame, fast enough to cast rays against it.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy import sparse
 
 from handsim.hand.skin.cage import CageHands
 from handsim.hand.skin.cage_topology import (
+    CARPUS,
     KNUCKLES,
     METACARPUS,
+    PAST_KNUCKLES,
+    THENAR,
+    WEB,
     CageTopology,
     cage_topology,
     dorsal,
     palmar,
 )
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
-from handsim.hand.skin.weights import cage_weights, strongest_weights
+from handsim.hand.topology import NUM_BONES, PALM
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import MIRROR
 
@@ -32,6 +41,24 @@ if TYPE_CHECKING:
 _LEVELS: Final = 2
 _FIT_STEPS: Final = 4
 _FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
+# Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
+_FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
+# Share of the thumb's metacarpal on the palm's rows around it: (row, index, share).
+_THENAR: Final = (
+    (CARPUS, dorsal(0), 0.25),
+    (CARPUS, palmar(0), 0.35),
+    (CARPUS, palmar(1), 0.15),
+    (THENAR, dorsal(0), 0.5),
+    (THENAR, dorsal(1), 0.05),
+    (THENAR, palmar(0), 0.8),
+    (THENAR, palmar(1), 0.6),
+    (THENAR, palmar(2), 0.3),
+    (THENAR, palmar(3), 0.05),
+    (METACARPUS, dorsal(0), 0.15),
+    (METACARPUS, palmar(0), 0.4),
+    (METACARPUS, palmar(1), 0.25),
+)
+_KNUCKLE_SHARES: Final = {KNUCKLES: (0.35, 0.25), PAST_KNUCKLES: (0.9, 0.7), WEB: (1.0, 0.9)}  # finger, web
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,12 +185,7 @@ def vertex_normals(
 
 @kernel
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """See `vertex_normals`; zero for a vertex without faces.
-
-    Args:
-        vertices: Positions (V, 3) [m].
-        faces: Triangles (F, 3).
-    """
+    """See `vertex_normals`; zero for a vertex without faces."""
     normals = np.zeros_like(vertices)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -186,33 +208,82 @@ def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals
 
 
-def linear_blend_skinning(
-    points: Float[np.ndarray, "N 3"],
-    bone_indices: Int[np.ndarray, "N 4"],
-    bone_weights: Float[np.ndarray, "N 4"],
+def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
+    """Share of every bone in every cage vertex; rows sum to one."""
+    weights = np.zeros((topology.num_vertices, NUM_BONES))
+    for row, (on_finger, on_web) in _KNUCKLE_SHARES.items():
+        for column in range(9):
+            fingers = (
+                [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
+            )
+            share = on_finger if column % 2 or len(fingers) == 1 else on_web
+            for index in (dorsal(column), palmar(column)):
+                weights[topology.palm[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)
+    for row, index, share in _THENAR:
+        weights[topology.palm[row, index], 1] = share
+    for digit, rings in enumerate(topology.rings):
+        first = 1 + 3 * digit
+        if digit == 0:
+            weights[rings[0], first] = 0.95
+        for ring, (bone, share) in zip(rings[-len(_FINGER_RINGS) :], _FINGER_RINGS, strict=True):
+            weights[ring, first + bone - 1] = 1.0 - share
+            weights[ring, first + bone] = share
+    weights[:, PALM] = 1.0 - weights[:, PALM + 1 :].sum(axis=1)
+    return weights
+
+
+def strongest_weights(
+    weights: Float[np.ndarray, "V 16"],
+) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"]]:
+    """The four largest shares of each vertex in descending order, scaled to sum to one, and their bones."""
+    indices = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    shares = np.take_along_axis(weights, indices, axis=1)
+    return indices, shares / shares.sum(axis=1, keepdims=True)
+
+
+def skin_frames(
+    points: Float[np.ndarray, "V 3"],
+    bone_indices: Int[np.ndarray, "V 4"],
+    bone_weights: Float[np.ndarray, "V 4"],
     rest_transforms: Float[np.ndarray, "L 4 4"],
-    transforms: Float[np.ndarray, "*batch L 4 4"],
-) -> Float[np.ndarray, "*batch N 3"]:
+    transforms: Float[np.ndarray, "T L 4 4"],
+) -> Float[np.ndarray, "T V 3"]:
     """Points attached at rest, carried by the bones.
 
     Args:
         points: Rest positions, in the frame of `rest_transforms` [m].
-        bone_indices: The bones that move each point.
-        bone_weights: Their shares.
+        bone_weights: Their shares in descending order; the first zero ends a point's list.
         rest_transforms: Bones at rest.
-        transforms: Bones in each pose, in any frame.
+        transforms: Bones in every frame, in any one frame of reference.
 
     Returns:
         Positions in the frame of `transforms` [m].
     """
-    motion = (transforms @ np.linalg.inv(rest_transforms))[..., :3, :]
-    weights = np.zeros((len(points), len(rest_transforms)))
-    np.add.at(weights, (np.arange(len(points))[:, None], bone_indices), bone_weights)
-    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    # Each bone moves only its own points: one small product a bone instead of a blended matrix a point.
-    result = np.zeros((*motion.shape[:-3], len(points), 3))
-    for bone in range(len(rest_transforms)):
-        mine = np.flatnonzero(weights[:, bone])
-        carried = np.einsum("...ij,nj->...ni", motion[..., bone, :, :], homogeneous[mine])
-        result[..., mine, :] += weights[mine, bone, None] * carried
-    return result
+    motion = np.ascontiguousarray((transforms @ np.linalg.inv(rest_transforms))[..., :3, :])
+    skinned: NDArray[np.float64] = _skin(points, bone_indices, bone_weights, motion)
+    return skinned
+
+
+@kernel
+def _skin(
+    points: Float[np.ndarray, "V 3"],
+    bones: Int[np.ndarray, "V 4"],
+    weights: Float[np.ndarray, "V 4"],
+    motion: Float[np.ndarray, "T L 3 4"],
+) -> Any:
+    """Skinned positions (T, V, 3) [m] by transforms from the rest pose to each frame."""
+    skinned = np.empty((len(motion), len(points), 3))
+    for t in range(len(motion)):
+        for v in range(len(points)):
+            px, py, pz = points[v, 0], points[v, 1], points[v, 2]
+            x, y, z = 0.0, 0.0, 0.0
+            for i in range(weights.shape[1]):
+                share = weights[v, i]
+                if share == 0.0:
+                    break
+                m = motion[t, bones[v, i]]
+                x += share * (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3])
+                y += share * (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3])
+                z += share * (m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3])
+            skinned[t, v, 0], skinned[t, v, 1], skinned[t, v, 2] = x, y, z
+    return skinned

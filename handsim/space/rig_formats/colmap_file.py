@@ -37,13 +37,9 @@ _NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
-    """A camera for each image of a reconstruction.
+    """A camera for each image of a reconstruction in meters, called after it.
 
-    Args:
-        path: The folder of `cameras.txt` and `images.txt`, or one of the two.
-
-    Returns:
-        Cameras called after their images, with their poses; the reconstruction's unit must be the meter.
+    `path` is the folder of `cameras.txt` and `images.txt`, or one of the two.
 
     Raises:
         RigError: A file is missing or damaged, or a model is one that we do not have.

@@ -60,12 +60,8 @@ Sections = dict[str, Values]
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
     """The camera of a calibration, both of a stereo pair, or all of a file (docs/rendering.md has the names).
 
-    Args:
-        path: A `.yml`, `.yaml` or `.json` file. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
-            sample writes them, and of `intri.yml` and `extri.yml`, either; the other is read too.
-
-    Returns:
-        Cameras with their poses [m] and intrinsics [px].
+    The file is a `.yml`, `.yaml` or `.json`. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
+    sample writes them, and of `intri.yml` and `extri.yml`, it is either; the other is read too.
 
     Raises:
         RigError: It cannot be read, something is missing, or a lens is of a kind that we do not have.

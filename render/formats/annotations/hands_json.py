@@ -48,7 +48,6 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
     """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them.
 
     Args:
-        camera: The stream's camera.
         T_world_device: Pose of what the sample's cameras are fixed to.
     """
     K, lens = camera.K, camera.lens
@@ -77,10 +76,7 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
 
 
 def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
-    """`hands.json` of one time: `left` and `right`, null for a hand that is not there.
-
-    Args:
-        frames: One a stream.
+    """`hands.json` of one time, a frame a stream: `left` and `right`, null for a hand that is not there.
 
     Raises:
         HandSimError: Two hands are of the same side.

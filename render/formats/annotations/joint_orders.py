@@ -74,14 +74,7 @@ def joint_order(name: str) -> tuple[int, ...]:
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Our keypoints, or other rows with one per keypoint, in another order.
-
-    Args:
-        points: In the order of `KEYPOINT_NAMES`.
-        name: One of `JOINT_ORDERS`.
-
-    Returns:
-        As many as that order has; NaN for those that we do not have.
+    """Our keypoints, or other rows with one per keypoint, in one of `JOINT_ORDERS`; NaN for those we lack.
 
     Raises:
         ArgumentError: The order is unknown, or there are not 21 points.
@@ -90,20 +83,6 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
     nowhere = np.full_like(points[..., :1, :], np.nan)
     ordered: NDArray[np.floating] = np.concatenate([points, nowhere], axis=-2)[..., order, :]
     return ordered
-
-
-def from_order(points: Float[np.ndarray, "*batch n k"], name: str) -> Float[np.ndarray, "*batch 21 k"]:
-    """The inverse of `to_order`: NaN for those of ours that the other order has not.
-
-    Raises:
-        ArgumentError: The order is unknown, or it has another number of points.
-    """
-    order = np.array(joint_order(name))
-    points = _rows(points, len(order), f"joints in the order '{name}'")
-    known = np.flatnonzero(order != ABSENT)
-    ours = np.full((*points.shape[:-2], NUM_KEYPOINTS, points.shape[-1]), np.nan, dtype=points.dtype)
-    ours[..., order[known], :] = points[..., known, :]
-    return ours
 
 
 def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:

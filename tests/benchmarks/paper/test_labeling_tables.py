@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.command_line import run
+from benchmarks.held_out import held_out_markers
 from benchmarks.paper import labeling_tables
 from benchmarks.paper.labeling_tables import FIGURES, LABELING_TABLES, augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from handsim.cli.main import main
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
-from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import simulate_take
 

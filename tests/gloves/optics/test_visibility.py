@@ -13,7 +13,6 @@ from gloves.optics.visibility import (
     facing_cameras,
     free_rays,
     pack_cameras,
-    unpack_cameras,
     visible_cameras,
 )
 from handsim.errors import ArgumentError, RigError
@@ -92,7 +91,8 @@ def test_facing_cameras_are_those_with_the_marker_in_their_picture_and_on_its_ou
 
 def test_packing_round_trip(rng):
     seen = rng.random((5, 7, 16)) < 0.5
-    np.testing.assert_array_equal(unpack_cameras(pack_cameras(seen), 16), seen)
+    bits = (pack_cameras(seen)[..., None] >> np.arange(16)) & 1
+    np.testing.assert_array_equal(bits, seen)
 
 
 def test_bad_rigs_are_told():

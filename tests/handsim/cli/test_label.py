@@ -58,16 +58,16 @@ def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
 
 
 def test_a_capture_without_a_hand_is_told(take, tmp_path, capsys, rng):
-    body = rng.uniform(-0.9, 0.9, size=(40, 3)) + np.zeros((FRAMES, 1, 1))
+    body = rng.uniform(-0.9, 0.9, size=(40, 3)) + np.zeros((10, 1, 1))
     capture = Capture(tuple(f"*{number}" for number in range(40)), body, take.rate)
     empty = dataclasses.replace(capture, positions=np.full_like(body, np.nan))
     for given, words in (
         (capture, "expected hands in glove 'dense19'"),
-        (empty, "no point is in any of the 40 frames"),
+        (empty, "no point is in any of the 10 frames"),
     ):
         labeled, said = label(tmp_path, given, capsys)
         assert not np.isfinite(labeled.positions[:, :19]).any()
-        assert f"0 of {np.isfinite(given.positions[..., 0]).sum()} points labeled; no hand in 40 frames" in (
+        assert f"0 of {np.isfinite(given.positions[..., 0]).sum()} points labeled; no hand in 10 frames" in (
             said.out
         )
         assert words in said.err

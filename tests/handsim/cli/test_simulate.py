@@ -9,12 +9,12 @@ import os
 import numpy as np
 import pytest
 
+from benchmarks.held_out import held_out_markers
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.cli.main import main
-from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS
 
 FRAMES = 60

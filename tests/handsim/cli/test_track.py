@@ -38,7 +38,7 @@ from track.capture_tracking import track_capture
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user
-from track.viewer.recordings.corrector import Corrector
+from track.viewer.corrector import Corrector
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
 FRAMES = 60

@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import lsq_linear
 
-from handsim.kernels.segments import segment_distance
+from handsim.kernels.segments import segment_distance_squared
+
+
+def segment_distance(p, q, a, b):
+    return np.sqrt(segment_distance_squared(p, q, a, b))
+
 
 points = arrays(np.float64, (4, 3), elements=st.floats(-1, 1, width=32))
 

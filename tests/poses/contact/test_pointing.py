@@ -17,7 +17,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.objects import named_object
 from poses.contact.keeping_apart import keep_apart, point_pen
-from poses.contact.pointing import PointingConfig, pointing_path
+from poses.contact.pointing import DISTANCE, PATH, RETREAT, SPEED, TURNING, pointing_path
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.grasp_scene import object_penetration, wrist_poses
 from poses.grasps.object_motion import sample_object_motion
@@ -56,19 +56,18 @@ def speeds(places: np.ndarray) -> np.ndarray:
 
 def test_the_tip_visits_its_places_at_its_distance(rng):
     places, outward = markers_of(hands()[1], resting(hands()[1], 2400))
-    config = PointingConfig()
     path = pointing_path(places, outward, RATE, rng=rng)
     tip, axis = path[:, :3, 3], path[:, :3, 2]
     still = np.concatenate([[False], speeds(tip) < 1e-9])
     assert 0.2 < still.mean() < 0.7
     distances = np.linalg.norm(tip[:, None] - places, axis=2)
-    # A stay is at a place: straight along the pen at a distance that the config allows.
+    # A stay is at a place: straight along the pen at an allowed distance.
     straight = tip[:, None] - distances[..., None] * axis[:, None]
     aimed = np.linalg.norm(straight - places, axis=2) < 1e-9
     assert aimed[still].any(axis=1).all()
     target = aimed.argmax(axis=1)
     off = distances[np.arange(len(tip)), target][still]
-    low, high = config.distance
+    low, high = DISTANCE
     assert off.min() >= low - 1e-9 and off.max() <= high + 1e-9
     facing = np.einsum("ti,ti->t", axis, outward[np.arange(len(tip)), target])[still]
     assert facing.min() > 0.0, "the pen comes from outside"
@@ -79,7 +78,6 @@ def test_the_tip_visits_its_places_at_its_distance(rng):
 @given(st.integers(0, 2**32 - 1))
 def test_whatever_it_points_at_the_pen_never_jumps(seed):
     rng = np.random.default_rng(seed)
-    config = PointingConfig()
     places = np.tile(rng.uniform(-0.2, 0.2, size=(6, 3)), (FRAMES, 1, 1))
     outward = rng.standard_normal((6, 3))
     outward = np.tile(outward / np.linalg.norm(outward, axis=1, keepdims=True), (FRAMES, 1, 1))
@@ -88,9 +86,9 @@ def test_whatever_it_points_at_the_pen_never_jumps(seed):
     square = path[:, :3, :3] @ np.swapaxes(path[:, :3, :3], 1, 2)
     np.testing.assert_allclose(square, np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-9)
     assert (np.linalg.det(path[:, :3, :3]) > 0.0).all()
-    lifting = 2.6 * config.retreat / config.path[0] * 1.875
-    assert speeds(path[:, :3, 3]).max() < config.speed + lifting + 0.1
-    assert turns(path).max() < 2.0 * config.turning
+    lifting = 2.6 * RETREAT / PATH[0] * 1.875
+    assert speeds(path[:, :3, 3]).max() < SPEED + lifting + 0.1
+    assert turns(path).max() < 2.0 * TURNING
 
 
 def test_it_follows_places_that_move(rng):
@@ -99,9 +97,9 @@ def test_it_follows_places_that_move(rng):
     places, outward = markers_of(hand, motion)
     shift = np.linspace(0.0, 0.3, FRAMES)[:, None] * [1.0, 0.0, 0.0]
     seed = int(rng.integers(1000))
-    still = pointing_path(places, outward, RATE, PointingConfig(speed=50.0), rng=np.random.default_rng(seed))
+    still = pointing_path(places, outward, RATE, speed=50.0, rng=np.random.default_rng(seed))
     moving = pointing_path(
-        places + shift[:, None], outward, RATE, PointingConfig(speed=50.0), rng=np.random.default_rng(seed)
+        places + shift[:, None], outward, RATE, speed=50.0, rng=np.random.default_rng(seed)
     )
     np.testing.assert_allclose(moving[:, :3, 3] - shift, still[:, :3, 3], atol=1e-9)
     np.testing.assert_allclose(moving[:, :3, :3], still[:, :3, :3], atol=1e-9)

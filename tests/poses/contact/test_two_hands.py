@@ -18,9 +18,9 @@ from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import random_quaternions
 from poses.contact.contact_closing import close_fingers, first_contact, smooth_above, smooth_below
 from poses.contact.interactions import library
+from poses.contact.passages import MAX_ACCELERATION, MAX_SPEED
 from poses.contact.two_hands import (
     INTERACTIONS,
-    TwoHandConfig,
     sample_two_hand_motion,
     sample_two_hand_poses,
     two_hands_penetration,
@@ -95,7 +95,6 @@ def test_overlap_of_two_hands_is_mujocos(rng):
 @pytest.mark.parametrize("name", INTERACTIONS)
 def test_every_frame_is_valid_and_the_hands_really_touch(name, rng):
     right, left = hands()
-    config = TwoHandConfig()
     motions = sample_two_hand_motion(right, left, 8.0, interactions=[name], rng=rng)
     assert [len(motion.qpos) for motion in motions] == [961, 961]
     qpos = [motion.qpos for motion in motions]
@@ -104,8 +103,8 @@ def test_every_frame_is_valid_and_the_hands_really_touch(name, rng):
     assert touching.mean() > 0.25, "ways between meetings included"
     for motion in motions:
         speeds = motion.speeds()
-        assert np.abs(speeds).max() <= config.max_speed
-        assert np.abs(np.diff(speeds, axis=0) * motion.rate).max() <= config.max_acceleration
+        assert np.abs(speeds).max() <= MAX_SPEED
+        assert np.abs(np.diff(speeds, axis=0) * motion.rate).max() <= MAX_ACCELERATION
         wrist = np.linalg.norm(np.diff(motion.qpos[:, :3], axis=0), axis=1) * motion.rate
         assert wrist.max() < (4.0 if name == "clap" else 2.5)
         assert wrist.max() > 0.1

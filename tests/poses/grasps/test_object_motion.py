@@ -14,7 +14,7 @@ from handsim.space.objects import RigidObject, load_object, named_object, object
 from handsim.space.transforms import MIRROR
 from poses.grasps.grasp_scene import GraspScene, grasp_scene
 from poses.grasps.grasping import Hold
-from poses.grasps.hold_library import hold_names, hold_style, place_object
+from poses.grasps.hold_library import hold_names, hold_style, place_object, retarget_angles
 from poses.grasps.object_motion import (
     MAX_OBJECT_PENETRATION,
     object_penetration,
@@ -22,7 +22,6 @@ from poses.grasps.object_motion import (
     sample_object_motion,
     settle_hold,
 )
-from poses.grasps.retargeting import retarget_angles
 from poses.motion.motions import MotionConfig
 from poses.shapes.validity import MAX_PENETRATION, is_valid
 

@@ -16,7 +16,7 @@ from handsim.hand.motion import HandMotion
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
 from poses.motion.motions import MotionConfig, minimum_jerk, motion_through, sample_motion
-from poses.motion.rest_paths import can_be_left, path_to_rest
+from poses.motion.paths import can_be_left, path_to_rest
 from poses.motion.scripts import script_names, script_poses, scripted_motion
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture, gesture_names

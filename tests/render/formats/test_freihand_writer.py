@@ -13,7 +13,7 @@ from handsim.errors import DatasetError, HandSimError
 from handsim.space.lens import Lens
 from render.formats.annotations.common import hand_mask
 from render.formats.freihand_writer import FreihandWriter
-from render.formats.png_depth import read_depth
+from tests.render.formats.reading import depth_of
 
 
 def load(folder: Path, name: str) -> list:
@@ -47,7 +47,7 @@ def test_a_freihand_loader_reads_it(make_frame, tmp_path: Path) -> None:
         assert picture.shape[1::-1] == frame.camera.size
         mask = cv2.imread(str(tmp_path / "training" / "mask" / f"{number:08d}.jpg"), cv2.IMREAD_GRAYSCALE)
         np.testing.assert_array_equal(mask > 127, hand_mask(frame, place))
-        depth = read_depth(tmp_path / "training" / "depth" / f"{number:08d}.png")
+        depth = depth_of((tmp_path / "training" / "depth" / f"{number:08d}.png").read_bytes())
         assert depth.shape == mask.shape
 
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,34 +9,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from handsim.errors import DatasetError, HandSimError
 from render.formats.png_depth import (
-    decode_depth,
+    METERS_PER_UNIT,
     encode_depth,
     encode_ids,
     encode_jpeg,
     encode_normals,
     encode_pictures,
-    encode_png,
-    read_depth,
 )
+from tests.render.formats.reading import depth_of
 
 
 @settings(deadline=None)  # the first call compiles
-@given(
-    hnp.arrays(np.float32, (3, 5), elements=st.floats(0.0, 6.5, width=32)),
-    st.sampled_from([1e-4, 1e-3, 0.000125]),
-)
-def test_depth_comes_back_to_half_a_unit(depth: np.ndarray, unit: float) -> None:
-    back = decode_depth(encode_depth(depth, meters_per_unit=unit))
-    assert back.dtype == np.float32
-    np.testing.assert_allclose(back, depth, atol=unit / 2 + 1e-6)
+@given(hnp.arrays(np.float32, (3, 5), elements=st.floats(0.0, 6.5, width=32)))
+def test_depth_comes_back_to_half_a_unit(depth: np.ndarray) -> None:
+    np.testing.assert_allclose(depth_of(encode_depth(depth)), depth, atol=METERS_PER_UNIT / 2 + 1e-6)
 
 
 def test_what_is_too_far_is_a_hole() -> None:
     depth = np.array([[6.5535, 6.56, np.inf], [np.nan, -1.0, 0.0]], dtype=np.float32)
-    np.testing.assert_allclose(decode_depth(encode_depth(depth)), [[6.5535, 0, 0], [0, 0, 0]], atol=1e-6)
-    assert decode_depth(encode_depth(depth, meters_per_unit=1e-3))[0, 1] == pytest.approx(6.56)
+    np.testing.assert_allclose(depth_of(encode_depth(depth)), [[6.5535, 0, 0], [0, 0, 0]], atol=1e-6)
 
 
 def test_others_read_depth_and_its_unit() -> None:
@@ -54,27 +45,6 @@ def test_others_read_depth_and_its_unit() -> None:
 def test_the_same_depth_gives_the_same_bytes(rng: np.random.Generator) -> None:
     depth = rng.random((8, 9)).astype(np.float32)
     assert encode_depth(depth) == encode_depth(depth.copy())
-
-
-def test_damaged_and_foreign_files_are_told(tmp_path: Path) -> None:
-    data = encode_depth(np.ones((20, 20), dtype=np.float32))
-    path = tmp_path / "a.png"
-    for content, told in [
-        (data[: len(data) // 2], "damaged"),
-        (b"hello", "not a PNG"),
-        (b"", "not a PNG"),
-        (encode_png(np.zeros((4, 4, 3), np.uint8)), "expected a 16-bit gray picture"),
-        (data.replace(b"0.0001", b"0.00x1"), "unit"),
-    ]:
-        path.write_bytes(content)
-        with pytest.raises(DatasetError, match=told) as caught:
-            read_depth(path)
-        assert str(path) in str(caught.value)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(DatasetError, match="cannot be read"):
-        read_depth(tmp_path / "none.png")
-    with pytest.raises(HandSimError, match="positive number"):
-        encode_depth(np.ones((2, 2), np.float32), meters_per_unit=0.0)
 
 
 def test_ids_and_normals_come_back(make_frame) -> None:
@@ -102,5 +72,5 @@ def test_pictures_are_the_sensor_s(make_frame) -> None:
     assert set(encode_pictures(plain, lossless=True)) == {".png", ".depth.png", ".normals.png", ".ids.png"}
     files = encode_pictures(noisy, lossless=False)
     assert set(files) == {".jpg", ".depth.png", ".depth_ideal.png", ".normals.png", ".ids.png"}
-    np.testing.assert_allclose(decode_depth(files[".depth.png"]), noisy.noisy.depth, atol=1e-4)
-    np.testing.assert_allclose(decode_depth(files[".depth_ideal.png"]), noisy.ideal.depth, atol=1e-4)
+    np.testing.assert_allclose(depth_of(files[".depth.png"]), noisy.noisy.depth, atol=1e-4)
+    np.testing.assert_allclose(depth_of(files[".depth_ideal.png"]), noisy.ideal.depth, atol=1e-4)

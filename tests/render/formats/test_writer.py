@@ -15,11 +15,10 @@ import pytest
 from handsim.errors import DatasetError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.camera import look_at
-from render.formats.exr import read_exr
 from render.formats.folder_writers import BESIDE
-from render.formats.png_depth import decode_depth, read_depth
 from render.formats.writer import FORMATS, FrameWriter, open_writer
 from render.frames import Pictures, RenderedFrame
+from tests.render.formats.reading import depth_of, exr_content
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -171,7 +170,9 @@ def test_images_name_their_files_of_depth_and_ids(name: str, make_frame, tmp_pat
     writer.finish()
     (file,) = (*tmp_path.glob("annotations.json"), *tmp_path.rglob("*_data.json"))
     (image,) = json.loads(file.read_text())["images"]
-    np.testing.assert_allclose(read_depth(tmp_path / image["depth_file"]), frame.ideal.depth, atol=1e-4)
+    np.testing.assert_allclose(
+        depth_of((tmp_path / image["depth_file"]).read_bytes()), frame.ideal.depth, atol=1e-4
+    )
     ids = cv2.imread(str(tmp_path / image["ids_file"]))
     np.testing.assert_array_equal(ids[..., 1], frame.ideal.instances)
     assert (tmp_path / image["normals_file"]).is_file() and "depth_ideal_file" not in image
@@ -191,14 +192,14 @@ def test_png_and_exr_hold_the_pictures(make_frame, tmp_path: Path) -> None:
         record = json.loads((tmp_path / name / inside / "shard-00000" / "small_000007.json").read_text())
         assert [hand["side"] for hand in record["hands"]] == ["right", "left"]
         if name == "png":
-            depth = read_depth(tmp_path / "png" / record["depth_file"])
+            depth = depth_of((tmp_path / "png" / record["depth_file"]).read_bytes())
             np.testing.assert_allclose(depth, frame.noisy.depth, atol=1e-4)
-            ideal = read_depth(tmp_path / "png" / record["depth_ideal_file"])
+            ideal = depth_of((tmp_path / "png" / record["depth_ideal_file"]).read_bytes())
             np.testing.assert_allclose(ideal, frame.ideal.depth, atol=1e-4)
     picture = cv2.imread(str(tmp_path / "png" / "images" / "shard-00000" / "small_000007.png"))
     np.testing.assert_array_equal(picture[..., ::-1], frame.noisy.rgb)
-    back = read_exr(tmp_path / "exr" / "shard-00000" / "small_000007.exr")
-    np.testing.assert_array_equal(back.ideal.depth, frame.ideal.depth)
+    channels = exr_content(tmp_path / "exr" / "shard-00000" / "small_000007.exr")[1]
+    np.testing.assert_array_equal(channels["Z"], frame.ideal.depth)
 
 
 # ---- clips
@@ -247,10 +248,8 @@ def test_webdataset_iterates_it(clip) -> None:
     samples = list(webdataset.WebDataset(str(path), shardshuffle=False))
     assert [sample["__key__"] for sample in samples] == ["000004", "000005"]
     for sample, frame in zip(samples, frames[::2], strict=True):
-        np.testing.assert_allclose(decode_depth(sample["depth_small.png"]), frame.noisy.depth, atol=1e-4)
-        np.testing.assert_allclose(
-            decode_depth(sample["depth_ideal_small.png"]), frame.ideal.depth, atol=1e-4
-        )
+        np.testing.assert_allclose(depth_of(sample["depth_small.png"]), frame.noisy.depth, atol=1e-4)
+        np.testing.assert_allclose(depth_of(sample["depth_ideal_small.png"]), frame.ideal.depth, atol=1e-4)
         picture = cv2.imdecode(np.frombuffer(sample["image_other.jpg"], np.uint8), cv2.IMREAD_COLOR)
         assert picture.shape == (72, 96, 3)
         assert set(json.loads(sample["cameras.json"])) == {"small", "other"}

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, attach, nominal_fit
@@ -18,7 +19,6 @@ from handsim.hand.shape import named_shape
 from handsim.hand.topology import JOINT_NAMES, SIDES
 from handsim.space.transforms import MIRROR
 from poses.motion.wrist_paths import WristConfig, wrist_path
-from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import displace_markers
 from track.calibration.user_calibration import Calibration, HeldOut, calibrate_hand
 from track.user import User, load_user

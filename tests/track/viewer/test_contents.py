@@ -18,10 +18,8 @@ from handsim.space.cameras import named_rig
 from tests.rigs import mixed_rig
 from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
-from track.viewer.recordings.captures import CaptureRecording
-from track.viewer.recordings.datasets import DatasetRecording
-from track.viewer.recordings.takes import TakeRecording
-from track.viewer.scene.rig_view import box_edges, camera_counts
+from track.viewer.recordings import CaptureRecording, DatasetRecording, TakeRecording
+from track.viewer.stage import box_edges, camera_counts
 from train.data.shards import Dataset
 
 

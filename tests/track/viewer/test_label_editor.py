@@ -12,8 +12,8 @@ from gloves.takes.corrections import corrections_of, corrections_path
 from gloves.takes.take import load_take
 from handsim.errors import CaptureError, HandSimWarning
 from track.viewer.contents import open_content, show_recording
-from track.viewer.recordings.corrector import Corrector
-from track.viewer.recordings.takes import TakeRecording
+from track.viewer.corrector import Corrector
+from track.viewer.recordings import TakeRecording
 
 TIP = "right:ThumbTip"
 

@@ -10,9 +10,12 @@ import pytest
 from gloves.layout import load_layout
 from handsim.errors import HandSimWarning, WeightsError
 from train.any_layout import layout_labeler
-from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
-from train.any_layout.worn_markers import sample_worn_markers
+from train.any_layout.layout_labeler import (
+    LayoutLabeler,
+    sample_worn_markers,
+    save_layout_network,
+    shipped_network,
+)
 from train.data.augmentation import Corruption
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
@@ -47,9 +50,7 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     assert equal.mean() > 0.97  # the two know the layout from other poses
 
 
-def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 192, "seed": 0})
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, quickly_learned):
     layout = load_layout("starter6")
     layout.save(tmp_path / "mine.toml")
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
@@ -72,3 +73,23 @@ def test_the_network_is_saved_and_read_again(tmp_path, monkeypatch):
             shipped_network()
     finally:
         shipped_network.cache_clear()
+
+
+def test_the_back_of_the_hand_is_rigid_and_fingers_bend():
+    layout = load_layout("starter10")
+    markers = sample_worn_markers(layout, 250, rng=np.random.default_rng(0))
+    assert markers.shape == (250, 10, 3) and np.isfinite(markers).all()
+    back, tip = layout.names.index("BackHand1"), layout.names.index("MiddleTip")
+    second = layout.names.index("BackHand2")
+    for person in range(0, 200, 100):
+        rows = markers[person : person + 100]
+        assert np.linalg.norm(rows[:, back] - rows[:, second], axis=1).std() < 2e-3
+        assert np.linalg.norm(rows[:, back] - rows[:, tip], axis=1).std() > 1e-2
+    firsts = np.linalg.norm(markers[[0, 100, 200], back] - markers[[0, 100, 200], second], axis=1)
+    assert len(np.unique(firsts.round(5))) == 3  # three people
+
+
+def test_the_same_seed_gives_the_same_markers():
+    layout = load_layout("tips8")
+    one, two = (sample_worn_markers(layout, 30, rng=np.random.default_rng(3)) for _ in range(2))
+    assert np.array_equal(one, two)

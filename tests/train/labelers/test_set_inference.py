@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.held_out import held_out_markers
 from train.config import SetLabelerConfig
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import pad_clouds
-from train.labelers.set_inference import CloudScorer, _centers, weight_shapes
-from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_inference import CloudScorer, TrainedSetLabeler, _centers, weight_shapes
 from train.labelers.set_network import SetLabeler
 from train.labelers.storage import load_network
-from train.simulation.held_out import held_out_markers
 
 
 def scorer(network: SetLabeler) -> CloudScorer:

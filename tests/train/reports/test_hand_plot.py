@@ -9,8 +9,7 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlac
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, bones_of
 from train.reports.flat_hand import flat_hand
-from train.reports.hand_plot import HAND_SIZE, arrow_curve, mistakes
-from train.reports.name_placement import name_extent, place_names
+from train.reports.hand_plot import HAND_SIZE, arrow_curve, mistakes, name_extent, place_names
 
 
 def any_layout(count: int) -> MarkerLayout:

@@ -16,11 +16,11 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlac
 from handsim.hand.topology import BONES
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report
-from train.evaluation.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.glove_labeler import load_labeler
 from train.history import History
+from train.labeler_evaluation import Report
 from train.loop import CHECKPOINT, train_labeler
+from train.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
 from train.simulation.dataset_config import DatasetConfig

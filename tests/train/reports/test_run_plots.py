@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from train.evaluation.metrics import reliability
 from train.history import History
+from train.metrics import reliability
 from train.reports.plot_style import picture
 from train.reports.run_plots import (
     LONGEST_NAME,

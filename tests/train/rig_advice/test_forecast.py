@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.captures.gaps import run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.hand.motion import BodyMotion
 from handsim.space.camera import look_at

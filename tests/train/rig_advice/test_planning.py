@@ -12,8 +12,7 @@ from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
 from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
 from train.rig_advice.forecast import light
-from train.rig_advice.plan import plan
-from train.rig_advice.planning import Planning, view_candidates
+from train.rig_advice.planning import Planning, plan, view_candidates
 from train.simulation.room_settings import RoomConfig
 
 

@@ -10,7 +10,7 @@ import pytest
 from handsim.space.cameras import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import CameraLoss
 from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
-from train.rig_advice.rig_score import score_rig, sentences
+from train.rig_advice.rig_score import GRID, map_volume, score_rig, sentences
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +84,17 @@ def test_the_page_has_tables_and_pictures_and_the_record_every_figure(score, tmp
     assert record["all"]["missing"] == score.whole.missing
     assert len(record["all"]["error_directions"]) == 3 and len(record["volume"]["error"]) == 125
     assert len(record["without_camera"]) == 6 and record["without_camera"][3]["seen"] > 0.1
+
+
+def test_the_middle_is_seen_and_far_away_is_not(work):
+    sides = np.array([6.0, 0.4, 0.4])
+    found = map_volume(work, named_rig("figure5"), np.array(ROOM_CENTER), sides, rng=np.random.default_rng(0))
+    assert len(found.points) == GRID**3
+    middle, ends = np.abs(found.points[:, 0]) < 0.1, np.abs(found.points[:, 0]) > 2.9
+    assert found.seen_by_two[middle].mean() > 0.95 > found.seen_by_three[ends].mean()
+    assert found.seen_by_two[ends].mean() < 0.6
+    assert (found.seen_by_three <= found.seen_by_two).all()
+    assert 0.0 < np.nanmean(found.error[middle]) < 0.001
+    assert np.isnan(found.error[ends]).any() or np.nanmean(found.error[ends]) > np.nanmean(
+        found.error[middle]
+    )

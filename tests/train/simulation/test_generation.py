@@ -24,7 +24,7 @@ from handsim.space.cameras import as_rig
 from poses.shapes.couplings import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for
-from track.viewer.recordings.datasets import DatasetRecording
+from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import write_report
 from train.simulation import frame_scenes, generation, people

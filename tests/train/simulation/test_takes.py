@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.gaps import count_gaps
+from gloves.captures.capture import count_gaps
 from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.takes.take import Take, load_take

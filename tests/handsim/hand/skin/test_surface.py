@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 import trimesh
@@ -5,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import (
     ADULTS,
     EVERYBODY,
@@ -15,15 +18,19 @@ from handsim.hand.shape import (
     shape_from_measures,
 )
 from handsim.hand.skeleton import build_skeleton
+from handsim.hand.skin.cage_topology import cage_topology
 from handsim.hand.skin.surface import (
     HandSurface,
     build_surface,
-    linear_blend_skinning,
+    cage_weights,
     rest_vertices,
+    skin_frames,
+    strongest_weights,
     vertex_normals,
 )
-from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES
-from handsim.space.transforms import axis_angle_matrix, euler_matrix
+from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES, NUM_JOINTS
+from handsim.space.transforms import axis_angle_matrix, euler_matrix, random_quaternions
+from tests.handsim.hand.skin.blending import blend_skin
 
 FIST = [[20, 25, 40, 50]] + [[0, 90, 105, 65]] * 4
 SPREAD = [[30, -30, -10, -10], [20, 0, 0, 0], [0, 0, 0, 0], [-14, 0, 0, 0], [-30, 0, 0, 0]]
@@ -57,9 +64,8 @@ def rest(shape: HandShape) -> np.ndarray:
 
 def posed(shape: HandShape, degrees: list[list[float]]) -> np.ndarray:
     skin = build_surface(shape)
-    return linear_blend_skinning(
-        skin.vertices, skin.bone_indices, skin.bone_weights, rest(shape), forward(shape, degrees)
-    )
+    bones = forward(shape, degrees)[None]
+    return skin_frames(skin.vertices, skin.bone_indices, skin.bone_weights, rest(shape), bones)[0]
 
 
 def digit_faces(skin: HandSurface, digit: int) -> np.ndarray:
@@ -260,8 +266,8 @@ def test_posed_skin_has_no_spikes_and_few_folds(shape, pose):
 def test_rest_transforms_leave_the_skin_where_it_is():
     shape = named_shape("M")
     skin, transforms = build_surface(shape), rest(shape)
-    still = linear_blend_skinning(skin.vertices, skin.bone_indices, skin.bone_weights, transforms, transforms)
-    assert_allclose(still, skin.vertices, atol=1e-12)
+    still = skin_frames(skin.vertices, skin.bone_indices, skin.bone_weights, transforms, transforms[None])
+    assert_allclose(still[0], skin.vertices, atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -273,7 +279,7 @@ def test_skinning_is_rigid_for_a_rigid_hand_and_takes_batches(seed):
     moves = np.tile(np.eye(4), (3, 1, 1))
     moves[:, :3, :3] = [euler_matrix(angles) for angles in rng.uniform(-3, 3, (3, 3))]
     moves[:, :3, 3] = rng.standard_normal((3, 3))
-    result = linear_blend_skinning(
+    result = skin_frames(
         skin.vertices[:50],
         skin.bone_indices[:50],
         skin.bone_weights[:50],
@@ -288,10 +294,10 @@ def test_skinning_is_rigid_for_a_rigid_hand_and_takes_batches(seed):
 def test_skinning_against_the_plain_formula():
     rng = np.random.default_rng(1)
     points, indices = rng.standard_normal((7, 3)), rng.permuted(np.tile(np.arange(16), (7, 1)), axis=1)[:, :4]
-    weights = rng.dirichlet(np.ones(4), 7)
+    weights = -np.sort(-rng.dirichlet(np.ones(4), 7), axis=1)
     transforms = np.tile(np.eye(4), (2, 16, 1, 1))
     transforms[..., :3, 3] = rng.standard_normal((2, 16, 3))
-    result = linear_blend_skinning(points, indices, weights, transforms[0], transforms[1])
+    result = skin_frames(points, indices, weights, transforms[0], transforms[1:])[0]
     motion = transforms[1] @ np.linalg.inv(transforms[0])
     for point, bones, shares, got in zip(points, indices, weights, result, strict=True):
         wanted = sum(
@@ -314,3 +320,52 @@ def test_many_skins_at_once_are_those_of_each_alone():
     together = rest_vertices(EXTREME_SHAPES)
     for shape, vertices in zip(EXTREME_SHAPES, together, strict=True):
         assert_array_equal(vertices, build_surface(shape.with_side("right")).vertices)
+
+
+def test_cage_shares_sum_to_one_and_every_bone_moves_something():
+    topology = cage_topology()
+    weights = cage_weights(topology)
+    assert weights.shape == (topology.num_vertices, NUM_BONES)
+    assert weights.min() >= 0.0
+    assert_allclose(weights.sum(axis=1), 1.0)
+    assert (weights.max(axis=0) > 0.9).all()
+
+
+def test_strongest_keeps_the_four_largest_in_order():
+    weights = np.zeros((2, NUM_BONES))
+    weights[0, [3, 5, 7, 9, 11]] = [0.1, 0.4, 0.2, 0.25, 0.05]
+    weights[1, 2] = 1.0
+    indices, shares = strongest_weights(weights)
+    assert indices[0].tolist() == [5, 9, 7, 3]
+    assert_allclose(shares[0], np.array([0.4, 0.25, 0.2, 0.1]) / 0.95)
+    assert indices[1, 0] == 2
+    assert_allclose(shares[1], [1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_every_vertex_agrees_with_plain_skinning(side, rng):
+    model = HandModel(sample_shape(side=side, rng=rng))
+    low, high = model.skeleton.ranges.T
+    qpos = join_qpos(
+        rng.uniform(low, high, size=(7, NUM_JOINTS)),
+        position=rng.uniform(-1.0, 1.0, size=(7, 3)),
+        quaternion=random_quaternions(7, rng=rng),
+    )
+    surface = model.surface
+    rest = (surface.vertices, surface.bone_indices, surface.bone_weights, model.rest_transforms)
+    plain = blend_skin(*rest, model.forward_kinematics(qpos))
+    np.testing.assert_allclose(skin_frames(*rest, model.forward_kinematics(qpos)), plain, atol=1e-14)
+    np.testing.assert_array_equal(model.skin(qpos), skin_frames(*rest, model.forward_kinematics(qpos)))
+
+
+def test_weights_sum_to_one_before_the_first_zero():
+    """The compiled loop ends a vertex's list at the first zero."""
+    weights = HandModel.named("S").surface.bone_weights
+    ended = np.cumsum(weights == 0.0, axis=1) > 0
+    assert ended.any(), "the test needs vertices with fewer than four bones"
+    assert (weights[ended] == 0.0).all()
+
+
+def test_no_frames():
+    model = HandModel.named("S")
+    assert model.skin(join_qpos(np.zeros((0, NUM_JOINTS)))).shape == (0, len(model.surface.vertices), 3)

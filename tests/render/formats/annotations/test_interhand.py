@@ -13,7 +13,7 @@ import pytest
 from handsim.errors import DatasetError, HandSimError
 from handsim.space.camera import look_at
 from render.formats.annotations.interhand import skeleton_lines
-from render.formats.annotations.joint_orders import from_order
+from render.formats.annotations.joint_orders import to_order
 from render.formats.writer import open_writer
 
 NAME = "InterHand2.6M_train"
@@ -55,10 +55,9 @@ def test_an_interhand_loader_reads_it(moving, tmp_path: Path) -> None:
         np.testing.assert_array_equal(valid, np.repeat(["right" in sides, "left" in sides], 21))
         for hand in frame.hands:
             rows = slice(0, 21) if hand.shape.side == "right" else slice(21, 42)
-            np.testing.assert_allclose(from_order(uv[rows], "interhand"), hand.keypoints - 0.5, atol=1e-4)
-            np.testing.assert_allclose(
-                from_order(world[rows], "interhand"), 1e3 * hand.keypoints_world, atol=1e-5
-            )
+            np.testing.assert_allclose(uv[rows], to_order(hand.keypoints, "interhand") - 0.5, atol=1e-4)
+            expected = 1e3 * to_order(hand.keypoints_world, "interhand")
+            np.testing.assert_allclose(world[rows], expected, atol=1e-5)
         picture = cv2.imread(str(tmp_path / "images" / "train" / image["file_name"]))
         assert picture.shape[:2] == (image["height"], image["width"])
 

@@ -2,13 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from handsim.errors import ArgumentError
 from handsim.hand.keypoints import KEYPOINT_NAMES
-from render.formats.annotations.joint_orders import ABSENT, JOINT_ORDERS, from_order, joint_order, to_order
+from render.formats.annotations.joint_orders import ABSENT, JOINT_ORDERS, joint_order, to_order
 
 # Names as the formats' own documents list them, in our words.
 THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")
@@ -65,23 +62,12 @@ def test_counts(name: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("name", JOINT_ORDERS)
-@given(points=hnp.arrays(np.float64, (2, 21, 3), elements=st.floats(-1e3, 1e3)))
-def test_there_and_back(name: str, points: np.ndarray) -> None:
-    known = np.isin(np.arange(21), joint_order(name))
-    back = from_order(to_order(points, name), name)
-    np.testing.assert_array_equal(back[:, known], points[:, known])
-    assert np.isnan(back[:, ~known]).all()
-
-
-@pytest.mark.parametrize("name", JOINT_ORDERS)
-@given(data=st.data())
-def test_back_and_there(name: str, data: st.DataObject) -> None:
-    order = np.array(joint_order(name))
-    points = data.draw(hnp.arrays(np.float32, (len(order), 2), elements=st.floats(-8, 8, width=16)))
-    again = to_order(from_order(points, name), name)
-    assert again.dtype == np.float32
-    np.testing.assert_array_equal(again[order != ABSENT], points[order != ABSENT])
-    assert np.isnan(again[order == ABSENT]).all()
+def test_points_go_where_the_order_says(name: str, rng: np.random.Generator) -> None:
+    points, order = rng.standard_normal((2, 21, 3)).astype(np.float32), np.array(joint_order(name))
+    ordered = to_order(points, name)
+    assert ordered.dtype == np.float32
+    np.testing.assert_array_equal(ordered[:, order != ABSENT], points[:, order[order != ABSENT]])
+    assert np.isnan(ordered[:, order == ABSENT]).all()
 
 
 def test_every_order_has_each_joint_at_most_once() -> None:
@@ -95,5 +81,3 @@ def test_mistakes_are_told() -> None:
         to_order(np.zeros((21, 3)), "open_xr")
     with pytest.raises(ArgumentError, match=r"expected \(\.\.\., 21, k\)"):
         to_order(np.zeros((20, 3)), "mano")
-    with pytest.raises(ArgumentError, match=r"expected \(\.\.\., 26, k\)"):
-        from_order(np.zeros((25, 3)), "openxr")
