@@ -177,3 +177,19 @@ def _precision(right: int, given: int, there: int) -> float:
 
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
+
+
+def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
+    """Print figures as a table in percent, a column each."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("figure")
+    for name in columns:
+        table.add_column(f"{name} [%]", justify="right")
+    for figure in next(iter(columns.values())):
+        table.add_row(
+            figure.replace("_", " "), *map(percent, (column[figure] for column in columns.values()))
+        )
+    Console().print(table)

@@ -49,7 +49,7 @@ def evaluate(
     from train.data.augmentation import Corruption
     from train.evaluate import evaluate_labeler
     from train.glove_labeler import load_labeler
-    from train.reports.figures_table import print_figures
+    from train.metrics import print_figures
     from train.threads import label_on
 
     label_on(threads)

@@ -19,7 +19,7 @@ from handsim.cli.parsing import run_command
 from handsim.errors import DatasetError, HandSimError
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
 from train.devices.world import world_of
-from train.reports.figures_table import print_figures
+from train.metrics import print_figures
 
 _PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
 

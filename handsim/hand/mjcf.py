@@ -36,7 +36,6 @@ def build_spec(
     skeleton: Skeleton,
     capsules: Capsules,
     *,
-    name: str = "hand",
     sites: tuple[Site, ...] = (),
     actuators: bool = False,
 ) -> mujoco.MjSpec:
@@ -48,7 +47,7 @@ def build_spec(
     import mujoco
 
     spec = mujoco.MjSpec()
-    spec.modelname = name
+    spec.modelname = "hand"
     spec.compiler.degree = False
     spec.option.gravity = np.zeros(3)
     bodies: list[mujoco.MjsBody] = []

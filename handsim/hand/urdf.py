@@ -23,9 +23,9 @@ _MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
 _COLOR: Final = "0.85 0.65 0.55 1"
 
 
-def hand_urdf(model: HandModel, *, name: str = "hand") -> str:
+def hand_urdf(model: HandModel) -> str:
     """The text of a .urdf file: meters, radians, kilograms."""
-    root = ET.Element("robot", name=name)
+    root = ET.Element("robot", name="hand")
     ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
     for number, bone in enumerate(BONES):
         hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == number]

@@ -231,21 +231,19 @@ def check_outside(
             )
 
 
-def check_outside_volume(
-    rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float, *, clearance: float = HAND_REACH
-) -> None:
+def check_outside_volume(rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float) -> None:
     """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
 
     Raises:
-        ArgumentError: A camera is nearer to the cube than `clearance` [m].
+        ArgumentError: A camera is nearer to the cube than hands reach.
     """
     middle = np.asarray(center, dtype=np.float64)
     nearest = np.clip(rig.positions, middle - half_side, middle + half_side)
     distances = np.linalg.norm(nearest - rig.positions, axis=1)
-    if distances.min() < clearance:
+    if distances.min() < HAND_REACH:
         raise ArgumentError(
             f"camera {distances.argmin() + 1} of rig '{rig.name}' is {distances.min():.2g} m from the space "
-            f"that wrists move in, expected at least {clearance:g} m"
+            f"that wrists move in, expected at least {HAND_REACH:g} m"
         )
 
 

@@ -49,12 +49,7 @@ _MARGIN: Final = 0.9  # of the fastest and of the largest acceleration, for the 
 
 
 def sample_object_motion(
-    model: HandModel,
-    obj: RigidObject,
-    duration: float,
-    config: MotionConfig | None = None,
-    *,
-    rng: np.random.Generator,
+    model: HandModel, obj: RigidObject, duration: float, *, rng: np.random.Generator
 ) -> tuple[HandMotion, BodyMotion]:
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
@@ -64,7 +59,7 @@ def sample_object_motion(
         ArgumentError: The duration is not positive.
         PoseError: This hand does not get hold of the object, or finds no valid path out of a hold.
     """
-    config = config or MotionConfig()
+    config = MotionConfig()
     if not 0.0 < duration < np.inf:
         raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
     frames = round(duration * config.rate) + 1

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.metrics import LabelCounts, macro_f1, percent
+from train.metrics import LabelCounts, macro_f1, percent, print_figures
 
 
 def _one_each(pairs):
@@ -86,3 +86,9 @@ def test_macro_f1_of_nothing_and_of_chance():
 
 def test_percent():
     assert percent(0.98765) == "98.77" and percent(float("nan")) == "-"
+
+
+def test_figures_are_printed_in_percent(capsys):
+    print_figures({"clean": {"macro_f1": 0.98765, "ghost_recall": float("nan")}}, title="Figures")
+    said = capsys.readouterr().out
+    assert "macro f1" in said and "98.77" in said and "-" in said

@@ -87,7 +87,6 @@ def try_layout(
     rig: CameraRig | str,
     labeler: Labeler,
     *,
-    work: Sequence[str] = tuple(WORK),
     count: int = CAPTURES,
     first: int = 0,
     frames: int = FRAMES,
@@ -96,13 +95,12 @@ def try_layout(
     """Label and track simulated captures of each kind of work that the glove is for.
 
     Args:
-        work: Kinds of work, of `WORK`.
         count: Captures of each kind, each of another person.
         first: Number of the first capture.
         told: Called before each capture with what it is.
     """
     found: dict[str, Trial] = {}
-    for name in work if count else ():
+    for name in WORK if count else ():
         sides = tuple(side for side in WORK[name].sides if side in layout.sides)
         if name == "one hand":
             sides = sides or layout.sides
