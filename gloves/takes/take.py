@@ -367,7 +367,9 @@ class Take:
         markers[every] = np.where(filled[every, :, None], self.pose_markers(side, every), markers[every])
         return markers
 
-    def pose_markers(self, side: Side, frames: Int[np.ndarray, "F"] | None = None) -> Float[np.ndarray, "F M 3"]:
+    def pose_markers(
+        self, side: Side, frames: Int[np.ndarray, "F"] | None = None
+    ) -> Float[np.ndarray, "F M 3"]:
         """Where a hand's pose has its markers [m], shifted by their `marker_bias`; NaN where it has no pose.
 
         Args:
