@@ -1,7 +1,7 @@
 """Calibrated confidence in the labels of a whole take: among labels told 0.9, nine of ten are right.
 
-Two logistic models weigh what a take tells of its points (`track.label_evidence`): one for points with a label,
-one for points without. Both were fitted to simulated captures by `python -m benchmarks.doubtful_frames --fit`.
+Two logistic models weigh what a take tells of its points (`track.label_evidence`): one for points with a
+label, one for points without. `python -m benchmarks.doubtful_frames --fit` fits both to simulated captures.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.takes.take import Take
-from track.label_evidence import Evidence, evidence_of
+from track.label_evidence import evidence_of
 
 _LABELED: Final = (-8.41, 0.99, 2.48, 0.40, 0.35, 1.82, 3.50, 0.49)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
@@ -20,20 +20,15 @@ _UNLABELED: Final = (-6.78, 3.09, 3.64, 4.38, 4.59, 2.52, 0.49, 1.69)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 
-def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "T N"]:
+def label_confidence(take: Take) -> Float[np.ndarray, "T N"]:
     """Probability that each label of a tracked take is right; of a point without one, that it is no marker.
 
-    A confidence of 1 stays, as those of corrected labels and of a truth. So does that of rigid bodies' points,
-    and every one of a take without poses.
-
-    Args:
-        take: The take.
-        evidence: What it tells of its points, where that is known.
+    Confidences of rigid bodies' points stay, and all those of a take without poses.
     """
     confidence = take.confidence.copy()
     if not np.isfinite(take.qpos).any():
         return confidence
-    told = evidence_of(take) if evidence is None else evidence
+    told = evidence_of(take)
     labeled = told.labels >= 0
     right = np.zeros(len(labeled))
     for which, values, weights in (
@@ -41,6 +36,5 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
         (~labeled, told.unlabeled, _UNLABELED),
     ):
         right[which] = 1.0 / (1.0 + np.exp(weights[0] + values @ np.array(weights[1:])))
-    known = confidence[told.frames, told.columns] == 1.0
-    confidence[told.frames, told.columns] = np.where(known, 1.0, right)
+    confidence[told.frames, told.columns] = right
     return confidence

@@ -110,7 +110,8 @@ def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
     usual[~known] = np.median(usual[known]) if known.any() else _LEAST_RESIDUAL
-    return np.maximum(usual, _LEAST_RESIDUAL)
+    bounded: NDArray[np.float64] = np.maximum(usual, _LEAST_RESIDUAL)
+    return bounded
 
 
 def _lives(

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
@@ -23,6 +24,7 @@ _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # share of the points that are elsewhere, from which on it is told
 _AT_HAND: Final = 0.04  # [m] from the markers of a hand
 _CERTAIN: Final = 0.6  # confidence in every point of a frame that needs no look
+_AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
 _APART: Final = 0.25  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 
@@ -155,20 +157,20 @@ def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
 
 
 def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
-    """Spans in which a label is probably wrong, or a marker without one; the most frames that are wrong first.
+    """Spans in which a label is probably wrong or missing; those with the most such frames first.
 
     Args:
         take: A tracked take; of a truth there is nothing to doubt.
         most: The largest number of spans; all when None.
     """
-    evidence = evidence_of(take) if np.isfinite(take.qpos).any() else None
-    confidence = label_confidence(take, evidence)
-    markers = take.labels.astype(np.int64)
-    if evidence is not None:
+    confidence, markers = _confidence(take), take.labels.astype(np.int64)
+    if (confidence < _CERTAIN).any() and np.isfinite(take.qpos).any():
+        evidence = evidence_of(take)
         markers[evidence.frames, evidence.columns] = evidence.markers
     least = np.fmin.reduce(confidence, axis=1, initial=1.0)
     found: list[tuple[float, Doubt]] = []
-    for first, last in _joined(runs_of(least < _CERTAIN), _APART * take.rate):
+    around, apart = round(_AROUND * take.rate), _APART * take.rate
+    for first, last in _joined(runs_of(minimum_filter1d(least, 2 * around + 1) < _CERTAIN), apart):
         worst = first + int(least[first : last + 1].argmin())
         column = int(np.nanargmin(confidence[worst]))
         of, why = _words(take, worst, column, int(markers[worst, column]))
@@ -183,13 +185,14 @@ def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, in
     joined: list[tuple[int, int]] = []
     for first, last in runs:
         if joined and first - joined[-1][1] < apart:
-            first = joined.pop()[0]
-        joined.append((first, last))
+            joined[-1] = joined[-1][0], last
+        else:
+            joined.append((first, last))
     return joined
 
 
 def _words(take: Take, frame: int, column: int, marker: int) -> tuple[str, str]:
-    """Of what a doubt is, and why: of a label, of a marker that may be a point without one, or of its hand."""
+    """Of what a doubt is, and why: of a label, of a marker whose point may lack it, or of its hand."""
     if marker < 0:
         return "a point", "without a label"
     if take.labels[frame, column] >= 0:
@@ -203,8 +206,15 @@ def _words(take: Take, frame: int, column: int, marker: int) -> tuple[str, str]:
 
 def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
     """The least confidence in a frame's points, with a label or without; NaN in frames without points."""
-    least: NDArray[np.float64] = np.fmin.reduce(label_confidence(take), axis=1, initial=np.nan)
+    least: NDArray[np.float64] = np.fmin.reduce(_confidence(take), axis=1, initial=np.nan)
     return least
+
+
+def _confidence(take: Take) -> Float[np.ndarray, "T N"]:
+    """The confidence by all of the take; 1 stays, as that of corrected labels and of a truth."""
+    if (take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all():
+        return take.confidence
+    return np.where(take.confidence == 1.0, 1.0, label_confidence(take))
 
 
 def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
