@@ -14,9 +14,9 @@ from jaxtyping import Float
 from gloves.takes.take import Take
 from track.label_evidence import evidence_of
 
-_LABELED: Final = (-8.41, 0.99, 2.48, 0.40, 0.35, 1.82, 3.50, 0.49)
+_LABELED: Final = (-8.74, 0.90, 3.20, 0.66, 0.17, 1.98, 3.98, 0.44)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
-_UNLABELED: Final = (-6.78, 3.09, 3.64, 4.38, 4.59, 2.52, 0.49, 1.69)
+_UNLABELED: Final = (-7.61, 4.15, 7.06, 2.56, 6.08, 2.40, 0.81, 2.06)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 

@@ -44,7 +44,7 @@ _EXCHANGE: Final = 0.005  # [m] that points jump at least whose IDs were exchang
 _BESIDE: Final = 0.1  # [m] within which points are those of one hand
 _SHORT: Final = 20.0  # frames of a life that tells nothing by being short
 _FAR: Final = 1.0  # [m] in the place of what is not there
-_MOST_OFF: Final = 12.0  # usual residuals; more tells no more
+_MOST_OFF: Final = 100.0  # usual residuals; more tells no more
 
 
 class Evidence(NamedTuple):

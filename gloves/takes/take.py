@@ -119,7 +119,7 @@ class Take:
     labels: Int[np.ndarray, "T N"]
     """Label of each point."""
     confidence: Float[np.ndarray, "T N"]
-    """Probability of each label, 0 to 1; NaN where there is no point."""
+    """Probability that each label is right, or that a point without one is no marker; NaN without a point."""
     bodies: tuple[RigidBody, ...]
     """The rigid bodies."""
     body_poses: Float[np.ndarray, "T B 7"]
