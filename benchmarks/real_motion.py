@@ -30,7 +30,6 @@ import torch
 
 from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.captures.capture import Capture
 from gloves.layout import load_layout
 from track.capture_labeling import label_capture
 from track.hand_size import fit_size, sample_frames
@@ -84,22 +83,21 @@ def print_row(name: str, values: object, rest: str = "") -> None:
 
 def label(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The same for `handsim label`; the computing time is the mean one, the size measured included."""
-    names = tuple(f"*{column}" for column in range(scene.points.shape[1]))
     start = perf_counter()
-    take = label_capture(Capture(names, scene.points, scene.rate), load_layout("dense19"))
+    take = label_capture(scene.capture(), load_layout("dense19"))
     seconds = np.full(len(scene.points), (perf_counter() - start) / len(scene.points))
-    right = ((take.labels == _truth(scene)) | ~np.isfinite(scene.points[..., 0])).all(axis=1)
+    right = ((take.labels == true_labels(scene)) | ~np.isfinite(scene.points[..., 0])).all(axis=1)
     return right[scene.counted], seconds
 
 
-def _truth(scene: Scene) -> np.ndarray:
+def true_labels(scene: Scene) -> np.ndarray:
     """Marker of each column, -1 for a ghost."""
     columns = np.arange(scene.points.shape[1])
     return np.where(columns < 2 * len(NAMES), columns, -1)
 
 
-def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Which counted frames are right, and the computing time of each frame [s]."""
+def tracker_of(scene: Scene) -> tuple[list[StreamedFrame], Tracker]:
+    """The frames of a scene, and a tracker of its hands, whose size is measured."""
     seen = np.isfinite(scene.points[..., 0])
     frames = [
         StreamedFrame(t, t / scene.rate, scene.points[t, seen[t]], scene.ids[t, seen[t]])
@@ -108,8 +106,14 @@ def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     layout, labeler = load_layout("dense19"), load_labeler("dense19")
     size = fit_size(sample_frames(frames), layout, SIDES, labeler)
     assert size is not None
-    tracker = Tracker(size.hands(SIDES), labeler)
-    truth = _truth(scene)
+    return frames, Tracker(size.hands(SIDES), labeler)
+
+
+def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Which counted frames are right, and the computing time of each frame [s]."""
+    seen = np.isfinite(scene.points[..., 0])
+    frames, tracker = tracker_of(scene)
+    truth = true_labels(scene)
     right, seconds = np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
     for t, frame in enumerate(frames):
         start = perf_counter()

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
+from gloves.captures.capture import Capture
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 
@@ -34,6 +35,10 @@ class Scene(NamedTuple):
     """(T,) whether the hands are there."""
     rate: float
     """[Hz]"""
+
+    def capture(self) -> Capture:
+        """The points without labels; the IDs of a capture are its columns' runs."""
+        return Capture(tuple(f"*{column}" for column in range(self.points.shape[1])), self.points, self.rate)
 
 
 def make_scene(folder: Path, condition: str, *, seed: int, frames: int = 0) -> Scene:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from track.association.initialization import MOST_POINTS
 from track.association.point_groups import distances_to_nearest
-from track.association.single_frames import FrameLabels
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedHand
 from track.tracker import Tracker
@@ -31,6 +30,19 @@ _MOST: Final = 0.5  # share of the points with two labels, whose hands are diffe
 _MAJORITY: Final = 2.0 / 3.0  # of the confidence in a label that one of three witnesses denies
 
 
+class BothWays(NamedTuple):
+    """Labels of frames, and what they were found with."""
+
+    labels: list[Int[np.ndarray, "N"]]
+    """Marker of each point of each frame, counted through the hands in their order; -1 for none."""
+    agreed: list[Bool[np.ndarray, "N"]]
+    """Whether the directions give it the same label."""
+    qpos: Float[np.ndarray, "T H 27"]
+    """The poses of the direction that fits better; NaN where both have lost a hand."""
+    rms: Float[np.ndarray, "T H"]
+    """3D RMS distance of the labeled markers from these poses' [m]; NaN without a fit."""
+
+
 class _Tracked(NamedTuple):
     """What the tracker made of a frame in one direction."""
 
@@ -40,6 +52,10 @@ class _Tracked(NamedTuple):
     """Confidence in each label, 0 to 1."""
     markers: Float[np.ndarray, "H M 3"]
     """Every hand's markers [m]; NaN where it is lost."""
+    qpos: Float[np.ndarray, "H 27"]
+    """Every hand's pose; NaN where it is lost."""
+    rms: Float[np.ndarray, "H"]
+    """3D RMS distance of its labeled markers from the pose's [m]; NaN without a fit."""
     evidence: float
     """Of all hands together: log-odds of their labeled points, by their distances from the poses."""
 
@@ -49,7 +65,7 @@ def label_both_ways(
     user: User,
     labeler: Labeler,
     told: Callable[[int], None] = lambda count: None,
-) -> list[FrameLabels]:
+) -> BothWays:
     """Label frames that follow from each other.
 
     Args:
@@ -66,18 +82,16 @@ def label_both_ways(
             backward[run] = forward[run]
         else:
             forward[run] = backward[run]
-    found = [FrameLabels(one.labels, one.confidence) for one in forward]
-    different = [
-        number
-        for number, (one, other) in enumerate(zip(forward, backward, strict=True))
-        if (one.labels != other.labels).any()
-    ]
+    agreed = [one.labels == other.labels for one, other in zip(forward, backward, strict=True)]
+    different = [number for number, same in enumerate(agreed) if not same.all()]
     points = [frames[number].points for number in different]
     directions = [(forward[number], backward[number]) for number in different]
     third = _ask(points, directions, user, labeler)
+    labels = [one.labels for one in forward]
     for number, (one, other), witness in zip(different, directions, third, strict=True):
-        found[number] = _decide(one, other, witness)
-    return found
+        labels[number] = _decide(one, other, witness)
+    poses = [_poses(*pair) for pair in zip(forward, backward, strict=True)]
+    return BothWays(labels, agreed, *map(np.array, zip(*poses, strict=True)))
 
 
 def _track(
@@ -88,7 +102,9 @@ def _track(
     for frame in frames:
         one = tracker.step(frame.points, frame.ids, frame.time)
         markers = np.stack([hand.markers for hand in one.hands])
-        tracked.append(_Tracked(one.labels, one.confidence, markers, sum(map(_evidence, one.hands))))
+        qpos, rms = np.array([hand.qpos for hand in one.hands]), np.array([hand.rms for hand in one.hands])
+        evidence = sum(map(_evidence, one.hands))
+        tracked.append(_Tracked(one.labels, one.confidence, markers, qpos, rms, evidence))
         told(len(tracked))
     return tracked
 
@@ -98,6 +114,14 @@ def _evidence(hand: TrackedHand) -> float:
     if not np.isfinite(hand.rms):
         return 0.0
     return (len(hand.markers) - len(hand.filled)) * (_WORTH - 0.5 * (hand.rms / _SPREAD) ** 2)
+
+
+def _poses(one: _Tracked, other: _Tracked) -> tuple[Float[np.ndarray, "H 27"], Float[np.ndarray, "H"]]:
+    """The poses of the direction with more evidence, and their RMS; the other one's of hands that it lost."""
+    first, second = (one, other) if one.evidence >= other.evidence else (other, one)
+    lost = np.isnan(first.qpos[:, 0])
+    qpos: NDArray[np.float64] = np.where(lost[:, None], second.qpos, first.qpos)
+    return qpos, np.where(lost, second.rms, first.rms)
 
 
 def _exchanges(
@@ -152,7 +176,7 @@ def _cloud(
     return np.flatnonzero(own & ~others)
 
 
-def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> FrameLabels:
+def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
     """The label that two of three witnesses give each point, else that of the more confident direction.
 
     A direction without a label has no confidence, so that a label that nobody denies stays; and one that has
@@ -166,7 +190,7 @@ def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> Fr
     second = (second & ~first_stays) | second_stays
     labels = np.where(second, other.labels, one.labels)
     confidence = np.where(same, one.confidence, _MAJORITY * np.where(second, other_sure, sure))
-    return FrameLabels(_without_doubles(labels, confidence), confidence)
+    return _without_doubles(labels, confidence)
 
 
 def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:

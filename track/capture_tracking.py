@@ -21,6 +21,7 @@ from track.config import BOTH, Size, TrackerConfig
 from track.corrected_take import correct_take
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_size import sample_frames
+from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.setup import AnyHands, TrackerSetup, as_designed
 from track.sinks.addresses import SinkGroup
@@ -92,7 +93,8 @@ def track_capture(
     recorder = _record(frames, setup.tracker(), sinks, on_frame, progress)
     take = recorder.take(source)
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
-    take = dataclasses.replace(take, settings={**take.settings, **settings, **setup.settings})
+    settings = {**take.settings, **settings, **setup.settings}
+    take = dataclasses.replace(take, confidence=label_confidence(take), settings=settings)
     return take if corrections is None else _corrected(take, Path(corrections), pins)
 
 

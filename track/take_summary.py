@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
 from track.association.point_groups import distances_to_nearest
+from track.label_confidence import label_confidence
+from track.label_evidence import evidence_of
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
@@ -19,7 +23,9 @@ _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # share of the points that are elsewhere, from which on it is told
 _AT_HAND: Final = 0.04  # [m] from the markers of a hand
-_CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
+_CERTAIN: Final = 0.6  # confidence in every point of a frame that needs no look
+_AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
+_APART: Final = 0.25  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 
 
@@ -151,44 +157,64 @@ def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
 
 
 def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
-    """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
-
-    A hand that has not been seen yet is not lost.
+    """Spans in which a label is probably wrong or missing; those with the most such frames first.
 
     Args:
         take: A tracked take; of a truth there is nothing to doubt.
         most: The largest number of spans; all when None.
     """
-    found: list[tuple[float, int, Doubt]] = []
-    for number, side in enumerate(take.sides):
-        status = take.status[:, number]
-        known = np.logical_or.accumulate(status != LOST)
-        for first, last in runs_of(known & ((status == LOST) | (status == COASTING))):
-            state = LOST if (status[first : last + 1] == LOST).any() else COASTING
-            found.append((0.0, last - first, Doubt(first, last, first, side, STATUSES[state])))
-    sure = np.where(take.labels >= 0, take.confidence, 1.0)
-    least = sure.min(axis=1, initial=1.0)
-    for first, last in runs_of(least < _CERTAIN):
+    confidence, markers = _confidence(take), take.labels.astype(np.int64)
+    if (confidence < _CERTAIN).any() and np.isfinite(take.qpos).any():
+        evidence = evidence_of(take)
+        markers[evidence.frames, evidence.columns] = evidence.markers
+    least = np.fmin.reduce(confidence, axis=1, initial=1.0)
+    found: list[tuple[float, Doubt]] = []
+    around, apart = round(_AROUND * take.rate), _APART * take.rate
+    for first, last in _joined(runs_of(minimum_filter1d(least, 2 * around + 1) < _CERTAIN), apart):
         worst = first + int(least[first : last + 1].argmin())
-        label = take.label_names[take.labels[worst, sure[worst].argmin()]]
-        doubt = Doubt(first, last, worst, label, f"{100 * least[worst]:.0f} %")
-        found.append((float(least[worst]), last - first, doubt))
-    found.sort(key=lambda entry: (entry[0], -entry[1], entry[2].first))
-    return tuple(doubt for *_, doubt in found[:most])
+        column = int(np.nanargmin(confidence[worst]))
+        of, why = _words(take, worst, column, int(markers[worst, column]))
+        why += f", {100 * least[worst]:.0f} %"
+        found.append((float((1.0 - least[first : last + 1]).sum()), Doubt(first, last, worst, of, why)))
+    found.sort(key=lambda entry: (-entry[0], entry[1].first))
+    return tuple(doubt for _, doubt in found[:most])
+
+
+def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, int]]:
+    """Runs of frames, those that are less than `apart` frames from each other as one."""
+    joined: list[tuple[int, int]] = []
+    for first, last in runs:
+        if joined and first - joined[-1][1] < apart:
+            joined[-1] = joined[-1][0], last
+        else:
+            joined.append((first, last))
+    return joined
+
+
+def _words(take: Take, frame: int, column: int, marker: int) -> tuple[str, str]:
+    """Of what a doubt is, and why: of a label, of a marker whose point may lack it, or of its hand."""
+    if marker < 0:
+        return "a point", "without a label"
+    if take.labels[frame, column] >= 0:
+        return take.label_names[marker], "labeled"
+    hand = next(number for number, part in enumerate(take.hand_labels) if marker in part)
+    status = take.status[frame, hand]
+    if status in (LOST, COASTING):
+        return take.sides[hand], STATUSES[status]
+    return take.label_names[marker], "without a label"
 
 
 def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
-    """The least confidence of a frame's labels; 0 where a hand is coasting or has just been lost.
-
-    NaN in frames without labels.
-    """
-    labeled = take.labels >= 0
-    least: NDArray[np.float64] = np.where(labeled, take.confidence, np.inf).min(axis=1, initial=np.inf)
-    least[np.isinf(least)] = np.nan
-    lost = take.status == LOST
-    just_lost = lost & ~np.concatenate([np.ones_like(lost[:1]), lost[:-1]])
-    least[((take.status == COASTING) | just_lost).any(axis=1)] = 0.0
+    """The least confidence in a frame's points, with a label or without; NaN in frames without points."""
+    least: NDArray[np.float64] = np.fmin.reduce(_confidence(take), axis=1, initial=np.nan)
     return least
+
+
+def _confidence(take: Take) -> Float[np.ndarray, "T N"]:
+    """The confidence by all of the take; 1 stays, as that of corrected labels and of a truth."""
+    if (take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all():
+        return take.confidence
+    return np.where(take.confidence == 1.0, 1.0, label_confidence(take))
 
 
 def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:

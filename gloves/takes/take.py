@@ -119,7 +119,7 @@ class Take:
     labels: Int[np.ndarray, "T N"]
     """Label of each point."""
     confidence: Float[np.ndarray, "T N"]
-    """Probability of each label, 0 to 1; NaN where there is no point."""
+    """Probability that each label is right, or that a point without one is no marker; NaN without a point."""
     bodies: tuple[RigidBody, ...]
     """The rigid bodies."""
     body_poses: Float[np.ndarray, "T B 7"]
@@ -360,16 +360,36 @@ class Take:
             ArgumentError: The hand is not in the take.
         """
         number, markers = self.hand(side), self.observed(side)
-        worn, there = self.hands[number], self.status[:, number] != LOST
+        there = self.status[:, number] != LOST
         filled = np.isnan(markers[..., 0])
         markers[~there] = np.nan
-        every, bias = np.flatnonzero(there & filled.any(axis=1)), self.marker_bias(side)
-        for first in range(0, len(every), _CHUNK):
-            frames = every[first : first + _CHUNK]
-            bones = worn.model.forward_kinematics(self.qpos[frames, number])
+        every = np.flatnonzero(there & filled.any(axis=1))
+        markers[every] = np.where(filled[every, :, None], self.pose_markers(side, every), markers[every])
+        return markers
+
+    def pose_markers(
+        self, side: Side, frames: Int[np.ndarray, "F"] | None = None
+    ) -> Float[np.ndarray, "F M 3"]:
+        """Where a hand's pose has its markers [m], shifted by their `marker_bias`; NaN where it has no pose.
+
+        Args:
+            side: The hand.
+            frames: The frames; all when None.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        number, bias = self.hand(side), self.marker_bias(side)
+        worn, qpos = self.hands[number], self.qpos[:, number]
+        qpos = qpos if frames is None else qpos[frames]
+        markers = np.full((len(qpos), worn.layout.num_markers, 3), np.nan)
+        there = np.flatnonzero(np.isfinite(qpos[:, 0]))
+        for first in range(0, len(there), _CHUNK):
+            some = there[first : first + _CHUNK]
+            bones = worn.model.forward_kinematics(qpos[some])
             rotations = bones[:, worn.attachment.main_bones, :3, :3]
-            expected = worn.attachment.centers(worn.model, bones) - np.einsum("tmij,mj->tmi", rotations, bias)
-            markers[frames] = np.where(filled[frames, :, None], expected, markers[frames])
+            shifts = np.einsum("tmij,mj->tmi", rotations, bias)
+            markers[some] = worn.attachment.centers(worn.model, bones) - shifts
         return markers
 
     def marker_bias(self, side: Side) -> Float[np.ndarray, "M 3"]:

@@ -9,7 +9,7 @@ from track.both_directions import _exchanges, _Tracked
 
 def tracked(labels):
     row = np.array(labels)
-    return _Tracked(row, np.ones(len(row)), np.zeros((2, 5, 3)), 0.0)
+    return _Tracked(row, np.ones(len(row)), np.zeros((2, 5, 3)), np.zeros((2, 27)), np.zeros(2), 0.0)
 
 
 def test_runs_of_exchanged_hands_are_found():

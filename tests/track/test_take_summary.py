@@ -9,7 +9,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.takes.take import COASTING, LOST, TRACKED, Take
+from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.take_summary import doubts_of, frame_confidence, runs_of, summarize, suspicions
@@ -102,29 +102,40 @@ def test_a_truth_is_summed_up_without_residuals(truth):
     assert "never found" not in " ".join(told) and "RMS" not in " ".join(told)
 
 
-def test_doubtful_frames_are_the_worst_of_their_runs(tracked):
+def test_doubtful_frames_are_listed_by_the_stored_confidence_where_there_are_no_poses(tracked):
     assert runs_of(np.array([True, False, False, True, True])) == [(0, 0), (3, 4)]
     assert runs_of(np.zeros(3, dtype=bool)) == [] == runs_of(np.zeros(0, dtype=bool))
-    status = np.full(tracked.status.shape, TRACKED, dtype=np.int8)
-    status[10, 0], status[12:14, 1], status[-5:, 1], status[0, 1] = COASTING, COASTING, LOST, LOST
     confidence = np.where(np.isfinite(tracked.points[..., 0]), 0.99, np.nan)
-    columns = np.flatnonzero((tracked.labels[4:7] >= 0).all(axis=0) & (tracked.labels[20] >= 0))[:2]
-    confidence[4:7, columns[0]], confidence[5, columns[1]], confidence[20, columns[0]] = 0.8, 0.7, 0.4
-    qpos = np.where((status == LOST)[..., None], np.nan, tracked.qpos)
-    take = dataclasses.replace(tracked, status=status, qpos=qpos, confidence=confidence)
+    columns = np.flatnonzero((tracked.labels[4:7] >= 0).all(axis=0) & (tracked.labels[28] >= 0))[:2]
+    confidence[4:7, columns[0]], confidence[5, columns[1]], confidence[28, columns[0]] = 0.5, 0.3, 0.1
+    confidence[11, columns[0]], confidence[34, columns[0]] = 0.55, 0.65
+    take = dataclasses.replace(
+        tracked,
+        rate=40.0,  # a frame around, and spans of less than ten frames from each other are one
+        status=np.full(tracked.status.shape, LOST, dtype=np.int8),
+        qpos=np.full(tracked.qpos.shape, np.nan),
+        confidence=confidence,
+    )
     doubts = doubts_of(take)
-    assert [doubt[:3] for doubt in doubts] == [
-        (35, 39, 35), (12, 13, 12), (10, 10, 10), (20, 20, 20), (4, 6, 5)
-    ], "the longest loss first; not there yet is not lost"  # fmt: skip
-    first, second = take.sides
-    worst = take.label_names[take.labels[5, columns[1]]]
-    assert [doubt.words for doubt in doubts[:3]] == [
-        f"{second} lost",
-        f"{second} coasting",
-        f"{first} coasting",
-    ]
-    assert (doubts[4].of, doubts[4].why, doubts[4].words) == (worst, "70 %", f"{worst} 70 %")
-    assert doubts_of(take, most=2) == doubts[:2]
-    certain = frame_confidence(take)
-    assert certain[10] == certain[35] == 0.0 and certain[20] == 0.4
-    assert (certain[36:] == 0.99).all(), "lost for long is no news"
+    assert [doubt[:3] for doubt in doubts] == [(3, 12, 5), (27, 29, 28)], "more of the first is wrong"
+    assert doubts[0].words == f"{take.label_names[take.labels[5, columns[1]]]} labeled, 30 %"
+    assert doubts_of(take, most=1) == doubts[:1]
+    assert frame_confidence(take)[[5, 28, 34, 35]].tolist() == [0.3, 0.1, 0.65, 0.99]
+
+
+def test_doubtful_frames_of_a_tracked_take(tracked):
+    assert doubts_of(tracked) == (), "nothing is wrong"
+    column = int(np.flatnonzero((tracked.labels[10:20] == 3).all(axis=0))[0])
+    labels, status, qpos = tracked.labels.copy(), tracked.status.copy(), tracked.qpos.copy()
+    labels[10:16, column] = -1
+    (missed,) = doubts_of(dataclasses.replace(tracked, labels=labels))
+    assert missed.first <= 10 and missed.last >= 15 and 10 <= missed.worst <= 15
+    assert missed.words.startswith(f"{tracked.label_names[3]} without a label, ")
+    labels = np.where(
+        np.arange(FRAMES)[:, None] < 20, tracked.labels, np.where(tracked.labels < 19, -1, tracked.labels)
+    )
+    status[20:, 0], qpos[20:, 0] = LOST, np.nan
+    (lost,) = doubts_of(dataclasses.replace(tracked, labels=labels, status=status, qpos=qpos))
+    assert lost.first >= 15 and lost.last == FRAMES - 1
+    known = np.where(np.isfinite(tracked.points[..., 0]), 1.0, np.nan)
+    assert doubts_of(dataclasses.replace(tracked, labels=labels, confidence=known)) == (), "it was corrected"

@@ -194,7 +194,7 @@ def _residuals_section(take: Take, hand: HandFigures) -> Section:
 def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section:
     command = f"handsim view {shlex.quote(source)}"
     if not doubts:
-        return Section("Doubtful frames", "No hand is lost or coasts, and every label is sure.")
+        return Section("Doubtful frames", "No label is probably wrong or missing.")
     table = [["frames", "start [s]", "end [s]", "of", "why", "to look at", "in"]]
     for doubt in doubts[:_MOST_DOUBTS]:
         frames = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first} to {doubt.last}"
@@ -202,11 +202,12 @@ def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section
         look = f"frame {doubt.worst}, {worst} s"
         table.append([frames, start, end, doubt.of, doubt.why, look, f"{command} --time {worst}"])
     text = (
-        "Frames in which a hand is lost or coasts, the longest first, then labels of little confidence, "
-        f"which is given. <code>{escape(command)}</code> lists the worst of them too; a click leads there, "
+        "Spans in which a label is probably wrong or a marker lacks its own, those with the most such frames "
+        "first; the percentage is the least confidence in a point. "
+        f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
         "and a wrong label can be corrected."
     )
-    more = f"These are the worst {_MOST_DOUBTS} of {len(doubts):,}; the table beside the page has all."
+    more = f"These are the first {_MOST_DOUBTS} of {len(doubts):,}; the table beside the page has all."
     notes = [more] if len(doubts) > _MOST_DOUBTS else []
     return Section("Doubtful frames", text, table=table, notes=notes)
 

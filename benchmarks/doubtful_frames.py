@@ -1,0 +1,141 @@
+"""Whether the list of doubtful frames is right, and the confidence in labels, on captures with errors.
+
+python -m benchmarks.doubtful_frames [--gloves dense19 sparse13] [--seeds 300 301] [--label] [--fit]
+    [--real DATA]
+
+A person's capture of each kind is tracked (--label: labeled) without calibration. By turns of the seed there
+are foreign markers; many gaps, and markers that exchange trajectories; gaps and foreign markers; noise. A run
+of errors is consecutive frames, gaps of 5 bridged, in which a marker lacks its label, has another one, or a
+point that is none has it; where half of a hand is wrong, it is the hand's. --real takes real hands in motion
+instead, see `real_motion`. --fit prints the coefficients of `track.label_confidence`, fitted to the captures;
+those in use are of seeds 101 to 113, which test nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_closing
+
+from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
+from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.takes.take import Take
+from track.capture_labeling import label_capture
+from track.capture_tracking import track_capture
+from track.label_evidence import evidence_of
+from track.take_summary import doubts_of, frame_confidence, runs_of
+from train.evaluation.metrics import expected_calibration_error
+
+GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")
+WHAT = (
+    "runs of errors covered, spans with an error [%] | spans a minute | frames listed [%] | calibration "
+    "error [%]: labels, points without one, frames"
+)
+
+
+def simulated_takes(options: argparse.Namespace) -> Iterator[tuple[str, Take, np.ndarray]]:
+    """What each take is, the take and the true labels."""
+    make = label_capture if options.label else track_capture
+    for glove, seed, kind in product(options.gloves, options.seeds, KINDS):
+        truth = simulate(glove, kind, seed, options.frames)
+        yield f"{glove} {kind}", make(truth, glove), truth.labels
+
+
+def error_runs(take: Take, truth: np.ndarray) -> list[tuple[int, int]]:
+    """First and last frame of each run of errors."""
+    wrong, part = take.labels != truth, take.hands[0].layout.num_markers
+    hands, runs = np.where(truth >= 0, truth // part, -1), []
+    for hand in range(len(take.hands)):
+        seen, bad = (hands == hand).sum(axis=1), (wrong & (hands == hand)).sum(axis=1)
+        whole = (seen >= 3) & (2 * bad >= seen)
+        runs.append(whole)
+        wrong &= ~whole[:, None] | (hands != hand)
+    missed, marker = take.labels < 0, truth >= 0
+    for kind, keys in ((~missed & marker, truth), (missed, truth), (~marker, take.labels)):
+        runs += [(wrong & kind & (keys == key)).any(axis=1) for key in np.unique(keys[wrong & kind])]
+    closed = [binary_closing(np.pad(one, 6), np.ones(6))[6:-6] | one for one in runs]
+    return [run for one in closed for run in runs_of(one)]
+
+
+def score(take: Take, truth: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Runs, those covered, spans, those with an error, seconds and seconds listed; pairs for calibration."""
+    spans, runs = doubts_of(take, None), error_runs(take, truth)
+    there = np.isfinite(take.points[..., 0])
+    right, listed = (take.labels == truth) | ~there, np.zeros(take.num_frames, dtype=bool)
+    for span in spans:
+        listed[span.first : span.last + 1] = True
+    covered = sum(listed[first : last + 1].any() for first, last in runs)
+    good = sum(not right[span.first : span.last + 1].all() for span in spans)
+    counts = [len(runs), covered, len(spans), good, take.num_frames / take.rate, listed.sum() / take.rate]
+    parts = [there & (take.labels >= 0), there & (take.labels < 0)]
+    pairs = [np.stack([take.confidence[part], right[part]]) for part in parts]
+    certain = frame_confidence(take)
+    known = np.isfinite(certain)
+    return np.array(counts), [*pairs, np.stack([certain[known], right.all(axis=1)[known]])]
+
+
+def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
+    """`WHAT` of some captures."""
+    runs, covered, spans, good, seconds, listed = counts
+    shares = [100.0 * covered / max(runs, 1), 100.0 * good / max(spans, 1)]
+    errors = [100.0 * expected_calibration_error(one[0], one[1] > 0.5) for one in pairs]
+    return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
+
+
+def fit(values: np.ndarray, wrong: np.ndarray, ridge: float = 10.0) -> np.ndarray:
+    """Coefficients of a logistic model, the constant first, by Newton's method."""
+    columns = np.column_stack([np.ones(len(values)), values])
+    weights, prior = np.zeros(columns.shape[1]), ridge * np.diag([0.0] + [1.0] * values.shape[1])
+    for _ in range(30):
+        chance = 1.0 / (1.0 + np.exp(-columns @ weights))
+        gradient = columns.T @ (wrong - chance) - prior @ weights
+        weights += np.linalg.solve((columns.T * (chance * (1.0 - chance))) @ columns + prior, gradient)
+    return weights
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gloves", nargs="+", default=GLOVES)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[300, 301, 302, 303])
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--label", action="store_true")
+    parser.add_argument("--real", type=Path)
+    parser.add_argument("--fit", action="store_true")
+    add_save(parser)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print(describe("numba", "torch"), WHAT, sep="\n")
+    table: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {}
+    told: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    takes = real_takes(options.real, options.frames) if options.real else simulated_takes(options)
+    for name, take, truth in takes:
+        for key in (*name.split(), "all"):
+            table.setdefault(key, []).append(score(take, truth))
+        if options.fit:
+            evidence = evidence_of(take)
+            wrong = evidence.labels != truth[evidence.frames, evidence.columns]
+            labeled = evidence.labels >= 0
+            told.append((evidence.labeled, wrong[labeled], evidence.unlabeled, wrong[~labeled]))
+    figures: Figures = {}
+    for key, scores in table.items():
+        counts, pairs = zip(*scores, strict=True)
+        values = row(
+            np.sum(counts, axis=0), [np.concatenate(some, axis=1) for some in zip(*pairs, strict=True)]
+        )
+        print(f"{key:16s} | " + " | ".join(f"{value:6.1f}" for value in values), flush=True)
+        figures[key] = f"{WHAT}; {key}", values
+    save_figures(options.save, figures)
+    if told:
+        values, wrong, others, missing = map(np.concatenate, zip(*told, strict=True))
+        print("_LABELED", fit(values, wrong).round(2), "\n_UNLABELED", fit(others, missing).round(2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Confidence in labels by all of a take: errors that are put into a tracked take are told."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.takes.take import LOST, Take
+from track.capture_tracking import track_capture
+from track.label_confidence import label_confidence
+from track.label_evidence import evidence_of
+from train.simulation.takes import simulate_take
+
+FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def tracked() -> Take:
+    truth = simulate_take(kind="single-hand", num_frames=FRAMES, seed=1)
+    take = track_capture(truth, hands=truth.hands, labeler="dense19")
+    assert (take.labels == truth.labels).mean() > 0.999
+    return take
+
+
+def column_of(take: Take, first: int, last: int, name: str = "right:IndexTip") -> int:
+    """The column that has a label through a span."""
+    label = take.label_names.index(name)
+    return int(np.flatnonzero((take.labels[first : last + 1] == label).all(axis=0))[0])
+
+
+def relabeled(take: Take, first: int, last: int, column: int, label: int) -> Take:
+    labels = take.labels.copy()
+    labels[first : last + 1, column] = label
+    return dataclasses.replace(take, labels=labels)
+
+
+def test_right_labels_are_sure(tracked):
+    assert np.nanmedian(tracked.confidence) > 0.99, "a tracked capture has it already"
+    np.testing.assert_allclose(label_confidence(tracked), tracked.confidence)
+
+
+def test_a_marker_that_loses_its_label_for_some_frames(tracked):
+    column = column_of(tracked, 40, 80)
+    confidence = label_confidence(relabeled(tracked, 50, 65, column, -1))
+    assert (confidence[50:66, column] < 0.5).all() and (confidence[40:48, column] > 0.8).all()
+
+
+def test_markers_that_exchange_their_labels_for_some_frames(tracked):
+    one, other = (column_of(tracked, 40, 80, f"right:{name}") for name in ("IndexTip", "MiddleTip"))
+    labels = tracked.labels.copy()
+    labels[50:56, [one, other]] = labels[50:56, [other, one]]
+    confidence = label_confidence(dataclasses.replace(tracked, labels=labels))
+    assert confidence[50:56, [one, other]].max() < min(0.96, np.nanquantile(confidence, 0.01))
+
+
+def test_lives_go_on_where_ids_do_not_last_or_are_exchanged(tracked):
+    there = tracked.ids >= 0
+    fresh = np.where(there, np.cumsum(there).reshape(there.shape), -1)
+    column = column_of(tracked, 40, 80)
+    wrong = relabeled(dataclasses.replace(tracked, ids=fresh), 50, 52, column, -1)
+    assert (label_confidence(wrong)[50:53, column] < 0.5).all()
+
+
+def test_a_lost_hand_whose_points_are_there(tracked):
+    status, labels, qpos = tracked.status.copy(), tracked.labels.copy(), tracked.qpos.copy()
+    status[60:80, 0], qpos[60:80, 0] = LOST, np.nan
+    own = (labels[60:80] >= 0) & (labels[60:80] < 19)
+    labels[60:80][own] = -1
+    take = dataclasses.replace(tracked, status=status, labels=labels, qpos=qpos)
+    assert np.median(label_confidence(take)[60:80][own]) < 0.5
+
+
+def test_a_foreign_marker_without_a_label_is_sure(tracked):
+    far = np.full((FRAMES, 1, 3), 2.0)
+    columns = {
+        "points": np.concatenate([tracked.points, far], axis=1),
+        "ids": np.pad(tracked.ids, ((0, 0), (0, 1)), constant_values=10_000),
+        "labels": np.pad(tracked.labels, ((0, 0), (0, 1)), constant_values=-1),
+        "confidence": np.pad(tracked.confidence, ((0, 0), (0, 1)), constant_values=0.5),
+    }
+    assert (label_confidence(dataclasses.replace(tracked, **columns))[:, -1] > 0.9).all()
+
+
+def test_a_take_without_poses_keeps_its_confidence(tracked):
+    blank = np.full(tracked.qpos.shape, np.nan)
+    take = dataclasses.replace(tracked, qpos=blank, status=np.full(tracked.status.shape, LOST))
+    np.testing.assert_array_equal(label_confidence(take), take.confidence)
+
+
+def test_evidence_is_of_every_point_of_a_hand(tracked):
+    evidence = evidence_of(tracked)
+    assert len(evidence.frames) == np.isfinite(tracked.points[..., 0]).sum()
+    assert (evidence.labels == tracked.labels[evidence.frames, evidence.columns]).all()
+    assert np.isfinite(evidence.labeled).all() and np.isfinite(evidence.unlabeled).all()
+    assert len(evidence.labeled) == (evidence.labels >= 0).sum()
