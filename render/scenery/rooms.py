@@ -20,6 +20,8 @@ _FLOORS: Final = (0.25, 0.4, 0.35)  # likewise a floor, without stripes; ceiling
 _FLOOR: Final = 4  # number of that side
 _CONTRAST: Final = (0.15, 0.7)  # of a pattern, as a share of the difference of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
+_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] from an edge's middle
+_STEP: Final = 0.04  # of the root of light between neighbors, where four rays are cast for one
 _FRAME: Final = 0.06  # of a picture or window, as a share of its sides
 
 
@@ -71,13 +73,67 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     """
     width, height = size
     scene = _scene(seed)
-    rays = _rays(width, height, *scene.lens)
-    light = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
-    picture = light.reshape(height, width, 3)
+    down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
+    picture = _seen(scene, size, across, down).reshape(height, width, 3)
+    (edges,) = np.nonzero(_edges(picture))
+    parts = [_seen(scene, size, across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
+    picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     drawn: NDArray[np.float32] = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
     return drawn
+
+
+def _seen(
+    scene: _Scene, size: tuple[int, int], across: NDArray[np.float32], down: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Light (N, 3) at places (N,) [px] of a picture."""
+    width, height = size
+    rays = np.empty((len(across), 3), dtype=np.float32)
+    _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
+    return _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
+
+
+@kernel
+def _aim(
+    across: NDArray[np.float32],
+    down: NDArray[np.float32],
+    middle: float,
+    center: float,
+    focal: float,
+    axes: NDArray[np.float64],
+    rays: NDArray[np.float32],
+) -> None:
+    """Write the directions (N, 3) in which a camera sees places of its picture, no component 0.
+
+    Args:
+        across: Columns (N,) [px].
+        down: Rows (N,) [px].
+        middle: Column of the camera's axis [px].
+        center: Row of it [px].
+        focal: Focal length [px].
+        axes: The camera's axes in the room (3, 3), a row each: right, down, ahead.
+        rays: Written.
+    """
+    for n in range(len(rays)):
+        x, y = (across[n] - middle) / focal, (down[n] - center) / focal
+        length = np.sqrt(x * x + y * y + 1.0)
+        for axis in range(3):
+            way = (x * axes[0, axis] + y * axes[1, axis] + axes[2, axis]) / length
+            rays[n, axis] = way if abs(way) > 1e-6 else 1e-6
+
+
+def _edges(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H W,) a picture differs from its neighbors to the right or below, on both sides of that."""
+    roots = np.sqrt(picture @ np.float32([0.2, 0.6, 0.2]))
+    edges = np.zeros(roots.shape, dtype=bool)
+    right = np.abs(np.diff(roots, axis=1)) > _STEP
+    below = np.abs(np.diff(roots, axis=0)) > _STEP
+    edges[:, 1:] |= right
+    edges[:, :-1] |= right
+    edges[1:] |= below
+    edges[:-1] |= below
+    return edges.ravel()
 
 
 class _Scene(NamedTuple):
@@ -86,8 +142,10 @@ class _Scene(NamedTuple):
     room: NDArray[np.float64]
     """Far corner [m]; the other one is at the origin, z up."""
     eye: NDArray[np.float64]
-    lens: tuple[float, float, float, float]
-    """Focal length [picture heights], yaw, pitch and roll [rad]."""
+    focal: float
+    """Focal length [picture heights]."""
+    axes: NDArray[np.float64]
+    """The camera's axes (3, 3), a row each: right, down, ahead."""
     lamp: NDArray[np.float64]
     """Lamps and windows leave some parts darker than others."""
     strength: float
@@ -104,7 +162,8 @@ def _scene(seed: int) -> _Scene:
     yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls = _paint_walls(room, rng)
-    return _Scene(room, eye, (focal, yaw, pitch, roll), lamp, strength, walls, _place_boxes(room, eye, rng))
+    axes, boxes = _turned(yaw, pitch, roll), _place_boxes(room, eye, rng)
+    return _Scene(room, eye, focal, axes, lamp, strength, walls, boxes)
 
 
 def cast_room(
@@ -150,24 +209,13 @@ def _cast_all(
     return seen
 
 
-def _rays(
-    width: int, height: int, focal: float, yaw: float, pitch: float, roll: float
-) -> NDArray[np.float32]:
-    """Directions (H W, 3) of a camera that looks into the room, a little up or down and askew."""
+def _turned(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Axes (3, 3), a row each, of a camera that looks into the room, a little up or down and askew [rad]."""
     (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
     aside, upright = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0])
     level = np.array([-sy, cy, 0.0])
     ahead, down = cp * level + sp * upright, sp * level - cp * upright
-    right, below = cr * aside + sr * down, cr * down - sr * aside
-    x = ((np.arange(width) + 0.5 - width / 2) / (focal * height)).astype(np.float32)
-    y = ((np.arange(height) + 0.5 - height / 2) / (focal * height)).astype(np.float32)
-    along = y[:, None, None] * below.astype(np.float32) + ahead.astype(np.float32)
-    along = along + x[None, :, None] * right.astype(np.float32)
-    along = along.reshape(-1, 3)
-    along *= np.float32(1.0) / np.sqrt(np.einsum("ij,ij->i", along, along))[:, None]
-    along[np.abs(along) < 1e-6] = 1e-6
-    rays: NDArray[np.float32] = along
-    return rays
+    return np.stack([cr * aside + sr * down, cr * down - sr * aside, ahead])
 
 
 def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:

@@ -32,6 +32,9 @@ _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths there [hand breadths]."""
+_SQUARE: Final = 0.8
+"""Power of the cosine and sine of an arm's section: wrists are squarer than an ellipse, of power 1,"""
+_LONGER: Final = 1.04  # and longer around at the same width
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 _BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
 ELBOW: Final = _PLACES[4]
@@ -116,7 +119,8 @@ def forearm_rings(
     width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
-    round_section = np.stack([width[:, None] * np.cos(angle), depth[:, None] * np.sin(angle)], axis=-1)
+    axes_of = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
     share = _smooth(behind / (_BLEND * shape.length))[:, None, None]
     sections = (1.0 - share) * section + share * round_section
     axes, middles = _course(shape, forearm, behind)
@@ -229,6 +233,7 @@ def _half_axes(
     # Ramanujan's ellipse: its girth over its half width
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
+    around *= _LONGER
     return girth / around, flatness * girth / around
 
 
