@@ -30,7 +30,6 @@ _SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
-_OUT_OF_FOCUS: Final = ("noise", "clutter", "room")  # drawn at half of the picture's resolution
 _GAMMA: Final = 2.2
 _GRAINS: Final = (6.0, 60.0)  # of stone, cloth or wood along the height of a picture
 _GRAIN_CONTRAST: Final = (0.1, 0.5)  # share of the difference of any two colors
@@ -117,14 +116,6 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
 
 
-@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
-def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """The picture of `draw_background`, which cannot be written."""
-    picture = draw_background(background, size)
-    picture.setflags(write=False)
-    return picture
-
-
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white.
 
@@ -135,16 +126,28 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
     Raises:
         HandSimError: The kind is unknown, or the photograph cannot be read.
     """
+    return enlarged(coarse_background(background, size), size)
+
+
+def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """A picture of `coarse_background`, or values that grow with it from 0 on, at its whole size."""
+    if picture.shape[1::-1] == size:
+        return picture
+    whole: NDArray[np.float32] = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+    return np.clip(whole, 0.0, picture.max(), out=whole)
+
+
+@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
+def coarse_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
+    """The picture of `draw_background`, at half of its size unless it is a photograph; it cannot be written."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
-    drawn_size = size
-    if background.kind in _OUT_OF_FOCUS:
-        drawn_size = (max(2, size[0] // 2), max(2, size[1] // 2))
+    drawn_size = size if background.kind == "photo" else (max(2, size[0] // 2), max(2, size[1] // 2))
     width, height = drawn_size
     if background.kind == "plain":
         picture = np.broadcast_to(first, (height, width, 3)).copy()
     elif background.kind == "gradient":
-        picture = _gradient(first, second, size, rng)
+        picture = _gradient(first, second, drawn_size, rng)
     elif background.kind == "noise":
         picture = _noise(first, second, drawn_size, rng)
     elif background.kind == "clutter":
@@ -157,9 +160,8 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    if drawn_size != size:
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0, dtype=np.float32)
+    drawn.setflags(write=False)
     return drawn
 
 

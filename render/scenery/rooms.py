@@ -280,6 +280,7 @@ def _cast(
     """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
     position, color, inverse = np.empty(3), np.empty(3), np.empty(3)
     offsets = corners - eye
+    cones = _cones(offsets)
     for ray in range(len(rays)):
         distance, wall = np.inf, 0
         for axis in range(3):
@@ -288,7 +289,7 @@ def _cast(
             way = ((room[axis] if far else 0.0) - eye[axis]) * inverse[axis]
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
-        box, side, distance = _nearest_box(inverse, offsets, distance)
+        box, side, distance = _nearest_box(rays[ray], inverse, offsets, cones, distance)
         distances[ray], axes[ray] = distance, side if box >= 0 else wall // 2
         light = 0.35
         for axis in range(3):
@@ -308,16 +309,49 @@ def _cast(
 
 
 @kernel
-def _nearest_box(inverse: NDArray[np.float64], offsets: NDArray[np.float64], distance: float) -> Any:
+def _cones(offsets: NDArray[np.float64]) -> Any:
+    """Cones around boxes (B, 4): unit direction of the axis, and the cosine of half the angle.
+
+    Args:
+        offsets: Low and high corners of boxes (B, 2, 3) from the eye [m].
+    """
+    cones = np.empty((len(offsets), 4))
+    for box in range(len(offsets)):
+        axis = 0.5 * (offsets[box, 0] + offsets[box, 1])
+        axis /= np.sqrt((axis * axis).sum())
+        least = 1.0
+        for corner in range(8):
+            along, square = 0.0, 0.0
+            for i in range(3):
+                place = offsets[box, (corner >> i) & 1, i]
+                along, square = along + place * axis[i], square + place * place
+            least = min(least, along / np.sqrt(square))
+        cones[box, :3] = axis
+        cones[box, 3] = least - 1e-5 if least > 0.0 else -2.0  # wider than half of all ways is no cone
+    return cones
+
+
+@kernel
+def _nearest_box(
+    ray: NDArray[np.float32],
+    inverse: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    cones: NDArray[np.float64],
+    distance: float,
+) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
 
     Args:
-        inverse: One over the ray's unit direction (3,).
+        ray: Unit direction (3,).
+        inverse: One over it (3,).
         offsets: Low and high corners of boxes (B, 2, 3) from the ray's origin [m].
+        cones: Around the boxes (B, 4), see `_cones`.
         distance: Largest distance [m].
     """
     nearest, face = -1, 0
     for box in range(len(offsets)):
+        if ray[0] * cones[box, 0] + ray[1] * cones[box, 1] + ray[2] * cones[box, 2] < cones[box, 3]:
+            continue
         enter, leave, side = -np.inf, np.inf, 0
         for axis in range(3):
             low, high = offsets[box, 0, axis] * inverse[axis], offsets[box, 1, axis] * inverse[axis]
