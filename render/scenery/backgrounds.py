@@ -217,7 +217,7 @@ def _noise(
     grain = _octaves(grained, 1, float(rng.uniform(0.5, 0.85)), rng, cells)
     grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
     share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
-    color = 1.0 + 0.05 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
+    color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
     mixed: NDArray[np.float32] = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
     return mixed
 
