@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handsim.errors import HandSimError, choices
 from handsim.kernels.kernel import kernel
 from render.scenery.photographs import draw_photo, pick_photo
-from render.scenery.rooms import draw_room, paint_tint
+from render.scenery.rooms import draw_room, paint_tints
 from render.sensors.random_images import normal_numbers
 
 SHARE: Final = 0.6
@@ -168,7 +168,7 @@ def coarse_background(background: Background, size: tuple[int, int]) -> Float32[
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
     """Linear light of a wall or a cloth: grays more often than strong colors."""
     gray = rng.uniform(0.12, 0.95) ** _GAMMA
-    red, green, blue = np.clip(gray * np.exp(paint_tint(rng)), 0.003, 0.95)
+    red, green, blue = np.clip(gray * np.exp(paint_tints(rng, 1)[0]), 0.003, 0.95)
     return float(red), float(green), float(blue)
 
 

@@ -226,11 +226,12 @@ def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
             wide, high = rng.uniform((0.3, 0.3), (1.4, 1.2))
             left, low = rng.uniform(0.0, 1.0, 2) * np.maximum([across - wide, room[2] - high], 0.01)
             window = rng.random() < 0.3
-            glass = np.ones(3) if window else _paint(rng)
-            frames[wall, number] = left, low, wide, high, *_paint(rng), *glass, rng.uniform(-0.5, 0.5)
+            frame, glass = _paint(rng, 2)
+            glass = np.ones(3) if window else glass
+            frames[wall, number] = left, low, wide, high, *frame, *glass, rng.uniform(-0.5, 0.5)
     patterns = rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN], 6, p=_WALLS)
     patterns[_FLOOR:] = rng.choice([_TILES, _BOARDS, _PLAIN], p=_FLOORS), _PLAIN
-    colors = np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64)
+    colors = _paint(rng, 12).reshape(6, 2, 3)
     colors[:, 1] = colors[:, 0] + rng.uniform(*_CONTRAST, (6, 1)) * (colors[:, 1] - colors[:, 0])
     return _Walls(
         patterns,
@@ -250,7 +251,7 @@ def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.ra
     low[rng.random(count) < 0.7, 2] = 0.0
     return _Boxes(
         np.stack([low, low + extents], axis=1),
-        np.array([[_paint(rng), _paint(rng)] for _ in range(count)], dtype=np.float64),
+        _paint(rng, 2 * count).reshape(count, 2, 3),
         np.column_stack([rng.integers(0, 5, count), rng.uniform(0.05, 0.5, count)]),
         rng.uniform(0.55, 1.0, (count, 3)),
     )
@@ -402,20 +403,19 @@ def _wall_color(
                 color[channel] = bright * frames[wall, number, start + channel]
 
 
-def _paint(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Linear light of some paint, wood or cloth."""
-    gray = rng.uniform(0.1, 0.95) ** 2.2
-    tint = np.exp(paint_tint(rng))
-    color: NDArray[np.float32] = np.clip(gray * tint, 0.003, 0.95).astype(np.float32)
-    return color
+def _paint(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Linear light (count, 3) of some paints, woods or cloths."""
+    gray = rng.uniform(0.1, 0.95, (count, 1)) ** 2.2
+    colors: NDArray[np.float64] = np.clip(gray * np.exp(paint_tints(rng, count)), 0.003, 0.95)
+    return colors
 
 
-def paint_tint(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Logarithms of a paint's red, green and blue over its gray: warm or cool, seldom green or magenta.
+def paint_tints(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Logarithms (count, 3) of paints' red, green and blue over their gray.
 
-    Most walls, floors and cloths are nearly gray, some have a strong color.
+    They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray, some have a strong color.
     """
-    strong = rng.random() < _COLORED
-    warm, green = rng.normal(0.08, 0.32 if strong else 0.10), rng.normal(0.0, 0.10 if strong else 0.04)
-    tint: NDArray[np.float64] = np.array([warm, green, -1.1 * warm])
-    return tint
+    strong = rng.random(count) < _COLORED
+    warm = rng.normal(0.08, np.where(strong, 0.32, 0.10))
+    green = rng.normal(0.0, np.where(strong, 0.10, 0.04))
+    return np.stack([warm, green, -1.1 * warm], axis=1)
