@@ -38,7 +38,9 @@ from render.scenery.lights import Lighting
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
 _SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
 _ROUGHEST: Final = 0.04  # that a mirror can be
-_BLOCK: Final = 1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
+_BLOCK: Final = (
+    1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
+)
 
 _NO_TEXELS: Final = np.empty((0, 0, 8), dtype=np.uint8)
 
@@ -78,9 +80,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     sums = np.zeros((height, width, 4), dtype=np.float32)
     covered = _covered(first)
     for mesh in meshes:
-        _add_surface(
-            nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums
-        )
+        _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
     painted = np.zeros((height, width, 4), dtype=np.uint8)
     _as_bytes(sums.reshape(-1, 4), covered, painted.reshape(-1, 4))
     return painted

@@ -30,6 +30,7 @@ _SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
+_OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # drawn at half of the picture's resolution
 _GAMMA: Final = 2.2
 _GRAINS: Final = (6.0, 60.0)  # of stone, cloth or wood along the height of a picture
 _GRAIN_CONTRAST: Final = (0.1, 0.5)  # share of the difference of any two colors
@@ -126,11 +127,11 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
     Raises:
         HandSimError: The kind is unknown, or the photograph cannot be read.
     """
-    return enlarged(coarse_background(background, size), size)
+    return enlarged(_coarse(background, size), size)
 
 
 def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """A picture of `coarse_background`, or values that grow with it from 0 on, at its whole size."""
+    """A picture of `kept_background`, or values that grow with it from 0 on, at its whole size."""
     if picture.shape[1::-1] == size:
         return picture
     whole: NDArray[np.float32] = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
@@ -138,11 +139,19 @@ def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Fl
 
 
 @functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
-def coarse_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """The picture of `draw_background`, at half of its size unless it is a photograph; it cannot be written."""
+def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
+    """The picture of `draw_background` before it is `enlarged`, which cannot be written."""
+    picture = _coarse(background, size)
+    picture.setflags(write=False)
+    return picture
+
+
+def _coarse(background: Background, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The picture of `draw_background`, at half of its size where that shows as well."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
-    drawn_size = size if background.kind == "photo" else (max(2, size[0] // 2), max(2, size[1] // 2))
+    halved = (max(2, size[0] // 2), max(2, size[1] // 2))
+    drawn_size = halved if background.kind in _OUT_OF_FOCUS else size
     width, height = drawn_size
     if background.kind == "plain":
         picture = np.broadcast_to(first, (height, width, 3)).copy()
@@ -161,7 +170,6 @@ def coarse_background(background: Background, size: tuple[int, int]) -> Float32[
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
     drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0, dtype=np.float32)
-    drawn.setflags(write=False)
     return drawn
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from render.scenery.backgrounds import Background, BackgroundConfig, coarse_background, sample_background
+from render.scenery.backgrounds import Background, BackgroundConfig, kept_background, sample_background
 from render.skin.look import SkinLook
 
 _MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
@@ -140,7 +140,7 @@ def sample_surroundings(
         HandSimError: There is no photograph that can be read.
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
-    picture = cv2.resize(coarse_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
     lighting = surround(lighting, picture, rng.uniform(*_SHARE))
     return background, lighting if skin is None else expose_for(lighting, skin)
 

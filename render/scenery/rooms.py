@@ -413,7 +413,8 @@ def _paint(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
 def paint_tints(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
     """Logarithms (count, 3) of paints' red, green and blue over their gray.
 
-    They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray, some have a strong color.
+    They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray; some have a
+    strong color.
     """
     strong = rng.random(count) < _COLORED
     warm = rng.normal(0.08, np.where(strong, 0.32, 0.10))
