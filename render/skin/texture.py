@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 _HEM: Final = 0.004  # [m] that a hem is soft: a texel of the arm is 5 mm long, and less shows its corners
-_CREASE: Final = (-0.006, 0.02)  # [m] behind the wrist, where the palm's skin ends
+_CREASE: Final = (-0.012, 0.035)  # [m] behind the wrist, where the palm's skin ends
 _VEIN: Final = 0.0017  # [m] half as wide as a vein
 _UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
 _GRAIN: Final = 4.5e-5  # [m] of the skin's own relief, which breaks its gloss: furrows are 20 to 100 um deep
 _GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # [m]
 _MATT_GRAIN: Final = np.float32(0.05)  # of the roughness: ridges are drier than furrows
-_INNER_ARM: Final = 0.88  # pigment of the inner forearm, where the back of the hand has 1
+_INNER_ARM: Final = 0.8  # pigment of the inner forearm, where the back of the hand has 1
 
 
 class SkinTexture(NamedTuple):
