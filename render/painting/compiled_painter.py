@@ -37,7 +37,7 @@ from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
 _SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
-_ROUGHEST: Final = 0.04  # that a mirror can be
+_ROUGHEST: Final = np.float32(0.04)  # that a mirror can be
 _BLOCK: Final = (
     1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
 )
@@ -324,4 +324,4 @@ def _write_spot(
                 cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
             )
     spots[COLOR, spot], spots[COLOR + 1, spot], spots[COLOR + 2, spot] = red, green, blue
-    spots[ROUGH, spot] = max(rough, _ROUGHEST)
+    spots[ROUGH, spot] = rough if rough > _ROUGHEST else _ROUGHEST

@@ -22,6 +22,7 @@ _CONTRAST: Final = (0.15, 0.7)  # of a pattern, as a share of the difference of 
 _COLORED: Final = 0.4  # share of paints with a strong color
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] from an edge's middle
 _STEP: Final = 0.04  # of the root of light between neighbors, where four rays are cast for one
+_WEIGHTS: Final = np.array([0.2, 0.6, 0.2], dtype=np.float32)  # of red, green and blue in that light
 _FRAME: Final = 0.06  # of a picture or window, as a share of its sides
 
 
@@ -125,7 +126,7 @@ def _aim(
 
 def _edges(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Where (H W,) a picture differs from its neighbors to the right or below, on both sides of that."""
-    roots = np.sqrt(picture @ np.float32([0.2, 0.6, 0.2]))
+    roots = np.sqrt(picture @ _WEIGHTS)
     edges = np.zeros(roots.shape, dtype=bool)
     right = np.abs(np.diff(roots, axis=1)) > _STEP
     below = np.abs(np.diff(roots, axis=0)) > _STEP
