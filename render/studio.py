@@ -27,7 +27,7 @@ from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
 from render.painting.shadows import light_behind
-from render.scenery.backgrounds import Background, kept_background
+from render.scenery.backgrounds import Background, enlarged, kept_background
 from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
@@ -403,5 +403,4 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
 def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """SRGB from 0 to 255."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
-    drawn: NDArray[np.float32] = np.multiply(display, np.float32(255.0), out=display)
-    return drawn
+    return enlarged(np.multiply(display, np.float32(255.0), out=display), size)

@@ -37,8 +37,10 @@ from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
 _SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
-_ROUGHEST: Final = 0.04  # that a mirror can be
-_BLOCK: Final = 2048  # surface points shaded at a time, so that they stay in the processor's cache
+_ROUGHEST: Final = np.float32(0.04)  # that a mirror can be
+_BLOCK: Final = (
+    1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
+)
 
 _NO_TEXELS: Final = np.empty((0, 0, 8), dtype=np.uint8)
 
@@ -78,19 +80,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     sums = np.zeros((height, width, 4), dtype=np.float32)
     covered = _covered(first)
     for mesh in meshes:
-        spots, pixels, shares = _spots(nearness, first, covered, *mesh, TO_LINEAR)
-        _add_colors(
-            spots,
-            pixels,
-            shares,
-            len(mesh.texels) > 0,
-            mesh.finish,
-            lamps,
-            around,
-            *shadows,
-            TO_DISPLAY,
-            sums,
-        )
+        _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
     painted = np.zeros((height, width, 4), dtype=np.uint8)
     _as_bytes(sums.reshape(-1, 4), covered, painted.reshape(-1, 4))
     return painted
@@ -152,7 +142,7 @@ def _covered(first: NDArray[np.int32]) -> Any:
 
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @kernel
-def _spots(
+def _add_surface(
     nearness: NDArray[np.float32],
     first: NDArray[np.int32],
     covered: NDArray[np.int32],
@@ -163,18 +153,38 @@ def _spots(
     texels: NDArray[np.uint8],
     finish: NDArray[np.float64],
     to_linear: NDArray[np.float32],
-) -> Any:
-    """The surface points that are shaded: their table, the pixel of each, and its share of four samples.
+    lamps: NDArray[np.float64],
+    ambient: NDArray[np.float64],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
+    bias: float,
+    to_display: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Add one surface's colors, and how many of four samples per pixel it fills.
 
     `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
-    all surfaces from `begin`, -1 for none; `texels` is empty without a texture.
+    all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9) of
+    `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (H, W, 4) is added to.
     """
-    width = first.shape[1] // 2
-    end, most = begin + len(faces), 4 * len(covered)  # what is not used of these arrays takes no memory
-    spots = np.empty((most, SPOT), np.float32)
-    pixels, shares = np.empty(most, np.int64), np.empty(most, np.float32)
+    width, end = first.shape[1] // 2, begin + len(faces)
+    flat = sums.reshape(-1, 4)
+    block = np.empty((SPOT, _BLOCK), np.float32)
+    pixels, shares = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.float32)
     spot = 0
-    for pixel in covered:
+    for place in range(len(covered) + 1):
+        if spot > _BLOCK - 4 or place == len(covered):
+            spots = np.ascontiguousarray(block[:, :spot])
+            light = shade(spots, len(texels) > 0, finish, lamps, ambient, to_map, nearest, bias)
+            for n in range(spot):
+                pixel, share = pixels[n], shares[n]
+                for k in range(3):
+                    flat[pixel, k] += share * display(spots[TINT + k, n] * light[k, n], to_display)
+                flat[pixel, 3] += share
+            spot = 0
+        if place == len(covered):
+            break
+        pixel = covered[place]
         row, column = pixel // width, pixel % width
         count, smooth = _samples(nearness, first, begin, end, row, column)
         if count == 0:
@@ -196,43 +206,11 @@ def _spots(
                     texels,
                     finish,
                     to_linear,
-                    spots,
+                    block,
                     spot,
                 )
                 pixels[spot], shares[spot] = pixel, 4.0 if smooth else 1.0
                 spot += 1
-    return spots[:spot], pixels[:spot], shares[:spot]
-
-
-@kernel
-def _add_colors(
-    spots: NDArray[np.float32],
-    pixels: NDArray[np.int64],
-    shares: NDArray[np.float32],
-    mapped: bool,
-    finish: NDArray[np.float64],
-    lamps: NDArray[np.float64],
-    ambient: NDArray[np.float64],
-    to_map: NDArray[np.float64],
-    nearest: NDArray[np.float32],
-    bias: float,
-    to_display: NDArray[np.float32],
-    sums: NDArray[np.float32],
-) -> None:
-    """Add one surface's colors, and how many of four samples per pixel it fills, to `sums` (H, W, 4).
-
-    Rows (N, 23) of `spots` are the columns of `shading.SPOT`, and each stands for some samples of a pixel;
-    `lamps` are the rows (L, 9) of `_lamp_table`, and `nearest` and `bias` those of the `ShadowMap` [m].
-    """
-    flat = sums.reshape(-1, 4)
-    for start in range(0, len(pixels), _BLOCK):
-        block = np.ascontiguousarray(spots[start : start + _BLOCK].T)
-        light = shade(block, mapped, finish, lamps, ambient, to_map, nearest, bias)
-        for n in range(block.shape[1]):
-            pixel, share = pixels[start + n], shares[start + n]
-            for k in range(3):
-                flat[pixel, k] += share * display(block[TINT + k, n] * light[k, n], to_display)
-            flat[pixel, 3] += share
 
 
 @kernel(inline=True)
@@ -278,27 +256,36 @@ def _write_spot(
     first = max(1.0 - second - third, 0.0) * corners[a, 2]
     second, third = second * corners[b, 2], third * corners[c, 2]
     scale = 1.0 / (first + second + third)
-    first, second, third = first * scale, second * scale, third * scale
+    first, second, third = (
+        np.float32(first * scale),
+        np.float32(second * scale),
+        np.float32(third * scale),
+    )
     px = first * rows[a, 0] + second * rows[b, 0] + third * rows[c, 0]
     py = first * rows[a, 1] + second * rows[b, 1] + third * rows[c, 1]
     pz = first * rows[a, 2] + second * rows[b, 2] + third * rows[c, 2]
-    spots[spot, POSITION], spots[spot, POSITION + 1], spots[spot, POSITION + 2] = px, py, pz
+    spots[POSITION, spot], spots[POSITION + 1, spot], spots[POSITION + 2, spot] = px, py, pz
     for i in range(3):
-        spots[spot, NORMAL + i] = first * rows[a, 3 + i] + second * rows[b, 3 + i] + third * rows[c, 3 + i]
-        spots[spot, TINT + i] = first * rows[a, 6 + i] + second * rows[b, 6 + i] + third * rows[c, 6 + i]
-    red, green, blue, rough = finish[0], finish[1], finish[2], finish[3]
+        spots[NORMAL + i, spot] = first * rows[a, 3 + i] + second * rows[b, 3 + i] + third * rows[c, 3 + i]
+        spots[TINT + i, spot] = first * rows[a, 6 + i] + second * rows[b, 6 + i] + third * rows[c, 6 + i]
+    red, green, blue, rough = (
+        np.float32(finish[0]),
+        np.float32(finish[1]),
+        np.float32(finish[2]),
+        np.float32(finish[3]),
+    )
     if len(texels):
         u = first * rows[a, 9] + second * rows[b, 9] + third * rows[c, 9]
         v = first * rows[a, 10] + second * rows[b, 10] + third * rows[c, 10]
         r, g, b_, shine, across, up, out = read_texels(texels, to_linear, u, v)
         red, green, blue, rough = red * r, green * g, blue * b_, rough * shine
-        spots[spot, BUMP], spots[spot, BUMP + 1], spots[spot, BUMP + 2] = across, up, out
+        spots[BUMP, spot], spots[BUMP + 1, spot], spots[BUMP + 2, spot] = across, up, out
         bu, bv = rows[b, 9] - rows[a, 9], rows[b, 10] - rows[a, 10]
         cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
-        sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
+        sign = np.float32(1.0 if bu * cv - cu * bv >= 0.0 else -1.0)
         for i in range(3):
-            spots[spot, TANGENT + i] = sign * (
+            spots[TANGENT + i, spot] = sign * (
                 cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
             )
-    spots[spot, COLOR], spots[spot, COLOR + 1], spots[spot, COLOR + 2] = red, green, blue
-    spots[spot, ROUGH] = max(rough, _ROUGHEST)
+    spots[COLOR, spot], spots[COLOR + 1, spot], spots[COLOR + 2, spot] = red, green, blue
+    spots[ROUGH, spot] = rough if rough > _ROUGHEST else _ROUGHEST

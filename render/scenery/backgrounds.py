@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handsim.errors import HandSimError, choices
 from handsim.kernels.kernel import kernel
 from render.scenery.photographs import draw_photo, pick_photo
-from render.scenery.rooms import draw_room, paint_tint
+from render.scenery.rooms import draw_room, paint_tints
 from render.sensors.random_images import normal_numbers
 
 SHARE: Final = 0.6
@@ -30,8 +30,11 @@ _SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
-_OUT_OF_FOCUS: Final = ("noise", "clutter", "room")  # drawn at half of the picture's resolution
+_OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # drawn at half of the picture's resolution
 _GAMMA: Final = 2.2
+_GRAINS: Final = (6.0, 60.0)  # of stone, cloth or wood along the height of a picture
+_GRAIN_CONTRAST: Final = (0.1, 0.5)  # share of the difference of any two colors
+_SIDE: Final = np.float32(0.6)  # light on an object's side, where its top has 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,30 +117,42 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
 
 
-@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
-def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """The picture of `draw_background`, which cannot be written."""
-    picture = draw_background(background, size)
-    picture.setflags(write=False)
-    return picture
-
-
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white.
 
     Raises:
         HandSimError: The kind is unknown, or the photograph cannot be read.
     """
+    return enlarged(_coarse(background, size), size)
+
+
+def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """A picture of `kept_background`, or values that grow with it from 0 on, at its whole size."""
+    if picture.shape[1::-1] == size:
+        return picture
+    whole: NDArray[np.float32] = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+    return np.clip(whole, 0.0, picture.max(), out=whole)
+
+
+@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
+def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
+    """The picture of `draw_background` before it is `enlarged`, which cannot be written."""
+    picture = _coarse(background, size)
+    picture.setflags(write=False)
+    return picture
+
+
+def _coarse(background: Background, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The picture of `draw_background`, at half of its size where that shows as well."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
-    drawn_size = size
-    if background.kind in _OUT_OF_FOCUS:
-        drawn_size = (max(2, size[0] // 2), max(2, size[1] // 2))
+    halved = (max(2, size[0] // 2), max(2, size[1] // 2))
+    drawn_size = halved if background.kind in _OUT_OF_FOCUS else size
     width, height = drawn_size
     if background.kind == "plain":
         picture = np.broadcast_to(first, (height, width, 3)).copy()
     elif background.kind == "gradient":
-        picture = _gradient(first, second, size, rng)
+        picture = _gradient(first, second, drawn_size, rng)
     elif background.kind == "noise":
         picture = _noise(first, second, drawn_size, rng)
     elif background.kind == "clutter":
@@ -150,8 +165,6 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    if drawn_size != size:
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0, dtype=np.float32)
     return drawn
 
@@ -159,7 +172,7 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
     """Linear light of a wall or a cloth: grays more often than strong colors."""
     gray = rng.uniform(0.12, 0.95) ** _GAMMA
-    red, green, blue = np.clip(gray * np.exp(paint_tint(rng)), 0.003, 0.95)
+    red, green, blue = np.clip(gray * np.exp(paint_tints(rng, 1)[0]), 0.003, 0.95)
     return float(red), float(green), float(blue)
 
 
@@ -176,11 +189,14 @@ def _gradient(
 
 
 def _octaves(
-    size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator
+    size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator, cells: int = 3
 ) -> NDArray[np.float32]:
-    """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1."""
+    """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1.
+
+    The largest is the picture's height over `cells`.
+    """
     width, height = size
-    cells, strength, squares = 3, 1.0, 0.0
+    cells, strength, squares = min(cells, height - 1), 1.0, 0.0
     total = np.zeros((cells, max(2, cells * width // height), channels), dtype=np.float32)
     while cells < height:
         shape = (max(2, cells * width // height), cells)
@@ -196,8 +212,16 @@ def _octaves(
 def _noise(
     first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    share = 0.5 + 0.35 * _octaves(size, 1, float(rng.uniform(0.5, 0.85)), rng)
-    color = 1.0 + 0.05 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
+    """Stone, carpet, cloth or wood: grain of one scale and finer, often longer one way than the other."""
+    cells = int(np.exp(rng.uniform(*np.log(_GRAINS))))
+    longer = float(rng.choice([1.0, rng.uniform(2.0, 8.0)]))
+    width, height = size
+    across = rng.random() < 0.5
+    grained = (width, max(2, int(height / longer))) if across else (max(2, int(width / longer)), height)
+    grain = _octaves(grained, 1, float(rng.uniform(0.5, 0.85)), rng, cells)
+    grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
+    share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
+    color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
     mixed: NDArray[np.float32] = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
     return mixed
 
@@ -205,9 +229,11 @@ def _noise(
 def _clutter(
     first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Objects on a table: boxes, discs and cloths of all colors in a heap, each with its own light."""
+    """Objects on a table: boxes, tins and cloths of all colors in a heap, each with its own light."""
     picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
     height = size[1]
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    up = np.array([np.cos(turn), np.sin(turn)])  # of what is seen of their height, aslant
     for _ in range(int(rng.integers(8, 30))):
         color = np.array(_color(rng), dtype=np.float32)
         center = rng.uniform(0.0, 1.0, 2) * size
@@ -219,12 +245,20 @@ def _clutter(
         tilt = rng.uniform(0.0, 2.0 * np.pi)
         axes = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
         light = np.float32(rng.uniform(0.8, 1.15))
-        _paint_object(picture, outline @ axes + center, light * color)
+        bottom = outline @ axes + center
+        top = bottom + radius * max(0.0, rng.uniform(-0.3, 0.7)) * up
+        hull = cv2.convexHull(np.concatenate([bottom, top]).astype(np.float32))[:, 0]
+        _paint_object(picture, hull, _SIDE * light * color)
+        _paint_object(picture, top, light * color, shadow=False)
     return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
 
 
 def _paint_object(
-    picture: NDArray[np.float32], outline: NDArray[np.float64], color: NDArray[np.float32]
+    picture: NDArray[np.float32],
+    outline: NDArray[Any],
+    color: NDArray[np.float32],
+    *,
+    shadow: bool = True,
 ) -> None:
     """Paint an object over a picture, with its shadow to the right and below."""
     height, width = picture.shape[:2]
@@ -235,10 +269,12 @@ def _paint_object(
         return
     part = picture[low[1] : high[1], low[0] : high[0]]
     corners = np.rint(16.0 * (outline - low)).astype(np.int32)
-    covered, shadow = np.zeros((2, *part.shape[:2]), dtype=np.uint8)
+    covered, shaded = np.zeros((2, *part.shape[:2]), dtype=np.uint8)
     cv2.fillPoly(covered, [corners], 255, cv2.LINE_AA, 4)
-    cv2.fillPoly(shadow, [corners + int(16.0 * offset)], 255, cv2.LINE_AA, 4)
-    _lay_over(part, covered, cv2.blur(shadow, (5, 5)), color.astype(np.float32))
+    if shadow:
+        cv2.fillPoly(shaded, [corners + int(16.0 * offset)], 255, cv2.LINE_AA, 4)
+        shaded = cv2.blur(shaded, (5, 5))
+    _lay_over(part, covered, shaded, color.astype(np.float32))
 
 
 @kernel

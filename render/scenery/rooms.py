@@ -20,6 +20,9 @@ _FLOORS: Final = (0.25, 0.4, 0.35)  # likewise a floor, without stripes; ceiling
 _FLOOR: Final = 4  # number of that side
 _CONTRAST: Final = (0.15, 0.7)  # of a pattern, as a share of the difference of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
+_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] from an edge's middle
+_STEP: Final = 0.04  # of the root of light between neighbors, where four rays are cast for one
+_WEIGHTS: Final = np.array([0.2, 0.6, 0.2], dtype=np.float32)  # of red, green and blue in that light
 _FRAME: Final = 0.06  # of a picture or window, as a share of its sides
 
 
@@ -66,13 +69,67 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     """A random room from a random position, linear light."""
     width, height = size
     scene = _scene(seed)
-    rays = _rays(width, height, *scene.lens)
-    light = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
-    picture = light.reshape(height, width, 3)
+    down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
+    picture = _seen(scene, size, across, down).reshape(height, width, 3)
+    (edges,) = np.nonzero(_edges(picture))
+    parts = [_seen(scene, size, across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
+    picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     drawn: NDArray[np.float32] = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
     return drawn
+
+
+def _seen(
+    scene: _Scene, size: tuple[int, int], across: NDArray[np.float32], down: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Light (N, 3) at places (N,) [px] of a picture."""
+    width, height = size
+    rays = np.empty((len(across), 3), dtype=np.float32)
+    _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
+    return _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
+
+
+@kernel
+def _aim(
+    across: NDArray[np.float32],
+    down: NDArray[np.float32],
+    middle: float,
+    center: float,
+    focal: float,
+    axes: NDArray[np.float64],
+    rays: NDArray[np.float32],
+) -> None:
+    """Write the directions (N, 3) in which a camera sees places of its picture, no component 0.
+
+    Args:
+        across: Columns (N,) [px].
+        down: Rows (N,) [px].
+        middle: Column of the camera's axis [px].
+        center: Row of it [px].
+        focal: Focal length [px].
+        axes: The camera's axes in the room (3, 3), a row each: right, down, ahead.
+        rays: Written.
+    """
+    for n in range(len(rays)):
+        x, y = (across[n] - middle) / focal, (down[n] - center) / focal
+        length = np.sqrt(x * x + y * y + 1.0)
+        for axis in range(3):
+            way = (x * axes[0, axis] + y * axes[1, axis] + axes[2, axis]) / length
+            rays[n, axis] = way if abs(way) > 1e-6 else 1e-6
+
+
+def _edges(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H W,) a picture differs from its neighbors to the right or below, on both sides of that."""
+    roots = np.sqrt(picture @ _WEIGHTS)
+    edges = np.zeros(roots.shape, dtype=bool)
+    right = np.abs(np.diff(roots, axis=1)) > _STEP
+    below = np.abs(np.diff(roots, axis=0)) > _STEP
+    edges[:, 1:] |= right
+    edges[:, :-1] |= right
+    edges[1:] |= below
+    edges[:-1] |= below
+    return edges.ravel()
 
 
 class _Scene(NamedTuple):
@@ -81,8 +138,10 @@ class _Scene(NamedTuple):
     room: NDArray[np.float64]
     """Far corner [m]; the other one is at the origin, z up."""
     eye: NDArray[np.float64]
-    lens: tuple[float, float, float, float]
-    """Focal length [picture heights], yaw, pitch and roll [rad]."""
+    focal: float
+    """Focal length [picture heights]."""
+    axes: NDArray[np.float64]
+    """The camera's axes (3, 3), a row each: right, down, ahead."""
     lamp: NDArray[np.float64]
     """Lamps and windows leave some parts darker than others."""
     strength: float
@@ -99,7 +158,8 @@ def _scene(seed: int) -> _Scene:
     yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls = _paint_walls(room, rng)
-    return _Scene(room, eye, (focal, yaw, pitch, roll), lamp, strength, walls, _place_boxes(room, eye, rng))
+    axes, boxes = _turned(yaw, pitch, roll), _place_boxes(room, eye, rng)
+    return _Scene(room, eye, focal, axes, lamp, strength, walls, boxes)
 
 
 def cast_room(
@@ -144,24 +204,13 @@ def _cast_all(
     return seen
 
 
-def _rays(
-    width: int, height: int, focal: float, yaw: float, pitch: float, roll: float
-) -> NDArray[np.float32]:
-    """Directions (H W, 3) of a camera that looks into the room, a little up or down and askew."""
+def _turned(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Axes (3, 3), a row each, of a camera that looks into the room, a little up or down and askew [rad]."""
     (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
     aside, upright = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0])
     level = np.array([-sy, cy, 0.0])
     ahead, down = cp * level + sp * upright, sp * level - cp * upright
-    right, below = cr * aside + sr * down, cr * down - sr * aside
-    x = ((np.arange(width) + 0.5 - width / 2) / (focal * height)).astype(np.float32)
-    y = ((np.arange(height) + 0.5 - height / 2) / (focal * height)).astype(np.float32)
-    along = y[:, None, None] * below.astype(np.float32) + ahead.astype(np.float32)
-    along = along + x[None, :, None] * right.astype(np.float32)
-    along = along.reshape(-1, 3)
-    along *= np.float32(1.0) / np.sqrt(np.einsum("ij,ij->i", along, along))[:, None]
-    along[np.abs(along) < 1e-6] = 1e-6
-    rays: NDArray[np.float32] = along
-    return rays
+    return np.stack([cr * aside + sr * down, cr * down - sr * aside, ahead])
 
 
 def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
@@ -172,11 +221,12 @@ def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
             wide, high = rng.uniform((0.3, 0.3), (1.4, 1.2))
             left, low = rng.uniform(0.0, 1.0, 2) * np.maximum([across - wide, room[2] - high], 0.01)
             window = rng.random() < 0.3
-            glass = np.ones(3) if window else _paint(rng)
-            frames[wall, number] = left, low, wide, high, *_paint(rng), *glass, rng.uniform(-0.5, 0.5)
+            frame, glass = _paint(rng, 2)
+            glass = np.ones(3) if window else glass
+            frames[wall, number] = left, low, wide, high, *frame, *glass, rng.uniform(-0.5, 0.5)
     patterns = rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN], 6, p=_WALLS)
     patterns[_FLOOR:] = rng.choice([_TILES, _BOARDS, _PLAIN], p=_FLOORS), _PLAIN
-    colors = np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64)
+    colors = _paint(rng, 12).reshape(6, 2, 3)
     colors[:, 1] = colors[:, 0] + rng.uniform(*_CONTRAST, (6, 1)) * (colors[:, 1] - colors[:, 0])
     return _Walls(
         patterns,
@@ -196,7 +246,7 @@ def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.ra
     low[rng.random(count) < 0.7, 2] = 0.0
     return _Boxes(
         np.stack([low, low + extents], axis=1),
-        np.array([[_paint(rng), _paint(rng)] for _ in range(count)], dtype=np.float64),
+        _paint(rng, 2 * count).reshape(count, 2, 3),
         np.column_stack([rng.integers(0, 5, count), rng.uniform(0.05, 0.5, count)]),
         rng.uniform(0.55, 1.0, (count, 3)),
     )
@@ -226,6 +276,7 @@ def _cast(
     """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
     position, color, inverse = np.empty(3), np.empty(3), np.empty(3)
     offsets = corners - eye
+    cones = _cones(offsets)
     for ray in range(len(rays)):
         distance, wall = np.inf, 0
         for axis in range(3):
@@ -234,7 +285,7 @@ def _cast(
             way = ((room[axis] if far else 0.0) - eye[axis]) * inverse[axis]
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
-        box, side, distance = _nearest_box(inverse, offsets, distance)
+        box, side, distance = _nearest_box(rays[ray], inverse, offsets, cones, distance)
         distances[ray], axes[ray] = distance, side if box >= 0 else wall // 2
         light = 0.35
         for axis in range(3):
@@ -254,10 +305,37 @@ def _cast(
 
 
 @kernel
-def _nearest_box(inverse: NDArray[np.float64], offsets: NDArray[np.float64], distance: float) -> Any:
+def _cones(offsets: NDArray[np.float64]) -> Any:
+    """Cones around boxes (B, 4), seen from the eye: unit direction of the axis, and the cosine of half the angle."""
+    cones = np.empty((len(offsets), 4))
+    for box in range(len(offsets)):
+        axis = 0.5 * (offsets[box, 0] + offsets[box, 1])
+        axis /= np.sqrt((axis * axis).sum())
+        least = 1.0
+        for corner in range(8):
+            along, square = 0.0, 0.0
+            for i in range(3):
+                place = offsets[box, (corner >> i) & 1, i]
+                along, square = along + place * axis[i], square + place * place
+            least = min(least, along / np.sqrt(square))
+        cones[box, :3] = axis
+        cones[box, 3] = least - 1e-5 if least > 0.0 else -2.0  # wider than half of all ways is no cone
+    return cones
+
+
+@kernel
+def _nearest_box(
+    ray: NDArray[np.float32],
+    inverse: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    cones: NDArray[np.float64],
+    distance: float,
+) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none."""
     nearest, face = -1, 0
     for box in range(len(offsets)):
+        if ray[0] * cones[box, 0] + ray[1] * cones[box, 1] + ray[2] * cones[box, 2] < cones[box, 3]:
+            continue
         enter, leave, side = -np.inf, np.inf, 0
         for axis in range(3):
             low, high = offsets[box, 0, axis] * inverse[axis], offsets[box, 1, axis] * inverse[axis]
@@ -308,20 +386,20 @@ def _wall_color(
                 color[channel] = bright * frames[wall, number, start + channel]
 
 
-def _paint(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Linear light of some paint, wood or cloth."""
-    gray = rng.uniform(0.1, 0.95) ** 2.2
-    tint = np.exp(paint_tint(rng))
-    color: NDArray[np.float32] = np.clip(gray * tint, 0.003, 0.95).astype(np.float32)
-    return color
+def _paint(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Linear light (count, 3) of some paints, woods or cloths."""
+    gray = rng.uniform(0.1, 0.95, (count, 1)) ** 2.2
+    colors: NDArray[np.float64] = np.clip(gray * np.exp(paint_tints(rng, count)), 0.003, 0.95)
+    return colors
 
 
-def paint_tint(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Logarithms of a paint's red, green and blue over its gray: warm or cool, seldom green or magenta.
+def paint_tints(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Logarithms (count, 3) of paints' red, green and blue over their gray.
 
-    Most walls, floors and cloths are nearly gray, some have a strong color.
+    They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray; some have a
+    strong color.
     """
-    strong = rng.random() < _COLORED
-    warm, green = rng.normal(0.08, 0.32 if strong else 0.10), rng.normal(0.0, 0.10 if strong else 0.04)
-    tint: NDArray[np.float64] = np.array([warm, green, -1.1 * warm])
-    return tint
+    strong = rng.random(count) < _COLORED
+    warm = rng.normal(0.08, np.where(strong, 0.32, 0.10))
+    green = rng.normal(0.0, np.where(strong, 0.10, 0.04))
+    return np.stack([warm, green, -1.1 * warm], axis=1)

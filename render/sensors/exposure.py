@@ -20,6 +20,7 @@ from handsim.kernels.kernel import kernel
 from render.sensors.random_images import quantiles, random_words
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
+_SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
 
 
@@ -39,6 +40,8 @@ class Exposure:
     """Share of the light that is missing in the corners."""
     jpeg_quality: int | None = None
     """Quality of JPEG compression, 1 to 100; None without it."""
+    blur: float = 0.0
+    """Standard deviation of what lens and color filters spread a point of light by [px]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,8 @@ class ExposureConfig:
     jpeg_share: float = 0.5
     """Share of pictures with JPEG compression."""
     jpeg_quality: tuple[int, int] = (70, 98)
+    blur: tuple[float, float] = (0.3, 0.7)
+    """A lens in focus and the interpolation of a color filter's pixels [px]."""
 
 
 def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Exposure:
@@ -70,6 +75,7 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
         read_noise=float(rng.uniform(*config.read_noise)),
         vignetting=float(rng.uniform(*config.vignetting)),
         jpeg_quality=quality if is_jpeg else None,
+        blur=float(rng.uniform(*config.blur)),
     )
 
 
@@ -101,7 +107,10 @@ def expose(
         np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0),
     )
     balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
-    light = np.ascontiguousarray(linear, dtype=np.float32).reshape(height, 3 * width)
+    light = np.ascontiguousarray(linear, dtype=np.float32)
+    if exposure.blur > 0.0:
+        light = cv2.GaussianBlur(light, _SPREAD, exposure.blur)
+    light = light.reshape(height, 3 * width)
     _expose(light, *numbers, words.reshape(-1, 3 * width), quantiles(), away, balance, _root_curve(), rgb)
     rgb = rgb.reshape(linear.shape)
     return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)

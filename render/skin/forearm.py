@@ -32,6 +32,10 @@ _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths there [hand breadths]."""
+_CUFF: Final = 0.012  # [m] of the arm along which a sleeve becomes wider than it
+_SQUARE: Final = 0.8
+"""Power of the cosine and sine of an arm's section: wrists are squarer than an ellipse, of power 1,"""
+_LONGER: Final = 1.04  # and longer around at the same width
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 _BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
 ELBOW: Final = _PLACES[4]
@@ -67,6 +71,8 @@ class Forearm:
     """Start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm."""
     sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)
     """sRGB in [0, 1]."""
+    looseness: float = 1.2
+    """Girth of the sleeve over the arm's in it."""
 
     def __post_init__(self) -> None:
         if not 0.02 <= self.length <= _LONGEST:
@@ -84,7 +90,7 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
     girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
     sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
-    red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.12, 3), 0.02, 0.95)
+    red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.08, 3), 0.02, 0.95)
     return Forearm(
         float(length),
         float(flexion),
@@ -92,6 +98,7 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
         girth,
         float(sleeve),
         (float(red), float(green), float(blue)),
+        float(rng.uniform(1.1, 1.45)),
     )
 
 
@@ -114,7 +121,11 @@ def forearm_rings(
     width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
-    round_section = np.stack([width[:, None] * np.cos(angle), depth[:, None] * np.sin(angle)], axis=-1)
+    axes_of = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if forearm.sleeve < forearm.length:
+        loose = 1.0 + (forearm.looseness - 1.0) * _smooth((behind - forearm.sleeve) / _CUFF + 0.5)
+        width, depth = loose * width, loose * depth
+    round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
     share = _smooth(behind / (_BLEND * shape.length))[:, None, None]
     sections = (1.0 - share) * section + share * round_section
     axes, middles = _course(shape, forearm, behind)
@@ -227,6 +238,7 @@ def _half_axes(
     # Ramanujan's ellipse: its girth over its half width
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
+    around *= _LONGER
     return girth / around, flatness * girth / around
 
 

@@ -57,7 +57,7 @@ class SkinLook:
     """Visibility of veins on the back."""
     relief: float = 1.0
     """Height of tendons, knuckles and the skin's grain."""
-    nail: tuple[float, float, float] = (4.0, 5.0, -3.0)
+    nail: tuple[float, float, float] = (3.0, 3.0, -2.0)
     """L*, a*, b* of the nails above the skin's."""
     polish: float = 0.0
     """Share of the nails' color that is `polish_color`."""
@@ -138,7 +138,7 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
     strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
-    nail = np.array([4.0, 5.0, -3.0]) + rng.normal(0.0, (1.5, 1.5, 1.0))
+    nail = np.array([3.0, 3.0, -2.0]) + rng.normal(0.0, (1.5, 1.5, 1.0))
     return SkinLook(
         lightness=lightness,
         redness=redness,
@@ -152,7 +152,7 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
         nail=(float(nail[0]), float(nail[1]), float(nail[2])),
         polish=float(polish),
         polish_color=(float(color[0]), float(color[1]), float(color[2])),
-        roughness=float(rng.uniform(0.4, 0.62)),
+        roughness=float(rng.uniform(0.5, 0.68)),
         seed=int(rng.integers(2**31)),
     )
 

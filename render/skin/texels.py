@@ -160,7 +160,7 @@ def line_depth(rng: np.random.Generator) -> NDArray[np.float32]:
     near, palm_lines, depth = _lines_of_all()
     depth = depth.copy()
     for line in palm_lines:
-        depth[near] = np.maximum(depth[near], np.float32(rng.uniform(0.8, 1.2)) * line)
+        depth[near] = np.maximum(depth[near], np.float32(rng.uniform(1.0, 1.5)) * line)
     for number, digit in enumerate(_digit_lines()):
         joints = digit.joints
         waves = digit.wave(rng.uniform(0.0, 6.0))
@@ -175,7 +175,7 @@ def line_depth(rng: np.random.Generator) -> NDArray[np.float32]:
             positions = joint + spacing * places + rng.normal(0.0, 0.0003, count)
             for place, position in zip(places, positions, strict=True):
                 bow = digit.arch * np.float32(place / count * 2.0)  # wrinkles are curved
-                _draw_line(digit.along, bow, digit.back, position, 0.0006, 0.55, digit.texels, depth)
+                _draw_line(digit.along, bow, digit.back, position, 0.0006, 0.4, digit.texels, depth)
     return depth
 
 

@@ -22,10 +22,13 @@ if TYPE_CHECKING:
 
 
 _HEM: Final = 0.004  # [m] that a hem is soft: a texel of the arm is 5 mm long, and less shows its corners
-_CREASE: Final = (-0.006, 0.02)  # [m] behind the wrist, where the palm's skin ends
+_CREASE: Final = (-0.012, 0.035)  # [m] behind the wrist, where the palm's skin ends
 _VEIN: Final = 0.0017  # [m] half as wide as a vein
 _UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
-_INNER_ARM: Final = 0.88  # pigment of the inner forearm, where the back of the hand has 1
+_GRAIN: Final = 4.5e-5  # [m] of the skin's own relief, which breaks its gloss: furrows are 20 to 100 um deep
+_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # [m]
+_MATT_GRAIN: Final = np.float32(0.05)  # of the roughness: ridges are drier than furrows
+_INNER_ARM: Final = 0.8  # pigment of the inner forearm, where the back of the hand has 1
 
 
 class SkinTexture(NamedTuple):
@@ -108,8 +111,10 @@ def _painted(
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
     _add(lab, look.creases * lines, (-9.5, 4.0, 0.5))
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
-    height += look.relief * 2e-5 * noise(texels.positions, (0.0035, 0.0018), rng=rng)
+    grain = noise(texels.positions, _GRAIN_SIZES, rng=rng)
+    height += look.relief * _GRAIN * grain
     rough = np.minimum(look.roughness + 0.1 * (1.0 - texels.back), 1.0).astype(np.float32)
+    rough += _MATT_GRAIN * np.clip(grain, -1.5, 1.5)
     paint = _Paint(lab, rough, height.astype(np.float32))
     _paint_nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:

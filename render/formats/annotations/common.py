@@ -119,7 +119,8 @@ def rigid_record(transform: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
 
 def shape_record(shape: HandShape) -> dict[str, Any]:
     """A person's hand as JSON; the fields of `HandShape`."""
-    return {name: _plain(getattr(shape, name)) for name in HandShape.__dataclass_fields__}
+    fields = {name: getattr(shape, name) for name in HandShape.__dataclass_fields__}
+    return {name: _listed(x) if isinstance(x, np.ndarray | np.generic) else x for name, x in fields.items()}
 
 
 def rounded(values: NDArray[np.floating], decimals: int) -> Any:

@@ -107,3 +107,12 @@ def test_odd_sizes_work():
     assert shot(light, Exposure(0.1, (1.1, 1.0, 0.9), 900.0, 3.0, 0.2, 80)).shape == (37, 23, 3)
     with pytest.raises(ArgumentError, match="expected \\(H, W, 3\\)"):
         shot(light[..., 0], Exposure())
+
+
+def test_blur_spreads_light_and_loses_none() -> None:
+    light = np.zeros((9, 9, 3), dtype=np.float32)
+    light[4, 4] = 1.0
+    seen = linear_of(shot(light, Exposure(blur=0.6)))
+    assert 0.3 < seen[4, 4, 0] < 0.7 and seen[4, 5, 0] > 0.05
+    assert seen[2].max() == 0.0
+    assert np.abs(seen.sum(axis=(0, 1)) - 1.0).max() < 0.03

@@ -157,3 +157,15 @@ def test_texture_places_lie_on_texels_of_their_own_tile() -> None:
     spans = np.ptp(texel[atlas.corner_faces], axis=1)
     on_hand = (atlas.faces < atlas.num_hand).all(axis=1)
     assert spans[on_hand].max() < 4.5
+
+
+def test_a_sleeve_is_wider_than_the_arm_in_it() -> None:
+    atlas, model = skin_atlas(), HandModel.named("M")
+    bare, worn = (
+        PosableSkin(model, Forearm(length=0.6, sleeve=sleeve, looseness=1.3)).rest[atlas.num_hand : -1]
+        for sleeve in (1.0, 0.1)
+    )
+    across = [np.ptp(arm.reshape(-1, len(atlas.wrist), 3)[..., 1], axis=1) for arm in (bare, worn)]
+    behind = -bare.reshape(-1, len(atlas.wrist), 3)[..., 0].mean(axis=1)
+    wider = across[1] / across[0]
+    assert np.allclose(wider[behind < 0.09], 1.0) and np.allclose(wider[behind > 0.14], 1.3, atol=0.01)
