@@ -8,7 +8,7 @@ are foreign markers; many gaps, and markers that exchange trajectories; gaps and
 of errors is consecutive frames, gaps of 5 bridged, in which a marker lacks its label, has another one, or a
 point that is none has it; where half of a hand is wrong, it is the hand's. --real takes real hands in motion
 instead, see `real_motion`. --fit prints the coefficients of `track.label_confidence`, fitted to the captures;
-those in use are of seeds 101 to 113, which test nothing.
+those in use are of seeds 101 to 114, which test nothing.
 """
 
 from __future__ import annotations
@@ -87,15 +87,23 @@ def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
 
 
-def fit(values: np.ndarray, wrong: np.ndarray, ridge: float = 10.0) -> np.ndarray:
-    """Coefficients of a logistic model, the constant first, by Newton's method."""
+def fit(told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: float = 10.0) -> np.ndarray:
+    """Coefficients of a logistic model, the constant first, by Newton's method.
+
+    Args:
+        told: Of each capture, what is told of its points (P, F), and which are wrong (P,).
+        most: Weight of all wrong points of a capture at most: a hand that is wrong throughout is one error.
+        ridge: Precision of the coefficients around 0.
+    """
+    values, wrong = map(np.concatenate, zip(*told, strict=True))
+    weight = np.concatenate([np.where(bad, min(1.0, most / max(bad.sum(), 1)), 1.0) for _, bad in told])
     columns = np.column_stack([np.ones(len(values)), values])
-    weights, prior = np.zeros(columns.shape[1]), ridge * np.diag([0.0] + [1.0] * values.shape[1])
+    found, prior = np.zeros(columns.shape[1]), ridge * np.diag([0.0] + [1.0] * values.shape[1])
     for _ in range(30):
-        chance = 1.0 / (1.0 + np.exp(-columns @ weights))
-        gradient = columns.T @ (wrong - chance) - prior @ weights
-        weights += np.linalg.solve((columns.T * (chance * (1.0 - chance))) @ columns + prior, gradient)
-    return weights
+        chance = 1.0 / (1.0 + np.exp(-columns @ found))
+        gradient = columns.T @ (weight * (wrong - chance)) - prior @ found
+        found += np.linalg.solve((columns.T * (weight * chance * (1.0 - chance))) @ columns + prior, gradient)
+    return found
 
 
 def main() -> None:
@@ -113,7 +121,8 @@ def main() -> None:
     torch.set_num_threads(1)
     print(describe("numba", "torch"), WHAT, sep="\n")
     table: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {}
-    told: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    labeled: list[tuple[np.ndarray, np.ndarray]] = []
+    others: list[tuple[np.ndarray, np.ndarray]] = []
     takes = real_takes(options.real, options.frames) if options.real else simulated_takes(options)
     for name, take, truth in takes:
         for key in (*name.split(), "all"):
@@ -121,8 +130,8 @@ def main() -> None:
         if options.fit:
             evidence = evidence_of(take)
             wrong = evidence.labels != truth[evidence.frames, evidence.columns]
-            labeled = evidence.labels >= 0
-            told.append((evidence.labeled, wrong[labeled], evidence.unlabeled, wrong[~labeled]))
+            labeled.append((evidence.labeled, wrong[evidence.labels >= 0]))
+            others.append((evidence.unlabeled, wrong[evidence.labels < 0]))
     figures: Figures = {}
     for key, scores in table.items():
         counts, pairs = zip(*scores, strict=True)
@@ -132,9 +141,8 @@ def main() -> None:
         print(f"{key:16s} | " + " | ".join(f"{value:6.1f}" for value in values), flush=True)
         figures[key] = f"{WHAT}; {key}", values
     save_figures(options.save, figures)
-    if told:
-        values, wrong, others, missing = map(np.concatenate, zip(*told, strict=True))
-        print("_LABELED", fit(values, wrong).round(2), "\n_UNLABELED", fit(others, missing).round(2))
+    if options.fit:
+        print("_LABELED", fit(labeled).round(2), "\n_UNLABELED", fit(others).round(2))
 
 
 if __name__ == "__main__":

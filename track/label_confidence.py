@@ -14,9 +14,9 @@ from jaxtyping import Float
 from gloves.takes.take import Take
 from track.label_evidence import evidence_of
 
-_LABELED: Final = (-8.74, 0.90, 3.20, 0.66, 0.17, 1.98, 3.98, 0.44)
+_LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
-_UNLABELED: Final = (-7.61, 4.15, 7.06, 2.56, 6.08, 2.40, 0.81, 2.06)
+_UNLABELED: Final = (-7.07, 3.55, 6.40, 3.60, 5.50, 1.69, 0.32, 1.17)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 

@@ -83,12 +83,12 @@ def evidence_of(take: Take) -> Evidence:
     of_hand = _of_hands(take, np.isfinite(seen[..., 0]), owners)[frames, owners[markers]]
     label, frame = labels[which], frames[which]
     off = np.fmax(residuals[frame, label] / _usual(residuals)[label], 1.0)
-    off = np.nan_to_num(np.log(np.minimum(off, _MOST_OFF)), nan=1.0)
+    off = np.minimum(np.nan_to_num(off, nan=3.0), _MOST_OFF)
     labeled = [
         of_life[which],
         np.log1p((length - own - others) / own)[which],
-        off,
-        off * np.log(_SHORT / np.minimum(length, _SHORT))[which],
+        off - 1.0,
+        np.log(off) * np.log(_SHORT / np.minimum(length, _SHORT))[which],
         *of_hand[which].T,
         _improbable(take, owners)[frame, label],
     ]

@@ -23,9 +23,9 @@ _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # share of the points that are elsewhere, from which on it is told
 _AT_HAND: Final = 0.04  # [m] from the markers of a hand
-_CERTAIN: Final = 0.6  # confidence in every point of a frame that needs no look
+_CERTAIN: Final = 0.7  # confidence in every point of a frame that needs no look
 _AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
-_APART: Final = 0.25  # [s] between two spans that are two
+_APART: Final = 0.2  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 
 
