@@ -29,7 +29,7 @@ from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
 from track.label_evidence import evidence_of
 from track.take_summary import doubts_of, frame_confidence, runs_of
-from train.evaluation.metrics import expected_calibration_error
+from train.metrics import expected_calibration_error
 
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")
 WHAT = (

@@ -164,8 +164,8 @@ def _add_surface(
     """Add one surface's colors, and how many of four samples per pixel it fills.
 
     `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
-    all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9) of
-    `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (H, W, 4) is added to.
+    all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9)
+    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (H, W, 4) is added to.
     """
     width, end = first.shape[1] // 2, begin + len(faces)
     flat = sums.reshape(-1, 4)

@@ -306,7 +306,7 @@ def _cast(
 
 @kernel
 def _cones(offsets: NDArray[np.float64]) -> Any:
-    """Cones around boxes (B, 4), seen from the eye: unit direction of the axis, and the cosine of half the angle."""
+    """Cones around boxes (B, 4): unit direction of the axis, and the cosine of half the angle."""
     cones = np.empty((len(offsets), 4))
     for box in range(len(offsets)):
         axis = 0.5 * (offsets[box, 0] + offsets[box, 1])
