@@ -32,6 +32,7 @@ from track.kinematics.marker_kinematics import (
 _DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
 _LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
+_NOISE_STEP: Final = 1e-5  # [m] in which noise is told apart
 # A hand of which the size is measured, chosen on simulated people that benchmarks.doubt does not try; what is
 # not here is the population's.
 _SIZE: Final = 0.02  # logarithm
@@ -140,8 +141,8 @@ class SpreadModel:
     """
 
     def __init__(self, fit: GloveFit, *, is_calibrated: bool) -> None:
-        self._hand, self._is_calibrated = hand_arrays(fit), is_calibrated
-        self._tips, self._measured = tip_lengths(fit), measured_doubt(self._hand.digits)
+        self._hand, self._tips, self._is_calibrated = hand_arrays(fit), tip_lengths(fit), is_calibrated
+        self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -163,8 +164,18 @@ class SpreadModel:
         digits = self._hand.digits
         freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
         noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
-        doubt = calibrated_doubt(digits, noise) if self._is_calibrated else self._measured
+        doubt = self._doubt(round(noise / _NOISE_STEP))
         return pose_spreads(self._hand, self._tips, resting_prior().precision, doubt, qpos, unseen)
+
+    def _doubt(self, steps: int) -> HandDoubt:
+        """What is not known of the hand, at a noise of so many steps."""
+        if steps not in self._doubts:
+            digits = self._hand.digits
+            calibrated = self._is_calibrated
+            self._doubts[steps] = (
+                calibrated_doubt(digits, steps * _NOISE_STEP) if calibrated else measured_doubt(digits)
+            )
+        return self._doubts[steps]
 
 
 def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:

@@ -21,7 +21,7 @@ from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
-from track.user import MEASURED, are_calibrated
+from track.user import MEASURED
 from train.evaluation.metrics import percent
 from train.reports.plot_style import picture
 
@@ -109,7 +109,7 @@ def _calibration_section(take: Take) -> Section:
     elif notes.startswith(MEASURED):
         text = "The hands are not calibrated: their size and proportions were measured in the capture. "
         text += _UNCALIBRATED + _CALIBRATE
-    elif not are_calibrated(notes):
+    elif notes in get_args(Size):
         text = (
             f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
         )
