@@ -116,7 +116,7 @@ def eliminate_poses(
 def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "S S"]:
     """Covariance of the shared unknowns, whatever the poses are: the inverse of the reduced system."""
     reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
-    return np.linalg.inv(reduced[:, :-1])  # type: ignore[no-any-return]
+    return np.linalg.inv(reduced[:, :-1])
 
 
 def _step(

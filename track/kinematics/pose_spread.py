@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import ADULTS
 from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from track.kinematics.joint_prior import resting_prior
@@ -33,12 +32,14 @@ _DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
 _LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
 _NOISE_STEP: Final = 1e-5  # [m] in which noise is told apart
-# A hand of which the size is measured, chosen on simulated people that benchmarks.doubt does not try; what is
-# not here is the population's.
-_SIZE: Final = 0.02  # logarithm
-_PLACE: Final = 0.0015  # [m]
-_KNUCKLE: Final = 0.0017  # [m]
-_THUMB: Final = 3.3  # times the fingers' directions
+# A hand of which size and proportions are measured, chosen on simulated people that benchmarks.doubt does not
+# try. What the fit of the proportions makes up for is not here: less than people differ by.
+_SIZE: Final = 0.001  # logarithm
+_PLACE: Final = 0.0016  # [m]
+_KNUCKLE: Final = 0.0003  # [m]
+_TURN: Final = 1.8  # [deg]
+_THUMB: Final = 4.0  # times the fingers' directions
+_BONES: Final = (0.01, 0.02)  # logarithms, of each bone and of all of a digit
 # A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
 _DETERMINED: Final = 3  # markers that determine a digit
 _FEW: Final = 1.4  # times the doubt of such a digit, of one with fewer
@@ -86,13 +87,13 @@ def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
 
 
 def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
-    """Of a hand of which the size is known: people and gloves differ as simulated ones do.
+    """Of a hand of which size and proportions are measured: people and gloves differ as simulated ones do.
 
     Args:
         digits: Digit of each marker, -1 for the palm.
     """
-    count, turn = len(DIGITS), np.deg2rad(ADULTS.angle_spread)
-    directions = np.tile(turn, (count, 3))
+    count = len(DIGITS)
+    directions = np.full((count, 3), np.deg2rad(_TURN))
     directions[0] *= _THUMB
     return HandDoubt(
         MARKER_NOISE,
@@ -100,7 +101,7 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
         np.full(len(digits), _PLACE),
         np.full(count, _KNUCKLE),
         directions,
-        np.tile([ADULTS.bone_spread, ADULTS.digit_spread], (count, 1)),
+        np.tile(_BONES, (count, 1)),
         0.0,
         np.zeros((count, 2)),
     )
@@ -109,7 +110,7 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
 def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """Of a calibrated hand, which is as near to its user's as the noise of its markers lets it be.
 
-    A digit with a single marker remains half as doubtful as on a hand of which the size is known.
+    A digit with a single marker remains half as doubtful as on a measured hand.
 
     Args:
         digits: Digit of each marker, -1 for the palm.
@@ -137,7 +138,7 @@ class SpreadModel:
 
     Args:
         fit: The hand in its glove.
-        is_calibrated: Whether it is its user's; otherwise only the size is.
+        is_calibrated: Whether it is its user's; otherwise size and proportions are measured.
     """
 
     def __init__(self, fit: GloveFit, *, is_calibrated: bool) -> None:
