@@ -29,7 +29,7 @@ _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by
 _NOTHING: Final = "-"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
-    "Joint angles of such hands are typically 7 to 8 degrees off in the mean, those of calibrated hands 1 to "
+    "Joint angles of such hands are typically 5 to 7 degrees off in the mean, those of calibrated hands 1 to "
     "2 (simulated captures, whose truth is known); the bands say how much for each joint. "
 )
 _CALIBRATE: Final = (
