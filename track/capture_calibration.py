@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from track.capture_tracking import track_capture
+from track.capture_tracking import record_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_check import check_hands
 from track.hand_size import sample_frames
 from track.setup import AnyHands, TrackerSetup, as_designed, found_user
 from track.streams.frame_source import checked_frames
 from track.take_calibration import CalibrationProgress, calibrate_take, kept_user, leaves_markers
+from track.tracker import Tracker
 from track.user import MEASURED, User
 
 
@@ -56,16 +61,20 @@ def calibrate(
     told = progress if progress is not None else _untold
     setup = TrackerSetup.of(glove, hands, size, labeler, (), TrackerConfig())
     source = capture_of(capture)
-    user, network = setup.user, setup.labeler
+    frames, user, network = checked_frames(source), setup.user, setup.labeler
+    sample = sample_frames(frames)
     if setup.is_measured:
-        frames = sample_frames(checked_frames(source))
-        user = found_user(frames, user.layout, user.sides, network) or user
+        user = found_user(sample, user.layout, user.sides, network) or user
+    check_hands(sample, user, network)
     start = as_designed(user) if setup.is_measured else user.hands
-    labeled = partial(track_capture, source, labeler=network, progress=partial(told, "frames"))
-    take = labeled(hands=user)
+
+    def labeled(hands: Sequence[GloveFit]) -> Take:
+        return record_frames(frames, Tracker(hands, network), progress=partial(told, "frames")).take(source)
+
+    take = labeled(user)
     done = calibrate_take(take, start, user, told)
     if leaves_markers(take, done):
-        take = labeled(hands=[one.hand for one in done])
+        take = labeled([one.hand for one in done])
         done = calibrate_take(take, start, user, told)
     name = Path(capture).name if isinstance(capture, str | Path) else "a capture"
     notes = f"calibrated from {name}, {user.notes.removeprefix(MEASURED) or user} to begin with"

@@ -88,9 +88,9 @@ def track_capture(
     is_measured = setup.is_measured
     setup = setup.measured(sample_frames(frames))
     if calibrate:
-        recorder = _record(frames, setup.tracker(), None, None, progress)
+        recorder = record_frames(frames, setup.tracker(), progress=progress)
         setup = _calibrated(recorder.take(source), setup, progress, is_measured=is_measured)
-    recorder = _record(frames, setup.tracker(), sinks, on_frame, progress)
+    recorder = record_frames(frames, setup.tracker(), sinks, on_frame, progress)
     take = recorder.take(source)
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     settings = {**take.settings, **settings, **setup.settings}
@@ -98,12 +98,12 @@ def track_capture(
     return take if corrections is None else _corrected(take, Path(corrections), pins)
 
 
-def _record(
+def record_frames(
     frames: Sequence[StreamedFrame],
     tracker: Tracker,
-    sinks: SinkGroup | None,
-    on_frame: OnFrame | None,
-    progress: Progress | None,
+    sinks: SinkGroup | None = None,
+    on_frame: OnFrame | None = None,
+    progress: Progress | None = None,
 ) -> TakeRecorder:
     """Track all frames; sinks take them at the capture's own rate."""
     recorder = TakeRecorder(tracker)

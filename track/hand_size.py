@@ -21,9 +21,9 @@ from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
 from handsim.space.transforms import MIRROR
 from track.calibration.energy import Estimate, Problem
-from track.calibration.hand_parameters import NUM_PARAMETERS
+from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
-from track.calibration.solver import levenberg_marquardt, user_hand
+from track.calibration.solver import levenberg_marquardt, shared_covariance, user_hand
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
@@ -41,7 +41,6 @@ _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, AN
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
 _MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
 _INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do repeats from frame to frame
-_PROBE: Final = 0.006  # [m] of length to either side, where the cost tells how sure the length is
 _FRAMES: Final = 8  # of each hand with which length and breadth are searched
 _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
 _MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
@@ -52,9 +51,7 @@ _PATIENCE: Final = 20  # frames with enough points for a hand, but none, after w
 _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 16  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
-_UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
-_SLIP_SPREAD, _LIFT_SPREAD = 0.006, 0.002  # [m] of markers around their places, so that tracking finds them
-_REPEATED: Final = 4.0  # a glove that slipped is the same in all frames: they tell the length as one does
+_SURE: Final = 2.0  # standard deviations within which the length is with 95 %
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
@@ -72,9 +69,9 @@ class SizeFit(NamedTuple):
     """Standard deviation of its length [m]."""
 
     def __str__(self) -> str:
-        shape = self.hand.shape
-        unsure = f", unsure by {1e3 * self.spread:.0f} mm" if self.spread > _UNSURE else ""
-        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm{unsure}"
+        """Length and breadth [mm], and by how much the length may be off, with 95 %."""
+        shape, unsure = self.hand.shape, _SURE * self.spread
+        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {1e3 * unsure:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
         """The measured hands of these sides."""
@@ -135,9 +132,7 @@ def _fit_from(
         markers = _label(frames, start, sides, labeler, config) or markers
         search = _Search(markers, start)
         found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    measures, spread = search.measures(found)
-    hand, rms = _fit_proportions(_as_right(markers), _hand(*measures, layout))
-    return SizeFit(hand, rms, spread)
+    return _fit_proportions(_as_right(markers), _hand(*search.measures(found), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
@@ -229,8 +224,8 @@ class _Search:
         """The likeliest length [m] between two; `breadth` gives the breadth [m] of each."""
         return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
 
-    def measures(self, length: float) -> tuple[tuple[float, float], float]:
-        """Length and breadth [m], and the standard deviation of the length [m].
+    def measures(self, length: float) -> tuple[float, float]:
+        """Length and breadth [m].
 
         Args:
             length: The likeliest of hands of the usual breadth [m].
@@ -238,11 +233,7 @@ class _Search:
         usual = usual_breadth(length)
         low, high = (factor * usual for factor in _BREADTHS)
         breadth = _least(lambda tried: self._cost(length, tried), low, high)
-        length = self.length(lambda tried: breadth, 0.95 * length, 1.05 * length)
-        around = [self._cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
-        curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
-        prior = _LENGTH_SPREAD**-2
-        return (length, breadth), (max(curvature - prior, 0.0) / _REPEATED + prior) ** -0.5
+        return self.length(lambda tried: breadth, 0.95 * length, 1.05 * length), breadth
 
     def _cost(self, length: float, breadth: float) -> float:
         solver = PoseSolver(_hand(length, breadth, self._layout))
@@ -293,11 +284,11 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
                 third = tried
 
 
-def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[GloveFit, float]:
-    """One right hand for all hands of a user, calibrated without touches, and its median RMS distance [m].
+def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
+    """One shape for all hands of a user, by a calibration without touches.
 
-    `seen` are labeled markers of right hands, at least four in every frame. What these do not tell stays as
-    it was at the start.
+    `seen` are labeled markers of right hands, at least four in every frame; `start` is a right hand of about
+    the right size in the glove as designed. What the frames do not tell stays as it was.
     """
     worn, shape = start.attachment, start.model.shape
     coordinates = nearest_coordinates(worn.points, shape)
@@ -310,9 +301,10 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple
         robust_scale=_ROBUST_SCALE,
         relinearize=_RELINEARIZE,
     )
-    problem.position_spread, problem.height_spread = _SLIP_SPREAD, _LIFT_SPREAD
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
-    estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
-    return hand, float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
+    rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
+    variance = shared_covariance(problem, estimate, fit)[LENGTH, LENGTH]
+    return SizeFit(hand, rms, hand.shape.length * float(np.sqrt(variance)))

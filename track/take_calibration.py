@@ -17,7 +17,7 @@ from track.calibration.frames import CalibrationError
 from track.calibration.solver import Progress
 from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
-from track.user import User
+from track.user import AS_MEASURED, User
 
 CalibrationProgress = Callable[[str, int, int], None]
 """Called with what is done, such as "frames", how much of it, and of how much."""
@@ -65,7 +65,7 @@ def calibrate_take(
 def kept_user(
     take: Take,
     done: Sequence[Calibration],
-    before: Sequence[GloveFit],
+    before: User,
     notes: str,
     progress: CalibrationProgress | None,
 ) -> User:
@@ -79,8 +79,13 @@ def kept_user(
     whole = tuple(_solved_again(take, one, progress) if one.is_better else one for one in done)
     worn = {hand.side: hand for hand in before}
     hands = tuple(one.hand if one.is_better else worn[one.hand.side] for one in whole)
-    told = [f"{one.hand.side} hand: {one}" for one in whole]
+    told = [f"{one.hand.side} hand: {one}{_remark(one, before)}" for one in whole]
     return User(hands, "; ".join([notes, *told]), whole)
+
+
+def _remark(one: Calibration, before: User) -> str:
+    """What `is_calibrated` knows a hand by that is no better calibrated than measured."""
+    return "" if one.is_better or before.is_calibrated(one.hand.side) else AS_MEASURED
 
 
 def _solved_again(take: Take, one: Calibration, progress: CalibrationProgress | None) -> Calibration:

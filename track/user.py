@@ -28,6 +28,8 @@ from track.config import Size
 SCHEMA: Final = 1
 MEASURED: Final = "auto, "
 """How the notes on hands begin whose size was measured; the size follows."""
+AS_MEASURED: Final = ", as measured"
+"""How the sentence on a hand ends that a calibration left as it was measured."""
 _MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """The stored arrays of an attachment and their types; indices keep theirs, so that fractions are refused."""
@@ -82,10 +84,9 @@ class User(Sequence[GloveFit]):
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)
 
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether the hands are the person's, not hands of the same size."""
-        return are_calibrated(self.notes)
+    def is_calibrated(self, side: Side) -> bool:
+        """Whether the hand of a side is the person's, not one of the same size."""
+        return is_calibrated(self.notes, side)
 
     def __str__(self) -> str:
         """Length and breadth of the hands [mm], one pair where both are alike."""
@@ -165,9 +166,19 @@ class User(Sequence[GloveFit]):
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def are_calibrated(notes: str) -> bool:
-    """Whether hands with these notes are a person's; those of a size, named or measured (auto), are not."""
-    return not notes.startswith(MEASURED) and notes not in get_args(Size)
+def is_calibrated(notes: str, side: Side) -> bool:
+    """Whether the hand of a side, of a user with these notes, is the person's.
+
+    A hand of a size, named or measured (auto), is not, nor one that a calibration left so.
+    """
+    if notes.startswith(MEASURED) or notes in get_args(Size):
+        return False
+    return not any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
+
+
+def _left_as_measured(notes: str) -> list[str]:
+    """The sentences on hands that a calibration left as they were measured."""
+    return [told for told in notes.split("; ") if told.endswith(AS_MEASURED)]
 
 
 def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User:
@@ -202,7 +213,8 @@ def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
         UserError: The file cannot be read.
     """
     if isinstance(hands, str | Path):
-        return dataclasses.replace(load_user(hands), notes=Path(hands).name)
+        user = load_user(hands)
+        return dataclasses.replace(user, notes="; ".join([Path(hands).name, *_left_as_measured(user.notes)]))
     check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
     return hands if isinstance(hands, User) else User(tuple(hands))
 

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from gloves.fit import nominal_fit
+from gloves.layout import load_layout
 from gloves.takes.take import LOST, Take
 from handsim.errors import HandSimWarning
 from track.calibration.frames import CalibrationError
 from track.capture_tracking import track_capture
 from track.kinematics.pose_solver import PoseSolver
 from track.take_calibration import calibrate_take, kept_user
+from track.user import MEASURED, User, nominal_user
 from train.simulation.takes import simulate_take
 
 FRAMES, FRESH = 900, 600
@@ -37,7 +39,7 @@ def angle_error(take: Take, truth: Take) -> float:
 
 @pytest.mark.slow
 def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
-    start = [nominal_fit("dense19", "M", side) for side in ("right", "left")]  # the take has a right one
+    start = nominal_user(load_layout("dense19"), "M", ("right", "left"))  # the take has a right one
     done = calibrate_take(seen, start, start, None)
     user = kept_user(seen, done, start, "from a test", None)
     (one,) = user.calibrations
@@ -52,10 +54,13 @@ def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
 
 @pytest.mark.slow
 def test_a_hand_that_becomes_no_better_stays(seen):
-    start, before = [nominal_fit("dense19", "M", "right")], seen.hands
+    start, before = [nominal_fit("dense19", "M", "right")], User(seen.hands)
     done = calibrate_take(seen, start, before, None)
     user = kept_user(seen, done, before, "from a test", None)
-    assert user[0] is before[0] and "it stays as it was" in user.notes
+    assert user[0] is before[0] and user.notes.endswith("it stays as it was") and user.is_calibrated("right")
+    measured = kept_user(seen, done, User(seen.hands, f"{MEASURED}187 x 83 mm"), "from a test", None)
+    assert measured.notes.endswith("it stays as it was, as measured")
+    assert not measured.is_calibrated("right")
 
 
 def test_a_take_without_a_hand_is_told(seen):

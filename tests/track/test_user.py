@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
-from track.user import User, UserError, load_user
+from track.user import AS_MEASURED, MEASURED, User, UserError, as_user, load_user
 
 
 @pytest.fixture
@@ -44,6 +44,16 @@ def test_hands_come_back_exactly(hands, tmp_path):
         for field in dataclasses.fields(first.model.shape):
             mine, other = (getattr(hand.model.shape, field.name) for hand in (first, second))
             np.testing.assert_array_equal(mine, other)
+
+
+def test_a_hand_that_a_calibration_left_as_measured_is_not_calibrated(hands, tmp_path):
+    left = f"left hand: no better, so that it stays as it was{AS_MEASURED}"
+    User(hands, f"calibrated from a capture; {left}; right hand: better").save(tmp_path / "user.json")
+    for user in (load_user(tmp_path / "user.json"), as_user(tmp_path / "user.json")):
+        assert not user.is_calibrated("left") and user.is_calibrated("right")
+    assert as_user(tmp_path / "user.json").notes == f"user.json; {left}"
+    for notes, calibrated in (("", True), ("M", False), (f"{MEASURED}187 x 83 mm", False)):
+        assert User(hands, notes).is_calibrated("left") == calibrated
 
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):

@@ -51,6 +51,7 @@ from track.calibration.skin_coordinates import (
     skin_weight_jacobian,
     skin_weights,
 )
+from track.kinematics.joint_prior import resting_prior
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
@@ -62,11 +63,10 @@ HEIGHT_SPREAD: Final = 0.0005
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
-_REST_SPREAD: Final = np.deg2rad(90.0)  # of an angle around the resting hand's
+_GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
 RELINEARIZE: Final = 0.005
 """Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
 _STEP: Final = 1e-5  # of finite differences
-_REST: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +142,7 @@ class Problem:
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
+        self._pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
@@ -180,8 +181,9 @@ class Problem:
         cost += estimate.parameters @ self.precision @ estimate.parameters
         cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
         cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
-        values, weights = self._joint_angle_residuals(estimate)
-        cost += (weights * values**2).sum()
+        beyond, off = self._joint_angle_residuals(estimate)
+        cost += (beyond**2).sum() / _LIMIT_SPREAD**2
+        cost += ((off @ self._pose_precision) * off).sum()
         if fit.geometry is not None and estimate.contacts is not None:
             weights = contact_weights(fit.geometry, estimate.contacts.fingers)
             cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
@@ -194,15 +196,11 @@ class Problem:
         return product / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Residuals of the joint angles (F, 40) [rad] to their limits and to rest, and their weights."""
+        """Joint angles (F, 20) [rad] beyond their limits, and from the mean of gestures."""
         angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
-        values = np.concatenate([beyond, angles - _REST], axis=1)
-        weights = np.concatenate(
-            [(beyond != 0.0) / _LIMIT_SPREAD**2, np.full_like(angles, _REST_SPREAD**-2)], 1
-        )
-        return values, weights
+        return beyond, angles - resting_prior().angles
 
     def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
         """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
@@ -309,10 +307,11 @@ class Problem:
         result.shared_gradient[:] += (
             (estimate.coordinates.heights - self.heights) @ heights / self.height_spread**2
         )
-        values, weights = self._joint_angle_residuals(estimate)
+        beyond, off = self._joint_angle_residuals(estimate)
+        result.pose[:, 6:, 6:] += self._pose_precision
         angles = np.arange(6, 26)
-        result.pose[:, angles, angles] += weights[:, :20] + weights[:, 20:]
-        result.pose_gradient[:, 6:] += (weights * values)[:, :20] + (weights * values)[:, 20:]
+        result.pose[:, angles, angles] += (beyond != 0.0) / _LIMIT_SPREAD**2
+        result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
     def _add_contacts(
         self,

@@ -18,7 +18,7 @@ from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.energy import HEIGHT_SPREAD, POSITION_SPREAD, Estimate, Fit, Problem
 from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, shape_jacobian
 from track.calibration.skin_coordinates import SkinPatch, skin_points, skin_weights
-from track.calibration.solver import eliminate_poses
+from track.calibration.solver import shared_covariance
 
 _ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
@@ -66,8 +66,7 @@ def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
 
     Each marker counts as far as the data determine its place, beside a few of the usual spread.
     """
-    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
-    covariance = np.linalg.inv(reduced[:, :-1])
+    covariance = shared_covariance(problem, estimate, fit)
     own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
     blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
     across = np.einsum("mi,mij,mj->m", normals, blocks, normals)
@@ -94,8 +93,7 @@ def standard_errors(
 
     Where the wrist is in the palm is a convention: of the palm's markers it is the error among the knuckles.
     """
-    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
-    covariance = np.linalg.inv(reduced[:, :-1])
+    covariance = shared_covariance(problem, estimate, fit)
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -96,6 +97,12 @@ def eliminate_poses(
     reduced = np.concatenate([equations.shared, equations.shared_gradient[:, None]], axis=1)
     reduced -= flat.T @ solved.reshape(len(flat), -1)
     return reduced, solved
+
+
+def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "S S"]:
+    """Covariance of the shared unknowns, whatever the poses are: the inverse of the reduced system."""
+    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
+    return np.linalg.inv(reduced[:, :-1])
 
 
 def _step(

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import ADULTS
 from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from track.kinematics.joint_prior import resting_prior
@@ -32,24 +31,27 @@ from track.kinematics.marker_kinematics import (
 _DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
 _LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
-# A hand of which the size is measured, chosen on simulated people that benchmarks.doubt does not try; what is
-# not here is the population's.
-_SIZE: Final = 0.02  # logarithm
-_PLACE: Final = 0.0015  # [m]
-_KNUCKLE: Final = 0.0017  # [m]
-_THUMB: Final = 3.3  # times the fingers' directions
+_NOISE_STEP: Final = 1e-5  # [m] in which noise is told apart
+# A hand of which size and proportions are measured, chosen on simulated people that benchmarks.doubt does not
+# try. What the fit of the proportions makes up for is not here: less than people differ by.
+_SIZE: Final = 0.001  # logarithm
+_PLACE: Final = 0.0017  # [m]
+_KNUCKLE: Final = 0.0003  # [m]
+_TURN: Final = 1.8  # [deg]
+_THUMB: Final = 4.0  # times the fingers' directions
+_BONES: Final = (0.01, 0.02)  # logarithms, of each bone and of all of a digit
 # A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
 _DETERMINED: Final = 3  # markers that determine a digit
 _FEW: Final = 1.4  # times the doubt of such a digit, of one with fewer
 _CALIBRATED_SIZE: Final = 3.0  # [1/m] times the noise
-_CALIBRATED_PLACE: Final = 0.5  # times the noise
-_CALIBRATED_PALM: Final = 1.5  # times the noise
+_CALIBRATED_PLACE: Final = 0.15  # times the noise
+_CALIBRATED_PALM: Final = 0.45  # times the noise
 _CALIBRATED_KNUCKLE: Final = 0.15  # times the noise
-_CALIBRATED_TURNS: Final = (0.55, 0.45, 1.5)  # [deg]; abduction hardly tells where a digit points
+_CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg]; abduction hardly tells where a digit points
 _CALIBRATED_THUMB: Final = 1.6  # times the fingers' directions
-_CALIBRATED_BONES: Final = (5.0, 3.0)  # [1/m] times the noise
-_CALIBRATED_WRIST: Final = 0.0009  # [m]
-_CALIBRATED_JOINTS: Final = (0.0002, 0.0006)  # [m]
+_CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] times the noise
+_CALIBRATED_WRIST: Final = 0.0005  # [m]
+_CALIBRATED_JOINTS: Final = (0.00013, 0.00045)  # [m]
 _SINGLE: Final = 4.0  # times these, of a digit with one marker
 _LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
 _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
@@ -85,13 +87,13 @@ def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
 
 
 def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
-    """Of a hand of which the size is known: people and gloves differ as simulated ones do.
+    """Of a hand of which size and proportions are measured: people and gloves differ as simulated ones do.
 
     Args:
         digits: Digit of each marker, -1 for the palm.
     """
-    count, turn = len(DIGITS), np.deg2rad(ADULTS.angle_spread)
-    directions = np.tile(turn, (count, 3))
+    count = len(DIGITS)
+    directions = np.full((count, 3), np.deg2rad(_TURN))
     directions[0] *= _THUMB
     return HandDoubt(
         MARKER_NOISE,
@@ -99,7 +101,7 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
         np.full(len(digits), _PLACE),
         np.full(count, _KNUCKLE),
         directions,
-        np.tile([ADULTS.bone_spread, ADULTS.digit_spread], (count, 1)),
+        np.tile(_BONES, (count, 1)),
         0.0,
         np.zeros((count, 2)),
     )
@@ -108,7 +110,7 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
 def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """Of a calibrated hand, which is as near to its user's as the noise of its markers [m] lets it be.
 
-    A digit with a single marker remains half as doubtful as on a hand of which the size is known.
+    A digit with a single marker remains half as doubtful as on a measured hand.
     """
     before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
@@ -131,12 +133,12 @@ class SpreadModel:
     """Standard deviations of the poses of one hand.
 
     Args:
-        is_calibrated: Whether it is its user's; otherwise only the size is.
+        is_calibrated: Whether it is its user's; otherwise size and proportions are measured.
     """
 
     def __init__(self, fit: GloveFit, *, is_calibrated: bool) -> None:
-        self._hand, self._is_calibrated = hand_arrays(fit), is_calibrated
-        self._tips, self._measured = tip_lengths(fit), measured_doubt(self._hand.digits)
+        self._hand, self._tips, self._is_calibrated = hand_arrays(fit), tip_lengths(fit), is_calibrated
+        self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -157,8 +159,18 @@ class SpreadModel:
         digits = self._hand.digits
         freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
         noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
-        doubt = calibrated_doubt(digits, noise) if self._is_calibrated else self._measured
+        doubt = self._doubt(round(noise / _NOISE_STEP))
         return pose_spreads(self._hand, self._tips, resting_prior().precision, doubt, qpos, unseen)
+
+    def _doubt(self, steps: int) -> HandDoubt:
+        """What is not known of the hand, at a noise of so many steps."""
+        if steps not in self._doubts:
+            digits = self._hand.digits
+            calibrated = self._is_calibrated
+            self._doubts[steps] = (
+                calibrated_doubt(digits, steps * _NOISE_STEP) if calibrated else measured_doubt(digits)
+            )
+        return self._doubts[steps]
 
 
 def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:

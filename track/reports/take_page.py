@@ -21,7 +21,7 @@ from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
-from track.user import MEASURED, are_calibrated
+from track.user import MEASURED
 from train.metrics import percent
 from train.reports.plot_style import picture
 
@@ -29,7 +29,7 @@ _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by
 _NOTHING: Final = "-"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
-    "Joint angles of such hands are typically 7 to 8 degrees off in the mean, those of calibrated hands 1 to "
+    "Joint angles of such hands are typically 5 to 7 degrees off in the mean, those of calibrated hands 1 to "
     "2 (simulated captures, whose truth is known); the bands say how much for each joint. "
 )
 _CALIBRATE: Final = (
@@ -101,7 +101,7 @@ def _calibration_section(take: Take) -> Section:
     elif notes.startswith(MEASURED):
         text = "The hands are not calibrated: their size and proportions were measured in the capture. "
         text += _UNCALIBRATED + _CALIBRATE
-    elif not are_calibrated(notes):
+    elif notes in get_args(Size):
         text = (
             f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
         )

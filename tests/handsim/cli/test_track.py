@@ -171,11 +171,13 @@ def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
     out = tmp_path / "tracked.npz"
     assert main(["track", str(capture), "--out", str(out)]) == 0
     said = capsys.readouterr().out.splitlines()[0]
-    length, breadth = (int(word) for word in said.removeprefix("size of the hands: ")[:-3].split(" x "))
+    size = said.removeprefix("size of the hands: ")
+    length, _, breadth, unit, *doubt = size.split()
+    assert unit == "mm," and doubt[:2] == ["unsure", "by"]
     truth, take = load_take(capture.with_suffix(".truth.npz")), load_take(out)
-    assert length == pytest.approx(1e3 * truth.hands[0].shape.length, abs=12)
-    assert 0.4 < breadth / length < 0.5
-    assert take.settings["user"] == f"auto, {length} x {breadth} mm"
+    assert int(length) == pytest.approx(1e3 * truth.hands[0].shape.length, abs=int(doubt[2]))
+    assert 0.4 < int(breadth) / int(length) < 0.5
+    assert take.settings["user"] == f"auto, {size}"
     assert np.nanmedian(take.rms) < 0.005
 
 
