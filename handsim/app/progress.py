@@ -115,7 +115,7 @@ def _line(task: Task, unit: str, seconds: float) -> str:
     speed = str(_Speed(unit).render(task))
     total = 0.0 if task.total is None else task.total
     if total == 1.0 and not task.completed:  # the task does not know its size yet
-        done = f"working on {unit}"
+        done = f"working on {unit}" if unit else "working"
     else:
         done = f"{task.completed:,.0f} of {total:,.0f} {unit}"
     clock = _clock(seconds)

@@ -41,11 +41,16 @@ def sides_there(take):
 
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_two_hands_are_labeled_better_than_frame_by_frame_and_as_by_the_tracker(kind):
-    take = simulate_take(kind=kind, num_frames=FRAMES)
-    alone = evaluate_labeler(load_labeler("dense19"), [take]).figures["slot_accuracy"]
-    labels = label_capture(take.capture()).labels
-    tracked = track_capture(take.capture()).labels
-    ours, theirs = (right_slots(take.labels, one, len(take.label_names)) for one in (labels, tracked))
+    """In the mean over six people."""
+    slots = []
+    for seed in range(6):
+        take = simulate_take(kind=kind, num_frames=FRAMES, seed=seed)
+        alone = evaluate_labeler(load_labeler("dense19"), [take]).figures["slot_accuracy"]
+        labels = label_capture(take.capture()).labels
+        tracked = track_capture(take.capture()).labels
+        ours, theirs = (right_slots(take.labels, one, len(take.label_names)) for one in (labels, tracked))
+        slots.append((ours, theirs, alone))
+    ours, theirs, alone = np.mean(slots, axis=0)
     assert ours >= max(alone, theirs) - 0.001
 
 
