@@ -118,4 +118,4 @@ def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
     assert page.says("**right** tracked, RMS 1.00 mm")
     rows = [props["label"] for props in page.panel.values() if "label" in props]
     (doubt,) = [row for row in rows if ": " in row]
-    assert "right:ThumbTip without a label, " in doubt
+    assert "right:ThumbCMC without a label, " in doubt
