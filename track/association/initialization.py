@@ -40,10 +40,10 @@ SPARE_POINTS: Final = 6
 _CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
-_FIRST_CUTS: Final = 2  # tried together; mostly one of them is enough
+_FIRST_CUTS: Final = 3  # tried together; mostly one of them is enough
 _LAST_TURN: Final = _CUTS_OF_SEARCH - _FIRST_CUTS  # number of the call in which a search ends
 _CROSSED: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
-_MOST_FITS: Final = 2  # labeled clouds that are fitted at a time, the most confident ones
+_MOST_FITS: Final = 3  # labeled clouds that are fitted at a time, the most confident ones
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
 _MORE_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
@@ -95,8 +95,8 @@ class HandInitializer:
     Args:
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
-        at_once: Look at a group of points along all directions in one call. Otherwise a call looks along one
-            or two, and the next calls, a frame later each, along others, until a hand is certain or all were
+        at_once: Look at a group of points along all directions in one call. Otherwise a call looks along
+            three, and the next calls, a frame later each, along one more, until a hand is certain or all were
             tried: no frame waits for a search.
     """
 
