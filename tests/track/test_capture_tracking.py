@@ -194,6 +194,7 @@ from numba.core.registry import CPUDispatcher
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.capture_tracking import track_capture
+from track.label_confidence import label_confidence
 from track.setup import warm_up
 from track.streams.frame_source import checked_frames
 from train.glove_labeler import load_labeler
@@ -207,7 +208,8 @@ take = simulate_take(kind="hand-hand", num_frames=40)
 hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
 labeler = load_labeler("dense19")
 warm_up(hands, labeler)
-checked_frames(take.capture())  # of a whole capture alone; a stream has no such check
+checked_frames(take.capture())  # of a whole capture alone, as the next; a stream has neither
+label_confidence(take)
 before = ready()
 track_capture(take, hands=hands, labeler=labeler)
 for cloud in np.random.default_rng(1).uniform(0.0, 0.1, (20, 19, 3)):
