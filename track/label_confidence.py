@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.takes.take import Take
-from track.label_evidence import evidence_of
+from track.label_evidence import Evidence, evidence_of
 
 _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
@@ -20,15 +20,19 @@ _UNLABELED: Final = (-7.07, 3.55, 6.40, 3.60, 5.50, 1.69, 0.32, 1.17)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 
-def label_confidence(take: Take) -> Float[np.ndarray, "T N"]:
+def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "T N"]:
     """Probability that each label of a tracked take is right; of a point without one, that it is no marker.
 
     Confidences of rigid bodies' points stay, and all those of a take without poses.
+
+    Args:
+        take: A take of hands.
+        evidence: What `evidence_of` makes of it, where that is known already.
     """
     confidence = take.confidence.copy()
     if not np.isfinite(take.qpos).any():
         return confidence
-    told = evidence_of(take)
+    told = evidence_of(take) if evidence is None else evidence
     labeled = told.labels >= 0
     right = np.zeros(len(labeled))
     for which, values, weights in (

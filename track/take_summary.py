@@ -15,7 +15,7 @@ from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
 from track.association.point_groups import distances_to_nearest
 from track.label_confidence import label_confidence
-from track.label_evidence import evidence_of
+from track.label_evidence import Evidence, evidence_of
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
@@ -163,9 +163,9 @@ def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
         take: A tracked take; of a truth there is nothing to doubt.
         most: The largest number of spans; all when None.
     """
-    confidence, markers = _confidence(take), take.labels.astype(np.int64)
-    if (confidence < _CERTAIN).any() and np.isfinite(take.qpos).any():
-        evidence = evidence_of(take)
+    evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
+    confidence, markers = _confidence(take, evidence), take.labels.astype(np.int64)
+    if evidence is not None:
         markers[evidence.frames, evidence.columns] = evidence.markers
     least = np.fmin.reduce(confidence, axis=1, initial=1.0)
     found: list[tuple[float, Doubt]] = []
@@ -210,11 +210,16 @@ def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
     return least
 
 
-def _confidence(take: Take) -> Float[np.ndarray, "T N"]:
+def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "T N"]:
     """The confidence by all of the take; 1 stays, as that of corrected labels and of a truth."""
-    if (take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all():
+    if _is_known(take):
         return take.confidence
-    return np.where(take.confidence == 1.0, 1.0, label_confidence(take))
+    return np.where(take.confidence == 1.0, 1.0, label_confidence(take, evidence))
+
+
+def _is_known(take: Take) -> bool:
+    """Whether every label is certain, as those of a truth."""
+    return bool((take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all())
 
 
 def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
