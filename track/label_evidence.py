@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gloves.takes.take import LOST, Take, labeled_markers
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import point_distance
 from track.kinematics.joint_prior import resting_prior
 
 LABELED: Final = (
@@ -190,12 +191,12 @@ def _surroundings(
                 continue
             for k in range(len(free)):
                 if free[k]:
-                    distance = _distance(points[i], expected[frame, k])
+                    distance = point_distance(points[i], expected[frame, k])
                     if distance < near[0, u]:
                         near[0, u], marker[u] = distance, k
             for j in range(first, last):
                 if i != j:
-                    distance = _distance(points[i], points[j])
+                    distance = point_distance(points[i], points[j])
                     near[1, u] = min(near[1, u], distance)
                     near[2, u] += labels[j] < 0 and distance < beside
             u += 1
@@ -276,8 +277,11 @@ def _undo_exchanges(
             one, other = source[j], source[m]
             if one < 0 or other < 0:
                 continue
-            kept, also = _distance(predicted[one], points[j]), _distance(predicted[other], points[m])
-            changed = _distance(predicted[one], points[m]) + _distance(predicted[other], points[j])
+            kept, also = (
+                point_distance(predicted[one], points[j]),
+                point_distance(predicted[other], points[m]),
+            )
+            changed = point_distance(predicted[one], points[m]) + point_distance(predicted[other], points[j])
             if min(kept, also) >= exchange and changed < 0.5 * (kept + also):
                 source[j], source[m] = other, one
 
@@ -287,13 +291,7 @@ def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], mo
     """The point nearest to a place, -1 if it is farther than `most` [m]."""
     found = -1
     for i in range(len(points)):
-        distance = _distance(points[i], place)
+        distance = point_distance(points[i], place)
         if distance < most:
             most, found = distance, i
     return found
-
-
-@kernel(inline=True)
-def _distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
-    """Distance of two points [m]."""
-    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]

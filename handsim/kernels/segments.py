@@ -1,4 +1,4 @@
-"""Distance between two straight segments, compiled: the geometric test of contact and of visibility."""
+"""Distances of two points and of two straight segments, compiled; the test of contact and of visibility."""
 
 from __future__ import annotations
 
@@ -6,6 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim.kernels.kernel import kernel
+
+
+@kernel(inline=True)
+def point_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Distance of two points [m]."""
+    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]
 
 
 @kernel(inline=True)

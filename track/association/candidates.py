@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import point_distance
 
 MAX_CANDIDATES: Final = 7
 """Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
@@ -78,7 +79,7 @@ def _find_candidates(
                 continue
             incomplete = incomplete or missing[marker]
             for point in range(len(points)):
-                distance = _distance(points[point], positions[marker])
+                distance = point_distance(points[point], positions[marker])
                 distances[digit, point] = min(distances[digit, point], distance)
                 if assigned[point] < 0:
                     rivals[point] |= distance < (_MISSING_RADIUS if missing[marker] else _SEEN_RADIUS)
@@ -114,7 +115,7 @@ def _find_contested(
             continue
         for marker in range(len(missing)):
             other = missing[marker] and table.digits[marker] not in (-1, table.digits[owner])
-            if other and _distance(points[point], table.positions[marker]) < _MISSING_RADIUS:
+            if other and point_distance(points[point], table.positions[marker]) < _MISSING_RADIUS:
                 contested[point] = True
     return contested
 
@@ -138,9 +139,3 @@ def _add_nearest(
         candidates[count] = nearest
         count += 1
     return count
-
-
-@kernel
-def _distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
-    """Distance of two points [m]."""
-    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]

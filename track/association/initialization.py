@@ -179,9 +179,7 @@ class HandInitializer:
         )
         if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
             return hands
-        found = [hand for fit in first if (hand := self._trim(fit, points)) is not None]
-        better = sum(hand.score for hand in found) > one.score + two.score
-        return found if len(found) == 2 and better else hands
+        return _likelier([self._trim(fit, points) for fit in first], hands)
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
         """Log-odds of `count` labeled points being a hand against their being strays.
@@ -343,9 +341,9 @@ class HandInitializer:
         """
         if len(hands) != 2:
             return hands
-        one, two = hands
-        digits = self._states[one.index].solver.hand.digits
+        digits = self._states[hands[0].index].solver.hand.digits
         for digit in range(len(DIGITS)):
+            one, two = hands
             ours, theirs = (
                 np.flatnonzero((hand.labels >= 0) & (digits[hand.labels] == digit)) for hand in (one, two)
             )
@@ -360,10 +358,8 @@ class HandInitializer:
                 self._trim(self._refit(hand.index, points, labels, hand.fit), points)
                 for hand, labels in ((one, first), (two, second))
             ]
-            found = [hand for hand in changed if hand is not None]
-            if len(found) == 2 and sum(hand.score for hand in found) > one.score + two.score:
-                one, two = found
-        return [one, two]
+            hands = _likelier(changed, hands)
+        return hands
 
     def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
         """Drop the worst label while that improves the score; None where it is no hand."""
@@ -420,6 +416,15 @@ class HandInitializer:
         unusual = float(offset @ self._prior.precision @ offset) - NUM_JOINTS
         penalty = np.clip(_POSE_WEIGHT * unusual, 0.0, _MOST_POSE_PENALTY)
         return InitializedHand(index, fit, labels, self.score(count, rms, spread) - float(penalty))
+
+
+def _likelier(
+    changed: Sequence[InitializedHand | None], hands: list[InitializedHand]
+) -> list[InitializedHand]:
+    """Changed hands if all of them are hands and score more together, else the hands as they were."""
+    found = [hand for hand in changed if hand is not None]
+    better = sum(hand.score for hand in found) > sum(hand.score for hand in hands)
+    return found if better and len(found) == len(hands) else hands
 
 
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
