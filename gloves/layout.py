@@ -244,6 +244,9 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
     if str(glove) in list_layouts():
         path = _SHIPPED / f"{glove}.toml"
     elif path.suffix.lower() != ".toml":
+        beside = Path(f"{glove}.toml")
+        if beside.is_file():
+            raise LayoutError(f"unknown glove '{glove}'; give the name of its file, {beside}")
         unknown = choices(str(glove), list_layouts(), noun="glove")
         raise LayoutError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=LayoutError)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from handsim.hand.shape import HandShape, Population, sample_shape
     from handsim.space.camera import Camera, look_at
     from handsim.space.cameras import CameraRig, load_rig
+    from handsim.space.lens import Lens
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
@@ -29,6 +30,7 @@ __getattr__, __dir__ = lazy_exports(
         "HandModel": "handsim.hand.model",
         "HandMotion": "handsim.hand.motion",
         "HandShape": "handsim.hand.shape",
+        "Lens": "handsim.space.lens",
         "join_qpos": "handsim.hand.model",
         "look_at": "handsim.space.camera",
         "load_rig": "handsim.space.cameras",
@@ -43,6 +45,7 @@ __all__ = [
     "HandMotion",
     "HandShape",
     "HandSimError",
+    "Lens",
     "Population",
     "ShadowedPackageWarning",
     "__version__",

@@ -46,6 +46,8 @@ def fill_settings(config: Any) -> None:
         if one.default_factory is dataclasses.MISSING:
             continue
         value, default = getattr(config, one.name), one.default_factory()
+        if value is None and "None" in str(one.type):
+            continue
         if not dataclasses.is_dataclass(default) or type(value) is type(default):
             continue
         check_type(one.name, value, Mapping, f"a {type(default).__name__} or a mapping of its settings")

@@ -121,10 +121,10 @@ def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: An
     try:
         inspect.signature(function).bind(*args, **options)
     except TypeError as error:
-        expected = ", ".join([*("array" if hasattr(one, "shape") else type(one).__name__ for one in args)])
-        keywords = "".join(f", {key}=..." for key in options)
+        given = [*("array" if hasattr(one, "shape") else type(one).__name__ for one in args)]
+        given += [f"{key}=..." for key in options]
         raise ArgumentError(
-            f"{noun} '{name}' does not take the arguments ({expected}{keywords}): {error}"
+            f"{noun} '{name}' does not take the arguments ({', '.join(given)}): {error}"
         ) from error
     except ValueError:  # a builtin without a signature
         pass

@@ -9,6 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from handsim._checks import check_type, fill_settings
 from handsim.errors import ArgumentError, choices
 from render.cameras.viewpoints import ViewConfig
 from render.frames import PASSES
@@ -17,7 +18,7 @@ from render.scenery.backgrounds import BackgroundConfig
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.skin.look import ALL_TONES, check_tones
+from render.skin.look import ALL_TONES, TONES, check_tones, hyphened, named_tones
 
 NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
@@ -54,14 +55,15 @@ class RenderConfig:
     passes: tuple[str, ...] = PASSES
     """Pictures to draw: some of rgb, depth, normals, ids."""
     view: ViewConfig = field(default_factory=ViewConfig)
-    """Cameras, and where they stand."""
+    """Cameras, and where they stand; a mapping holds what differs from the usual ones."""
     dress: Literal["skin", "glove"] = "skin"
     """Bare hands, or the marker glove with its markers."""
     tones: tuple[float, ...] = ALL_TONES
     """Ranges of individual typology angles that skins are drawn from [deg], the ends of each one after the
-    other; see `render.skin.look.TONES`."""
+    other; names of classes, as very-light, brown, stand for those of `render.skin.look.TONES`."""
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
-    """Shares of the kinds of background."""
+    """Shares of the kinds of background; a name of a kind or several, as `("room", "plain")`, are equal
+    shares."""
     vary: Literal["shard", "frame"] = "shard"
     """Whether light and background change with every shard or every frame; people change with every shard."""
     depth_sensor: DepthNoiseConfig | Literal["auto"] | None = "auto"
@@ -81,7 +83,17 @@ class RenderConfig:
     """Seed of all random choices."""
 
     def __post_init__(self) -> None:
+        check_type("passes", self.passes, (str, tuple, list), "names of passes", PASSES)
+        check_type("tones", self.tones, (str, tuple, list), "names of skin tones", map(hyphened, TONES))
+        if isinstance(self.background, str | tuple | list):
+            object.__setattr__(self, "background", BackgroundConfig.of_kinds(self.background))
+        fill_settings(self)
+        tones = (self.tones,) if isinstance(self.tones, str) else tuple(self.tones)
+        if any(isinstance(tone, str) for tone in tones):
+            object.__setattr__(self, "tones", named_tones(tones))  # type: ignore[arg-type]  # names
         check_tones(self.tones)
+        if isinstance(self.passes, str):
+            object.__setattr__(self, "passes", (self.passes,))
         for name in self.passes:
             if name not in PASSES:
                 raise ArgumentError(choices(name, PASSES, noun="pass"))

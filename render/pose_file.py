@@ -267,7 +267,7 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
     if "hand_size" not in arrays:
         return None
     sizes = arrays["hand_size"]
-    if sizes.dtype.kind != "f" or sizes.shape[-1:] != (2,) or sizes.ndim > 2 or not sizes.size:
+    if sizes.dtype.kind not in "fiu" or sizes.shape[-1:] != (2,) or sizes.ndim > 2 or not sizes.size:
         raise ArgumentError(f"hand_size has shape {sizes.shape}, expected (P, 2): length and breadth [m]")
     sizes = sizes.reshape(-1, 2).astype(np.float64)
     if not ((sizes > 0.03) & (sizes < 0.35)).all():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured
-from render.formats.annotations.common import without_colors
+from render.formats.annotations.common import centered_K, without_colors
 from render.formats.clip_writer import TAR
 from render.formats.merging import CONFIG
 from render.formats.shards import INDEX
@@ -109,8 +110,7 @@ def render_take(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
-    if config.background.photo > 0.0:
-        photo_files(Path(str(config.background.photos)))
+    _check_lenses(formats, drawing)
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
@@ -212,10 +212,14 @@ class _Telling:
 
 
 def _settings(drawing: Drawing) -> dict[str, Any]:
-    """What decides the pictures, as JSON; what is not a take's file counts by its content."""
+    """What decides the pictures, as JSON; files count by their contents, photographs by names and sizes."""
     subject = drawing.subject
     settings: dict[str, Any] = {"take": subject.name, "frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
+    if drawing.config.background.photo > 0.0:
+        files, _ = photo_files(Path(str(drawing.config.background.photos)))
+        listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
+        settings["photos"] = f"sha256:{hashlib.sha256(listed.encode()).hexdigest()}"
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
@@ -256,6 +260,13 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
+
+
+def _check_lenses(formats: Sequence[str], drawing: Drawing) -> None:
+    """Refuse cameras that a format has no place for, before a folder is begun."""
+    if {"freihand", "interhand"} & set(formats):
+        for camera in drawing.viewpoints.cameras(0):
+            centered_K(camera)
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:

@@ -72,7 +72,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     | `visible` | (21,) bool | whether nothing hides them |
     | `box` | (4,) float32 | left, top, width, height of what is seen [px]; NaN: nothing |
     | `qpos` | (27,) float32 | wrist in the world [m], wxyz; joint angles [rad] |
-    | `shape` | (67,) float32 | the numbers of `HandShape`, lengths in [m] |
+    | `shape` | (68,) float32 | the numbers of `HandShape`, lengths in [m] |
     | `side` | () int64 | 0 left, 1 right |
     | `K`, `T_world_camera` | (3, 3), (4, 4) float32 | of the camera |
     | `person`, `tone` | () int64, () float32 | who it is; typology angle of the skin [deg], NaN in gloves |

@@ -89,7 +89,7 @@ def track_capture(
     setup = setup.measured(sample_frames(frames))
     if calibrate:
         recorder = record_frames(frames, setup.tracker(), progress=progress)
-        setup = _calibrated(recorder.take(source), setup, progress, is_measured=is_measured)
+        setup = _calibrated(recorder.take(source), setup, is_measured=is_measured)
     recorder = record_frames(frames, setup.tracker(), sinks, on_frame, progress)
     take = recorder.take(source)
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
@@ -123,18 +123,16 @@ def record_frames(
     return recorder
 
 
-def _calibrated(
-    take: Take, setup: TrackerSetup, progress: Progress | None, *, is_measured: bool
-) -> TrackerSetup:
+def _calibrated(take: Take, setup: TrackerSetup, *, is_measured: bool) -> TrackerSetup:
     """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
-    user, told = setup.user, None if progress is None else lambda _, *steps: progress(*steps)
+    user = setup.user
     try:
-        done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, told)
+        done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, None)
     except CalibrationError as error:
         warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
         return setup
     notes = f"calibrated on the take itself, {user.notes.removeprefix(MEASURED) or user} to begin with"
-    found = kept_user(take, done, user, notes, told)
+    found = kept_user(take, done, user, notes, None)
     better = {hand.side: hand for hand in found}
     hands = tuple(better.get(hand.side, hand) for hand in user)
     settings = {**setup.settings, "user": found.notes}

@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
-from handsim._checks import check_type
+from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
@@ -197,6 +197,9 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
     check_type("hands", hands, (Sequence, Path), _HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)
+    if isinstance(hands, str) and not hands.endswith(".json") and not Path(hands).is_file():
+        names = ", ".join(SIDES)
+        raise ArgumentError(f"hands is {shown_value(hands)}, expected {_HANDS}; valid names: {names}")
     if isinstance(hands, str | Path | User):
         return _in_glove(as_user(hands), glove, size), False
     for hand in hands:
@@ -219,8 +222,8 @@ def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
     if names != expected:
         name = glove if isinstance(glove, str | Path) else glove.name
         raise ArgumentError(
-            f"{user.notes or 'the hands'} is of a glove with the markers {', '.join(names)}, "
-            f"but glove '{name}' has {', '.join(expected)}"
+            f"the hands wear a glove with the markers {', '.join(names)}, but glove '{name}' has "
+            f"{', '.join(expected)}"
         )
     return user
 

@@ -75,8 +75,8 @@ def evaluate_labeler(
         )
     if takes and (corruption != CLEAN or every > 1):
         raise CaptureError(
-            "a simulated take is counted whole, with its own gaps and ghosts: leave out --occlude, --ghosts "
-            "and --every"
+            "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
+            "(--occlude, --ghosts) and every (--every), which labeled captures take"
         )
     for one in takes:
         take = one if isinstance(one, Take) else load_take(one)

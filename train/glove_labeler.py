@@ -59,7 +59,7 @@ def load_labeler(
     if found.marker_names != layout.names:
         raise WeightsError(
             f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{layout.name}' has "
-            f"{', '.join(layout.names)}"
+            f"{', '.join(layout.names)}; name the glove that it was trained on (--glove)"
         )
     return found
 
@@ -97,10 +97,11 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
             return load_stored_labeler(name)
     from train.any_layout.learned_gloves import is_learned, learned_labeler  # torch
 
-    shown = layout.name if isinstance(glove, MarkerLayout) else glove
+    is_shipped = layout.name in list_layouts() and load_layout(layout.name) == layout
+    shown = layout.name if is_shipped else "GLOVE.toml" if isinstance(glove, MarkerLayout) else glove
     how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
     warnings.warn(
-        f"no labeler was trained on glove '{shown}', so that the one for any layout labels it, which {how}; "
+        f"no labeler was trained on glove '{layout.name}', so that the one for any layout labels it, which {how}; "
         f"a better one takes handsim generate --glove {shown} --out SET && handsim train SET --out RUN, and "
         "--labeler RUN",
         HandSimWarning,

@@ -553,9 +553,12 @@ class Take:
         The file also holds `keypoints`, for programs that have no model of the hand.
 
         Raises:
+            ArgumentError: The ending is another.
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
+        if Path(path).suffix.lower() != ".npz":
+            raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)

@@ -115,9 +115,9 @@ def _line(task: Task, unit: str, seconds: float) -> str:
     speed = str(_Speed(unit).render(task))
     total = 0.0 if task.total is None else task.total
     if total == 1.0 and not task.completed:  # the task does not know its size yet
-        done = f"working on {unit}" if unit else "working"
+        done = "getting ready"
     else:
-        done = f"{task.completed:,.0f} of {total:,.0f} {unit}"
+        done = f"{task.completed:,.0f} of {total:,.0f} {unit}".rstrip()
     clock = _clock(seconds)
     rest = task.time_remaining
     left = f"{_clock(rest)} left" if rest else ""
@@ -140,4 +140,4 @@ class _Speed(ProgressColumn):
         if not speed:
             return Text("")
         number = f"{speed:,.0f}" if speed >= 10.0 else f"{speed:.2g}"
-        return Text(f"{number} {self.unit}/s", style="progress.data.speed")
+        return Text(f"{number}{' ' * bool(self.unit)}{self.unit}/s", style="progress.data.speed")

@@ -64,8 +64,7 @@ def evaluate(
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
         found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
         save_json(json, {**drawn, **found, "slot_accuracy_by_marker": by_marker})
-    print_figures(
-        {"share": report.figures}, title=f"{report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
-    )
+    hard = f", occlude {occlude}, ghosts {ghosts}" if occlude or ghosts else ""
+    print_figures({"share": report.figures}, title=f"{report.num_frames} hands in frames{hard}")
     worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
     print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))

@@ -12,6 +12,7 @@ from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
 from handsim.app.progress import named_steps, print_above, progress_bar
+from handsim.errors import ArgumentError
 from handsim.hand.topology import SIDES
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
@@ -62,5 +63,8 @@ def _report(config: DatasetConfig, out: Path) -> Path:
         kind: SimulatedKind = (
             "hand-hand" if len(load_layout(config.glove).sides) == len(SIDES) else "single-hand"
         )
-        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
+        try:
+            take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
+        except ArgumentError:  # a small rig stands where hands of captures move, which no set needs
+            return write_report(Dataset(out))
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

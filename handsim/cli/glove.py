@@ -291,7 +291,9 @@ def _tell_trials(trials: Mapping[str, Trial], layout: MarkerLayout) -> None:
         return
     print_line("captures, hands not calibrated; slots and whole frames that are right:")
     header, *rows = trial_rows(trials, layout)
-    table = Table(*header, box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for column in header:
+        table.add_column(Text(column))
     for row in rows:
         table.add_row(*map(Text, row))
     Console().print(table)

@@ -22,13 +22,13 @@ from render.config import RenderConfig
 from render.formats.merging import merge_renderings
 from render.painting.painter import PainterChoice
 from render.pose_file import CSV
-from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
+from render.scenery.backgrounds import BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
-from render.skin.look import ALL_TONES, TONES, named_tones
+from render.skin.look import ALL_TONES, named_tones
 from render.subject import PoseFile
 
 _NO_SENSOR: Final = "none"
@@ -70,7 +70,8 @@ class RenderOptions:
     """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
     all when not given."""
     background: tuple[BackgroundKind, ...] = ()
-    """Kinds of background: plain, gradient, noise, clutter, room, photo; a mixture when not given."""
+    """Kinds of background: plain, gradient, noise, clutter, room, photo; when not given, a mixture of the
+    others, or photographs alone where --photos is given."""
     photos: Path | None = None
     """Folder of photographs, for backgrounds of the kind photo."""
     vary: Literal["shard", "frame"] = _DEFAULT.vary
@@ -100,8 +101,8 @@ class RenderOptions:
         return RenderConfig(
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
             view=ViewConfig(**{name: getattr(self, name) for name in _AS_IN_VIEW}),
-            tones=_tone_ranges(self.tones),
-            background=_backgrounds(self.background, self.photos),
+            tones=named_tones(self.tones) if self.tones else ALL_TONES,
+            background=BackgroundConfig.of_kinds(self.background, self.photos),
             depth_sensor=_sensors(self.depth_sensor),
             color_sensor=ExposureConfig() if self.color_sensor else None,
             shutter=ShutterConfig() if self.motion_blur else None,
@@ -151,6 +152,8 @@ def render(
     if merge:
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
+        if options != RenderOptions() or format != ("webdataset",):
+            raise HandSimError("--merge copies pictures as they are; leave out the options of drawing")
         count = merge_renderings(merge, place)
         print_line(f"{out}: {count} shards of {len(merge)} renderings")
         return
@@ -213,25 +216,6 @@ def _print_lacking(out: str, place: Place) -> None:
     cut = cut_off_pictures(place)
     if cut:
         print_line(f"{out}: images that lack a hand of their frame: {len(cut)} (the first: {cut[0]})")
-
-
-def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:
-    """Typology angles [deg] of the classes."""
-    if not tones:
-        return ALL_TONES
-    known = {name.replace(" ", "-"): name for name in TONES}
-    for name in tones:
-        if name not in known:
-            raise HandSimError(choices(name, known, noun="skin tone"))
-    return named_tones([known[name] for name in tones])
-
-
-def _backgrounds(kinds: tuple[BackgroundKind, ...], photos: Path | None) -> BackgroundConfig:
-    folder = None if photos is None else str(photos)
-    if not kinds and folder is None:
-        return BackgroundConfig()
-    chosen = kinds or ("photo",)
-    return BackgroundConfig(**{kind: float(kind in chosen) for kind in KINDS}, photos=folder)
 
 
 def _print_left_out(photos: Path) -> None:

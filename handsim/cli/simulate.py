@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import tyro
 
-from gloves.captures.capture import Capture, count_gaps
+from gloves.captures.capture import Capture, run_lengths
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
@@ -47,8 +47,10 @@ def simulate(
         with chosen_workers(cluster, None, print_line) as workers:
             list(run_jobs(functools.partial(_capture_of_seed, out, config), [config.seed], workers))
         take = load_take(truth)
-    counts = count_gaps(take.markers_present())
-    print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")
+    gaps = len(run_lengths(~take.markers_present()))
+    print_line(
+        f"{out}: {take.num_frames} frames, {gaps} gap{'s' * (gaps != 1)} of single markers; truth in {truth}"
+    )
 
 
 def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:

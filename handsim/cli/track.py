@@ -137,7 +137,12 @@ def _track_file(
             corrections=corrections if corrections.exists() else None,
             calibrate=calibrate,
             sinks=sinks,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=lambda done, total: bar.update(
+                task,
+                completed=done,
+                total=total,
+                description="calibrating" if calibrate and done == total else "",
+            ),
             on_frame=on_frame,
         )
     take.save(out)

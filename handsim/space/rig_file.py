@@ -76,10 +76,6 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
         raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MOST}")
     check_names(str(path), cameras)
     for camera in cameras:
-        if not _NAME.fullmatch(camera.name):
-            raise RigError(
-                f"{path}: a camera is called {shown(camera.name)}, expected up to 64 letters, digits, - and _"
-            )
         try:
             check_near(f"camera '{camera.name}'", camera)
         except RigError as error:
@@ -88,13 +84,17 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
 
 
 def check_names(owner: str, cameras: Sequence[Camera]) -> None:
-    """Refuse two cameras of one name.
+    """Refuse two cameras of one name, and names that cannot be part of a file's.
 
     Raises:
         RigError: There are such.
     """
     names = [camera.name for camera in cameras]
     for name in names:
+        if not _NAME.fullmatch(name):
+            raise RigError(
+                f"{owner}: a camera is called {shown(name)}, expected up to 64 letters, digits, - and _"
+            )
         if names.count(name) > 1:
             raise RigError(f"{owner}: two cameras are called '{name}', expected different names")
 

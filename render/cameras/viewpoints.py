@@ -21,6 +21,7 @@ from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.cameras import load_rig
+from handsim.space.rig_file import check_names
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.framing import Framing, looking, poses_at
@@ -87,10 +88,21 @@ class ViewConfig:
                 f"the cameras are those of {self.own_cameras}; leave out the placement, the camera and the "
                 "views"
             )
+        if isinstance(self.cameras, tuple):
+            check_names("cameras", self.cameras)
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
         if self.placement not in PLACEMENTS:
             raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
+        if self.placement == "rig" and self.views != 1:
+            raise ArgumentError(
+                f"views is {self.views} with the placement rig, which has a view from each of its cameras; "
+                "leave it out"
+            )
+        if self.placement != "rig" and self.rig != "six":
+            raise ArgumentError(
+                f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"
+            )
         if self.views < 1:
             raise ArgumentError(f"{self.views} views, expected at least 1")
         check_number("share", self.share, 0.01, 1.0)

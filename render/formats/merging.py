@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from handsim._checks import check_type
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
@@ -33,7 +34,7 @@ _LARGEST: Final = 1 << 30  # bytes of a picture's file
 _SAMPLE: Final = re.compile(r"(\d+)(\..+)")
 
 
-def merge_renderings(folders: Sequence[Path], out: Path) -> int:
+def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     """Copy the shards of several renderings into one folder.
 
     Frames of the second rendering are numbered after those of the first, and so on, in keys, names of files
@@ -51,6 +52,10 @@ def merge_renderings(folders: Sequence[Path], out: Path) -> int:
             renderings, `out` is not new, or the disk is too small.
         DatasetError: A shard is damaged.
     """
+    check_type("folders", folders, (list, tuple), "paths of folders")
+    folders, out = [Path(folder) for folder in folders], Path(out)
+    if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
+        raise HandSimError("expected two or more different folders to merge")
     settings = [_settings(folder) for folder in folders]
     formats = settings[0]["formats"]
     for folder, one in zip(folders, settings, strict=True):
@@ -64,8 +69,6 @@ def merge_renderings(folders: Sequence[Path], out: Path) -> int:
             raise HandSimError(
                 f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
             )
-    if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
-        raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
     _check_space(folders, out)

@@ -7,6 +7,7 @@ picture.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -80,6 +81,25 @@ class BackgroundConfig:
             raise HandSimError(f"shares of backgrounds are {shares}, expected none negative and one positive")
         if self.photo > 0.0 and self.photos is None:
             raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in")
+
+    @classmethod
+    def of_kinds(cls, kinds: str | Sequence[str] = (), photos: str | Path | None = None) -> BackgroundConfig:
+        """Equal shares of some kinds of `KINDS`; of none, the usual mixture, or photographs where there are.
+
+        Args:
+            photos: Folder of photographs, its subfolders included.
+
+        Raises:
+            HandSimError: A kind is unknown, or photographs are requested without a folder.
+        """
+        chosen = (kinds,) if isinstance(kinds, str) else tuple(kinds)
+        folder = None if photos is None else str(photos)
+        if not chosen and folder is None:
+            return cls()
+        for kind in chosen:
+            if kind not in KINDS:
+                raise HandSimError(choices(str(kind), KINDS, noun="background"))
+        return cls(**{kind: float(kind in (chosen or ("photo",))) for kind in KINDS}, photos=folder)
 
     def shares(self) -> tuple[float, ...]:
         """The shares in the order of `KINDS`."""

@@ -14,7 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError, HandSimError
+from handsim._checks import check_type
+from handsim.errors import ArgumentError, HandSimError, choices
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -111,10 +112,27 @@ def tone_name(angle: float) -> str:
     return next((name for name, (low, _) in TONES.items() if angle > low), "dark")
 
 
+def hyphened(tone: str) -> str:
+    """The name of a class of `TONES` as options have it."""
+    return tone.replace(" ", "-")
+
+
 def named_tones(names: Sequence[str]) -> tuple[float, ...]:
-    """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range."""
+    """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range.
+
+    Args:
+        names: Of classes, with a space or a hyphen in very light.
+
+    Raises:
+        ArgumentError: A class is unknown.
+    """
+    known = {hyphened(name): angles for name, angles in TONES.items()}
+    for name in names:
+        check_type("a skin tone", name, str, "its name", known)
+        if hyphened(name) not in known:
+            raise ArgumentError(choices(name, known, noun="skin tone"))
     ranges: list[float] = []
-    for low, high in sorted({TONES[name] for name in names}):
+    for low, high in sorted({known[hyphened(name)] for name in names}):
         if ranges and low <= ranges[-1]:
             ranges[-1] = high
         else:

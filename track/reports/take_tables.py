@@ -18,7 +18,7 @@ from handsim.hand.topology import JOINT_NAMES, JOINTS
 from track.reports.hand_figures import RANGE, HandFigures
 from track.take_summary import Doubt
 
-TABLES: Final = (".csv", ".joints.csv", ".markers.csv", ".doubts.csv")
+TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 """How their names end: frames, ranges of motion, markers, frames to look at."""
 
 

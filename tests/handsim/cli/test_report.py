@@ -28,9 +28,9 @@ def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.startswith(f"{out}: page on {folder / name}; tables in ") and said.count("\n") == 1
     names = {path.name for path in out.parent.iterdir()}
-    assert names == {"page.html", "page.csv", "page.joints.csv", "page.markers.csv", "page.doubts.csv"}
+    assert names == {"page.html", "page.frames.csv", "page.joints.csv", "page.markers.csv", "page.doubts.csv"}
     assert all(one in said for one in names)
-    with (out.parent / "page.csv").open(newline="") as file:
+    with (out.parent / "page.frames.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 2 * FRAMES
     page = out.read_text(encoding="utf-8")
     assert f"<h1>Take {name}</h1>" in page and "Right hand: joint angles" in page

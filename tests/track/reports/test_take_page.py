@@ -190,5 +190,5 @@ def test_a_page_of_another_name_is_refused(take, tmp_path):
         write_take_page(tmp_path / "page.pdf", take, source="take.npz")
     assert list(tmp_path.iterdir()) == []
     assert [path.name for path in table_paths(Path("a.b.html"))] == [
-        "a.b.csv", "a.b.joints.csv", "a.b.markers.csv", "a.b.doubts.csv"
+        "a.b.frames.csv", "a.b.joints.csv", "a.b.markers.csv", "a.b.doubts.csv"
     ]  # fmt: skip
