@@ -73,6 +73,7 @@ def draw(
     config = configured(config, camera, seed)
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
+    drawing.check_view()
     return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
 
 

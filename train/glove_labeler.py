@@ -102,8 +102,8 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
     how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
     warnings.warn(
         f"no labeler was trained on glove '{layout.name}', so that the one for any layout labels it, which "
-        f"{how}; a better one takes handsim generate --glove {shown} --out SET && handsim train SET --out RUN, and "
-        "--labeler RUN",
+        f"{how}; a better one takes handsim generate --glove {shown} --out SET && handsim train SET --out "
+        "RUN, and --labeler RUN",
         HandSimWarning,
         stacklevel=3,
     )
