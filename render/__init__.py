@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from render.drawing import draw
     from render.formats.merging import merge_renderings
     from render.frames import RenderedFrame
-    from render.scenery.backgrounds import BackgroundConfig
     from render.session import render_take
     from render.skin.look import SkinLook
     from render.stream import PictureStream
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "BackgroundConfig": "render.scenery.backgrounds",
         "PictureStream": "render.stream",
         "RenderConfig": "render.config",
         "RenderedFrame": "render.frames",
@@ -37,7 +35,6 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
-    "BackgroundConfig",
     "PictureStream",
     "RenderConfig",
     "RenderedFrame",

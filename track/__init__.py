@@ -4,7 +4,7 @@
 takes one frame of points at a time and gives a `TrackedFrame`; `measure_hands` measures whom it follows, and
 `calibrate` fits hands and gloves to them as a `User`. `open_source` opens a live stream, `ReplayServer` plays
 a capture as one, `open_sinks` takes hands to other programs, and a `Recorder` writes the take. `solve_pose`
-is the inverse kinematics alone: poses from labeled markers.
+is the inverse kinematics alone: poses from labeled markers. `doubts_of` and `write_take_page` tell of a take.
 """
 
 from typing import TYPE_CHECKING
@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from track.config import TrackerConfig
     from track.kinematics.pose_solver import solve_pose
     from track.recorder import Recorder
+    from track.reports.take_page import write_take_page
     from track.setup import measure_hands
     from track.sinks.addresses import open_sinks
     from track.sinks.message import LiveMessage
     from track.streams.addresses import open_source
     from track.streams.frame_source import StreamedFrame
     from track.streams.natnet_server import ReplayServer
+    from track.take_summary import doubts_of
     from track.tracked_frame import TrackedFrame
     from track.tracker import Tracker
     from track.user import User, load_user
@@ -41,6 +43,7 @@ __getattr__, __dir__ = lazy_exports(
         "TrackerConfig": "track.config",
         "User": "track.user",
         "calibrate": "track.capture_calibration",
+        "doubts_of": "track.take_summary",
         "label_capture": "track.capture_labeling",
         "load_user": "track.user",
         "measure_hands": "track.setup",
@@ -48,6 +51,7 @@ __getattr__, __dir__ = lazy_exports(
         "open_source": "track.streams.addresses",
         "solve_pose": "track.kinematics.pose_solver",
         "track_capture": "track.capture_tracking",
+        "write_take_page": "track.reports.take_page",
     },
 )
 
@@ -62,6 +66,7 @@ __all__ = [
     "User",
     "__version__",
     "calibrate",
+    "doubts_of",
     "label_capture",
     "load_user",
     "measure_hands",
@@ -69,4 +74,5 @@ __all__ = [
     "open_source",
     "solve_pose",
     "track_capture",
+    "write_take_page",
 ]

@@ -162,6 +162,9 @@ def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
     Args:
         take: A tracked take; of a truth there is nothing to doubt.
         most: The largest number of spans; all when None.
+
+    Returns:
+        Spans `first` to `last` [frames], the `worst` frame of each, and in words of what and why.
     """
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
     confidence, markers = _confidence(take, evidence), take.labels.astype(np.int64)

@@ -94,11 +94,6 @@ class ViewConfig:
             raise ArgumentError("cameras is empty, expected at least one camera")
         if self.placement not in PLACEMENTS:
             raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
-        if self.placement == "rig" and self.views != 1:
-            raise ArgumentError(
-                f"views is {self.views} with the placement rig, which has a view from each of its cameras; "
-                "leave it out"
-            )
         if self.placement != "rig" and self.rig != "six":
             raise ArgumentError(
                 f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"

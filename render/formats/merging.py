@@ -54,8 +54,6 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     """
     check_type("folders", folders, (list, tuple), "paths of folders")
     folders, out = [Path(folder) for folder in folders], Path(out)
-    if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
-        raise HandSimError("expected two or more different folders to merge")
     settings = [_settings(folder) for folder in folders]
     formats = settings[0]["formats"]
     for folder, one in zip(folders, settings, strict=True):
@@ -69,6 +67,8 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
             raise HandSimError(
                 f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
             )
+    if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
+        raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
     _check_space(folders, out)

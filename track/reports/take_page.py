@@ -39,13 +39,22 @@ _CALIBRATE: Final = (
 )
 
 
-def write_take_page(out: Path, take: Take, *, source: str) -> tuple[Path, ...]:
-    """Write the page (.html) on a take of this file and its tables (`take_tables`) beside it, all or none.
+def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
+    """Write the page (.html) on a take and its tables beside it, all or none, as `handsim report` does.
+
+    Args:
+        out: The page, an .html file, whole in itself.
+        take: A take of `track_capture` or `simulate_take`.
+        source: The take's file, which the page names; angles are in [deg] there, residuals in [mm].
+
+    Returns:
+        The page, and the tables of frames, joints, markers and doubtful frames (.csv).
 
     Raises:
         ArgumentError: The page's name does not end in .html.
         OSError: A file cannot be written.
     """
+    out = Path(out)
     if out.suffix.lower() != ".html":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .html")
     hands, doubts = hand_figures(take), doubts_of(take, most=None)

@@ -36,7 +36,7 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(command, "render_take", stub)
     line = (
-        "take.npz --out pics --format coco png --passes depth --placement head --camera sr300 --views 2 "
+        "take.npz --out pics --format coco png --passes depth --placement rig --camera sr300 --views 2 "
         "--share 0.4 --distance 0.5 0.6 --rig eight --dress glove --tones dark brown --background room plain "
         "--vary frame --depth-sensor none --no-color-sensor --motion-blur --painter opengl --every 3 "
         "--frames-per-shard 5 --seed 7 --workers 1"
@@ -44,7 +44,7 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     tyro.cli(command.render, args=line.split())
     take, out, formats, config, workers = given[0]
     assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
-    assert dataclasses.astuple(config.view) == ("head", "sr300", 2, 0.4, (0.5, 0.6), "eight", None)
+    assert dataclasses.astuple(config.view) == ("rig", "sr300", 2, 0.4, (0.5, 0.6), "eight", None)
     assert (config.passes, config.dress, config.tones) == (("depth",), "glove", (-52.0, 10.0))
     assert config.background == BackgroundConfig(plain=1, gradient=0, noise=0, clutter=0, room=1)
     assert (config.vary, config.painter, config.seed) == ("frame", "opengl", 7)

@@ -129,7 +129,7 @@ def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
 def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
     truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
     assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
-    assert "120 frames" in capsys.readouterr().out
+    assert "120 hands in frames" in capsys.readouterr().out
     found = json.loads(figures.read_text())
     assert found["frames"] == 2 * FRAMES
     assert found["figures"]["slot_accuracy"] > 0.8
