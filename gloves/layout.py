@@ -321,14 +321,10 @@ def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
         _parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)
     )
     radius = number_of(table, "radius_mm") * 1e-3
-    return MarkerLayout(text_of(table, "name"), markers, radius, _parse_sides(table))
-
-
-def _parse_sides(table: Mapping[str, object]) -> tuple[Side, ...]:
     sides = table.get("sides", list(SIDES))
     if not isinstance(sides, list) or not all(isinstance(side, str) for side in sides):
         raise LayoutError(f'sides is {sides!r}, expected a list of "right" and "left"')
-    return tuple(sides)
+    return MarkerLayout(text_of(table, "name"), markers, radius, tuple(sides))
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:

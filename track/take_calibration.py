@@ -51,7 +51,9 @@ def calibrate_take(
             f"no {' and no '.join(take.sides)} hand was found in the capture; expected half a minute of one"
         )
     worn = {hand.side: hand for hand in before}
-    out = _held_out(take.num_frames, take.rate)
+    # Frames that the calibration does not see: every third second, or less of a short take.
+    block = max(1, min(round(_BLOCK * take.rate), take.num_frames // _BLOCKS))
+    out: NDArray[np.bool_] = np.arange(take.num_frames) // block % _HELD_OUT == _HELD_OUT - 1
     done = []
     for hand in shown:
         markers = _markers(take, hand.side)
@@ -109,13 +111,6 @@ def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
             expected = markers[frame, filled[frame]]
             left += int((cdist(expected, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
     return left > _LEFT_OVER * total
-
-
-def _held_out(num_frames: int, rate: float) -> Bool[np.ndarray, "T"]:
-    """Frames that a calibration does not see: every third second, or less of a short take."""
-    block = max(1, min(round(_BLOCK * rate), num_frames // _BLOCKS))
-    out: NDArray[np.bool_] = np.arange(num_frames) // block % _HELD_OUT == _HELD_OUT - 1
-    return out
 
 
 def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFit) -> HeldOut | None:

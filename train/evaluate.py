@@ -110,11 +110,19 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
     parts = []
     for one in truth:
         if isinstance(one, np.ndarray):
-            parts.append(_checked_markers(one, len(names)))
+            count = len(names)
+            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
+                raise ArgumentError(
+                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
+                )
+            parts.append(one.astype(np.float64))
         elif isinstance(one, Capture):
             parts += select_hands(one, names)
         elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
-            parts.append(_markers_of_set(load_dataset(one), names))
+            dataset = load_dataset(one)
+            _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
+            markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
+            parts.append(markers)
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)
@@ -122,20 +130,6 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
     if not parts:
         raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
     return np.concatenate(parts)
-
-
-def _checked_markers(markers: NDArray[Any], count: int) -> NDArray[np.float64]:
-    if markers.ndim != 3 or markers.shape[1:] != (count, 3) or markers.dtype.kind not in "fiu":
-        raise ArgumentError(
-            f"markers are {markers.dtype} of shape {markers.shape}, expected (T, {count}, 3) numbers [m]"
-        )
-    return markers.astype(np.float64)
-
-
-def _markers_of_set(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.float64]:
-    _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
-    markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
-    return markers
 
 
 def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:

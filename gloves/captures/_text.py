@@ -150,7 +150,8 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
     decimals = False
     for index, line in enumerate(lines):
         numbers = _TIME_CODE.sub(b"", line)
-        if _is_row(numbers):
+        # A row of a frame and a position, with decimal points or commas and without quotes.
+        if numbers.count(b",") > _LEADING and _NUMBERS.fullmatch(numbers) is not None:
             if b"." in numbers:
                 return
             rows.append(index)
@@ -168,11 +169,6 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
                 f"line {first + index} has {width} cells where {expected} are expected: commas are both "
                 "between cells and in numbers; export it with decimal points, or with semicolons or tabs"
             )
-
-
-def _is_row(line: bytes) -> bool:
-    """Whether a line is a row of a frame and a position, with decimal points or commas and without quotes."""
-    return line.count(b",") > _LEADING and _NUMBERS.fullmatch(line) is not None
 
 
 def parse_table(

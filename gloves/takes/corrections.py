@@ -135,7 +135,11 @@ def find_pins(
         if not len(frames):
             unfitting.append(correction)
         pinned[frames, columns] = label
-    _check_single(pinned, label_names)
+    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
+        given = np.bincount(pinned[frame, pinned[frame] >= 0])
+        if given.max() > 1:
+            name = label_names[int(given.argmax())]
+            raise CaptureError(f"two points of frame {frame} are corrected to {name}, expected one point")
     return Pins(pinned, tuple(unfitting))
 
 
@@ -213,14 +217,6 @@ def _label_of(correction: Correction, number: int, frames: int, names: Sequence[
         unknown = choices(correction.label, (*names, NO_MARKER), noun="label")
         raise CaptureError(f"correction {number}: {unknown}")
     return list(names).index(correction.label)
-
-
-def _check_single(pinned: NDArray[np.int64], names: Sequence[str]) -> None:
-    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
-        given = np.bincount(pinned[frame, pinned[frame] >= 0])
-        if given.max() > 1:
-            name = names[int(given.argmax())]
-            raise CaptureError(f"two points of frame {frame} are corrected to {name}, expected one point")
 
 
 def _parse(table: Mapping[str, object], owner: str) -> Correction:

@@ -150,9 +150,12 @@ class Take:
         object.__setattr__(self, "bodies", tuple(self.bodies))
         try:
             points = np.asarray(self.points)
-            sizes = _sizes(
-                len(self.times), points.shape[1] if points.ndim == 3 else 0, self.hands, self.bodies
-            )
+            sizes = {
+                "T": len(self.times),
+                "N": points.shape[1] if points.ndim == 3 else 0,
+                "H": len(self.hands),
+                "B": len(self.bodies),
+            }
             for column in FRAMES:
                 object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
             for column in self._known():
@@ -682,13 +685,6 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         **{column.name: arrays[column.name] for column in FRAMES},
         **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
-
-
-def _sizes(
-    frames: int, columns: int, hands: Sequence[GloveFit], bodies: Sequence[RigidBody]
-) -> dict[str, int]:
-    """What the letters of shapes stand for."""
-    return {"T": frames, "N": columns, "H": len(hands), "B": len(bodies)}
 
 
 def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:

@@ -47,7 +47,10 @@ def chosen_workers(
         raise ArgumentError(f"--workers counts processes of this machine, but {cluster} has its own workers")
     distributed = import_extra("distributed", f"the cluster {cluster}", "cluster")
     with _client(distributed, cluster, check_workers(workers)) as client:
-        tell(_about(client, cluster))
+        count = len(client.nthreads())
+        there = f"{count} workers" if count else "no workers yet; waiting for the first"
+        link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
+        tell(f"{cluster}: {there}{link}")
         try:
             yield ClusterExecutor(client)
         except distributed.KilledWorker as error:
@@ -86,14 +89,6 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         ) from error
     with client:
         yield client
-
-
-def _about(client: Any, address: str) -> str:
-    """How many workers there are, and where to watch them."""
-    count = len(client.nthreads())
-    there = f"{count} workers" if count else "no workers yet; waiting for the first"
-    link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
-    return f"{address}: {there}{link}"
 
 
 class ClusterExecutor(Executor):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -35,7 +34,12 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
 
         sections = list(demo_sections(out, Path(work), seed=seed, num_frames=num_frames, report=step))
     figures = sections[-1]
-    _print_table(console, figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
+    printed = Table(title=f"{num_frames} generated frames, glove {GLOVE}")
+    for number, column in enumerate(figures.table[0]):
+        printed.add_column(Text(column), justify="right" if number else "left")
+    for row in figures.table[1:]:
+        printed.add_row(*row)
+    console.print(printed)
     page = out / "index.html"
     write_page(
         page,
@@ -46,12 +50,3 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
     )
     console.print(figures.notes[0])
     print_line(f"page: {page.resolve()}")
-
-
-def _print_table(console: Console, table: Sequence[Sequence[str]], *, title: str) -> None:
-    printed = Table(title=title)
-    for number, column in enumerate(table[0]):
-        printed.add_column(Text(column), justify="right" if number else "left")
-    for row in table[1:]:
-        printed.add_row(*row)
-    console.print(printed)

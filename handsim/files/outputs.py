@@ -25,19 +25,16 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
     """
     read = [Path(name) for name in inputs if isinstance(name, str | Path)]
     for output in (path for path in outputs if path is not None):
-        _check_place(output)
+        there = next((path for path in output.absolute().parents if path.exists()), None)
+        if there is not None and not there.is_dir():
+            raise ArgumentError(
+                f"the output {output} lies in {there.name}, which is a file, expected a folder"
+            )
+        if there is not None and not os.access(there, os.W_OK | os.X_OK):
+            raise ArgumentError(f"the output {output} cannot be written: {there} is closed to this user")
         for source in read:
             if _same(source, output):
                 raise ArgumentError(f"the output {output} is the input {source}, expected another file")
-
-
-def _check_place(output: Path) -> None:
-    """Refuse an output below a file, or in a folder in which this user may not write."""
-    there = next((path for path in output.absolute().parents if path.exists()), None)
-    if there is not None and not there.is_dir():
-        raise ArgumentError(f"the output {output} lies in {there.name}, which is a file, expected a folder")
-    if there is not None and not os.access(there, os.W_OK | os.X_OK):
-        raise ArgumentError(f"the output {output} cannot be written: {there} is closed to this user")
 
 
 def _same(source: Path, output: Path) -> bool:

@@ -225,17 +225,14 @@ def _sketch_fingers(
 def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
     """The fingers of all sketches, one after another, none in another's way."""
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
-    lasting = _loosened(model, make_valid(model, np.clip(opened, LOW, HIGH)))
+    # Poses with deep contact come a little nearer to rest, because fingers need room.
+    angles = make_valid(model, np.clip(opened, LOW, HIGH))
+    hard = ~is_valid(model, angles, max_penetration=_SNUG)
+    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
+    lasting = angles
     wandering = np.clip(lasting + wander, LOW, HIGH)
     valid = is_valid(model, wandering, max_penetration=_SNUG)
     return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
-
-
-def _loosened(model: HandModel, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Valid poses, those with deep contact a little nearer to rest, because fingers need room."""
-    hard = ~is_valid(model, angles, max_penetration=_SNUG)
-    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
-    return angles
 
 
 def _angles(name: str) -> NDArray[np.float64]:

@@ -68,7 +68,8 @@ def merge_renderings(folders: Sequence[Path], out: Path) -> int:
         raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
-    _check_space(folders, out)
+    needed = sum(file.stat().st_size for one in folders for file in one.rglob("*") if file.is_file())
+    check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
     count = 0
     for name in formats:
         count = _merge_format(name, folders, [one["frames"] for one in settings], formats, out)
@@ -87,11 +88,6 @@ def _settings(folder: Path) -> dict[str, Any]:
     if not good or not isinstance(frames, int) or not 0 < frames < 1 << 40:
         raise DatasetError(f"{folder / CONFIG} is damaged: formats or frames are missing")
     return settings
-
-
-def _check_space(folders: Sequence[Path], out: Path) -> None:
-    needed = sum(file.stat().st_size for one in folders for file in one.rglob("*") if file.is_file())
-    check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
 
 
 def _folder(folder: Path, formats: Sequence[str], name: str) -> Path:

@@ -113,7 +113,8 @@ def _sigma(
         return None
     sigma = (c2 * depth + c1) * depth + c0
     if cosines is not None and noise.angle_sigma > 0.0:
-        sigma += depth * np.sqrt(depth) * _by_cosine(_angle_terms(noise.angle_sigma), cosines)
+        bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+        sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
     if reflectance is not None:  # shot noise: as the root of the light
         sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
     return sigma
@@ -143,11 +144,6 @@ def _drop_weak(
     bright = np.broadcast_to(light, depth.shape).ravel()[dim] / depth.ravel()[dim] ** 2
     chance = 1.5 - bright / noise.weakest
     there.ravel()[dim] = rng.random(len(dim), dtype=np.float32) > chance
-
-
-def _by_cosine(table: NDArray[np.float32], cosines: NDArray[np.float32]) -> NDArray[np.float32]:
-    bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
-    return table.take(bands, mode="clip")
 
 
 @functools.lru_cache(maxsize=16)

@@ -155,22 +155,17 @@ def _packed(prior: PosePrior) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def _place_of_digest(content: bytes) -> slice:
-    """Where the digest stands: a text of 64 bytes after its key; a `ValueError` unless it is there once."""
-    key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
-    if content.count(key) != 1:
-        raise ValueError("the file has no SHA-256")
-    first = content.index(key) + len(key)
-    return slice(first, first + 64)
-
-
 def sign_model(content: bytes) -> bytes:
     """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before.
 
     Raises:
         ValueError: It has no place for it.
     """
-    place = _place_of_digest(content)
+    key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
+    if content.count(key) != 1:
+        raise ValueError("the file has no SHA-256")
+    first = content.index(key) + len(key)
+    place = slice(first, first + 64)
     blank = content[: place.start] + b"0" * 64 + content[place.stop :]
     return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
 
