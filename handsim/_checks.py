@@ -65,8 +65,7 @@ def make_settings(
     for name in given:
         if name not in known:
             raise ArgumentError(choices(str(name), known, noun=noun))
-    made: Settings = kind(**given) if default is None else dataclasses.replace(default, **given)
-    return made
+    return kind(**given) if default is None else dataclasses.replace(default, **given)
 
 
 def check_rng(rng: object) -> None:

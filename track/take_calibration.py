@@ -139,5 +139,4 @@ def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
 
 def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels are reliable."""
-    reliable: NDArray[np.bool_] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
-    return reliable
+    return np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))

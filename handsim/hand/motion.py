@@ -48,8 +48,7 @@ class HandMotion:
 
     def speeds(self) -> Float[np.ndarray, "S 20"]:
         """Joint speeds between frames [rad/s]."""
-        speeds: np.ndarray = np.diff(self.qpos[:, 7:], axis=0) * self.rate
-        return speeds
+        return np.diff(self.qpos[:, 7:], axis=0) * self.rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -70,8 +70,7 @@ def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.n
 
 def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Angles (T, 3) about z, y and x [deg], without jumps from frame to frame."""
-    degrees: NDArray[np.float64] = np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
-    return degrees
+    return np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
 
 
 def _order(bone: int) -> Iterator[int]:

@@ -109,8 +109,7 @@ class Camera:
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
         """Whether world points [m] are in front of the camera and, through its lens, inside its picture."""
-        seen: NDArray[np.bool_] = points_in_view(camera_arrays((self,)), points)[..., 0]
-        return seen
+        return points_in_view(camera_arrays((self,)), points)[..., 0]
 
     def rays(self) -> Float[np.ndarray, "H W 3"]:
         """Unit directions in the camera's axes through the centers of all pixels."""

@@ -197,8 +197,7 @@ class _Noise:
         size = (self.count, len(scale))
         lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
         new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
-        noise: NDArray[np.float64] = scale * (common * lasting + wander * new)
-        return noise
+        return scale * (common * lasting + wander * new)
 
 
 def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -93,5 +93,4 @@ def _rotated_to_the_arm(
     rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
     shift = np.eye(4)
     shift[:3, 3] = -tip
-    posed: np.ndarray = rotation @ shift
-    return posed
+    return rotation @ shift

@@ -138,8 +138,7 @@ def pose_to_qpos(poses: Float[np.ndarray, "*batch 4 4"]) -> NDArray[np.float64]:
     """Position and wxyz quaternion (..., 7) of rigid transforms."""
     flat = poses.reshape(-1, 4, 4)
     rows = np.concatenate([flat[:, :3, 3], rotation_quaternions(flat[:, :3, :3])], axis=1)
-    qpos: NDArray[np.float64] = rows.reshape(*poses.shape[:-2], 7)
-    return qpos
+    return rows.reshape(*poses.shape[:-2], 7)
 
 
 def qpos_to_pose(qpos: Float[np.ndarray, "7"]) -> NDArray[np.float64]:

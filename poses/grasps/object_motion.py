@@ -152,5 +152,4 @@ def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator
         for frequency in rng.uniform(1.0, 3.5, size=2):
             loops[:, axis] += 0.5 * np.sin(2 * np.pi * (frequency * time + rng.random()))
     swell = 0.5 + 0.5 * np.sin(2 * np.pi * (rng.uniform(0.1, 0.3) * time + rng.random()))
-    scribble: NDArray[np.float64] = size * swell[:, None] ** 2 * loops
-    return scribble
+    return size * swell[:, None] ** 2 * loops

@@ -72,8 +72,7 @@ class MotionConfig:
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
     """Share of the path after each of `frames` frames, the last one being 1."""
     time = np.arange(1, frames + 1) / frames
-    share: NDArray[np.float64] = time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
-    return share
+    return time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
 
 
 def straight_path(

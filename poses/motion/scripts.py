@@ -111,8 +111,7 @@ def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
     for finger in fingers:
         with contextlib.suppress(PoseError):  # other fingers remain
             poses.append(touching_angles(model, finger))
-    touches: NDArray[np.float64] = np.array(poses).reshape(-1, NUM_JOINTS)
-    return touches
+    return np.array(poses).reshape(-1, NUM_JOINTS)
 
 
 def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
@@ -121,5 +120,4 @@ def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> 
         steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
     else:
         steps = rng.integers(1, count, size=_POSES_AT_ONCE)
-    indices: NDArray[np.int64] = (at + np.concatenate([[0], np.cumsum(steps)])) % count
-    return indices
+    return (at + np.concatenate([[0], np.cumsum(steps)])) % count

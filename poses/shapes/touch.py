@@ -219,8 +219,7 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     first = np.clip((uv * vw - vv * uw) / determinant, 0.0, 1.0)
     second = np.clip((uv * first + vw) / vv, 0.0, 1.0)
     first = np.clip((uv * second - uw) / uu, 0.0, 1.0)
-    nearest: NDArray[np.float64] = start + np.stack([first, second], axis=1)[..., None] * along
-    return nearest
+    return start + np.stack([first, second], axis=1)[..., None] * along
 
 
 @kernel

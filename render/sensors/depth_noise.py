@@ -157,8 +157,7 @@ def _back(
     fx, fy, cx, cy = middle
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     rays = np.nan_to_num(Camera("rays", size, K, lens=lens).rays())
-    back: NDArray[np.float32] = np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
-    return back
+    return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
 
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
@@ -169,5 +168,4 @@ def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"
 
 @functools.cache
 def _luminance() -> NDArray[np.float32]:
-    table: NDArray[np.float32] = ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
-    return table
+    return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)

@@ -150,5 +150,4 @@ def _drop_weak(
 def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
     angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
     angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
-    terms: NDArray[np.float32] = (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
-    return terms
+    return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)

@@ -60,11 +60,9 @@ def _add_octave(
 def smooth(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    result: NDArray[Any] = share * share * (3.0 - 2.0 * share)
-    return result
+    return share * share * (3.0 - 2.0 * share)
 
 
 def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:
     """A Gaussian bell of height 1."""
-    height: NDArray[Any] = np.exp(-((distance / width) ** 2))
-    return height
+    return np.exp(-((distance / width) ** 2))

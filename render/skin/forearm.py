@@ -263,5 +263,4 @@ def _course(
 def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
     """Smoothstep from 0 to 1."""
     inside = np.clip(share, 0.0, 1.0)
-    result: NDArray[np.float64] = inside * inside * (3.0 - 2.0 * inside)
-    return result
+    return inside * inside * (3.0 - 2.0 * inside)

@@ -150,8 +150,7 @@ def assign_remaining(
     for marker in range(len(positions)):
         if assignment[marker] < 0:
             assignment[marker] = nearest_free(points, predicted[marker], _NEW * tight, assignment)
-    fitted: tuple[int, float] = fit_inliers(positions, points, assignment, pose, tight, gate)
-    return fitted
+    return fit_inliers(positions, points, assignment, pose, tight, gate)
 
 
 @kernel

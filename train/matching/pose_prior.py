@@ -254,8 +254,7 @@ def factor_of(
     inner = rows.T @ rows
     for direction in range(rank):
         inner[direction, direction] += spread * spread
-    lower: FloatArray = np.linalg.cholesky(inner).astype(np.float64)
-    return lower
+    return np.linalg.cholesky(inner).astype(np.float64)
 
 
 @kernel

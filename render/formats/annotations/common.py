@@ -64,8 +64,7 @@ def is_seen(hand: HandTruth) -> bool:
 def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Int[np.ndarray, "21"]:
     """COCO's flags of keypoints in a picture of this size [px]: 0 outside it, 1 hidden, 2 seen."""
     inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # never so for NaN
-    flags: NDArray[np.intp] = np.where(inside, np.where(hand.visible, 2, 1), 0)
-    return flags
+    return np.where(inside, np.where(hand.visible, 2, 1), 0)
 
 
 def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:

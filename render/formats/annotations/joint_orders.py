@@ -81,8 +81,7 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
     """
     order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
     nowhere = np.full_like(points[..., :1, :], np.nan)
-    ordered: NDArray[np.floating] = np.concatenate([points, nowhere], axis=-2)[..., order, :]
-    return ordered
+    return np.concatenate([points, nowhere], axis=-2)[..., order, :]
 
 
 def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:
