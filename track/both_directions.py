@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures.capture import runs_of
 from track.association.initialization import MOST_POINTS
 from track.association.point_groups import distances_to_nearest
 from track.streams.frame_source import StreamedFrame
@@ -133,8 +134,7 @@ def _exchanges(
         both = (one.labels >= 0) & (other.labels >= 0)
         wrong.append((one.labels[both] // num_markers != other.labels[both] // num_markers).mean() > _MOST
                      if both.any() else False)  # fmt: skip
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], np.array(wrong, dtype=np.int8), [0]])))
-    yield from (slice(int(begin), int(end)) for begin, end in steps.reshape(-1, 2))
+    yield from (slice(first, last + 1) for first, last in runs_of(np.array(wrong, dtype=np.bool_)))
 
 
 def _ask(

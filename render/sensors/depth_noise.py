@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
 from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight
 from render.sensors.structured_light import StructuredLight
@@ -154,9 +154,7 @@ def _back(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> NDArray[np.float32]:
     """Directions (3, H, W) from what is seen to the camera."""
-    fx, fy, cx, cy = middle
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    rays = np.nan_to_num(Camera("rays", size, K, lens=lens).rays())
+    rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
     return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
 
 

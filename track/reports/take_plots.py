@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, LOST
 from handsim.hand.topology import DIGITS, JOINT_NAMES
 from track.reports.hand_figures import HandFigures
-from track.take_summary import runs_of
 from train.reports.plot_style import BAND, BLUE, CARD, GREEN, LINE, SOFT, VIOLET, WARM
 
 if TYPE_CHECKING:

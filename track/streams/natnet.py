@@ -221,21 +221,17 @@ class _Reader:
         number: int = struct.unpack("<i", self.take(4))[0]
         return number
 
-    def count(self, least: int) -> int:
-        """A number of items of at least `least` bytes each."""
+    def count(self, least: int, between: int = 0) -> int:
+        """A number of items of at least `least` bytes each, with so many other bytes between."""
         count = self.integer()
+        self.take(between)
         if not 0 <= count * least <= self.left:
             raise DamagedPacket("counts more than there is")
         return count
 
     def section(self, least: int, sized: bool) -> int:
         """The number of items of a section; its size, if it has one, is not needed to skip it."""
-        count = self.integer()
-        if sized:
-            self.take(4)
-        if not 0 <= count * least <= self.left:
-            raise DamagedPacket("counts more than there is")
-        return count
+        return self.count(least, 4 if sized else 0)
 
     def skip(self, size: int, count: int) -> None:
         self.take(size * count)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from handsim.errors import RigError
 from handsim.files.toml_values import shown
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
+from handsim.space.lens import Lens
 
 _LARGEST: Final = 1e9  # in any unit
 _SKEWED: Final = 1e-3  # of a rotation in a file of few digits
@@ -92,7 +93,7 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def camera_matrix(
+def checked_matrix(
     owner: str, focal: tuple[float, float], center: tuple[float, float]
 ) -> Float[np.ndarray, "3 3"]:
     """K of focal lengths and a principal point [px].
@@ -104,7 +105,7 @@ def camera_matrix(
         raise RigError(
             f"{owner}: the focal lengths are {focal[0]:g} and {focal[1]:g}, expected positive pixels"
         )
-    return np.array([[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]])
+    return camera_matrix(*focal, *center)
 
 
 def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
@@ -127,6 +128,11 @@ def rigid(
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = rotation, position
     return transform
+
+
+def brown_lens(*coefficients: float) -> Lens:
+    """OpenCV's lens of k1, k2, p1, p2 and k3; a pinhole where all are zero."""
+    return Lens("brown", coefficients) if any(coefficients) else Lens()
 
 
 def camera_names(given: Sequence[str]) -> list[str]:
