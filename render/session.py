@@ -239,14 +239,6 @@ def cut_off_pictures(out: str | Place) -> list[str]:
         return sorted(name for file in files for name in load_json(file)["pictures"])
 
 
-def _lacks_a_hand(frame: RenderedFrame) -> bool:
-    """Whether a hand of the frame is not in its picture, or little of it."""
-    inside = [
-        ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1) for hand in frame.hands
-    ]
-    return any(float(shown.mean()) < _SHOWN for shown in inside)
-
-
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
         check_type("a format", name, str, "its name", FORMATS)
@@ -297,7 +289,11 @@ def _render_shard(
     def counted() -> Iterator[RenderedFrame]:
         with (out / _DRAWN.format(shard)).open("ab", buffering=0) as drawn:
             for frame in drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out):
-                if _lacks_a_hand(frame):
+                inside = [
+                    ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1)
+                    for hand in frame.hands
+                ]
+                if any(float(shown.mean()) < _SHOWN for shown in inside):
                     cut.append(frame.key)
                 yield frame
                 drawn.write(b".")

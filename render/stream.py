@@ -150,7 +150,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             check_number(name, count, 0 if name == "start" else 1)
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
-        self.config = _settled(configured(config, None, seed))
+        config = configured(config, None, seed)
+        if config.depth_sensor == "auto":  # of a stream it measures near hands
+            config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
+        self.config = config.settled()
         self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
@@ -307,13 +310,6 @@ def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]
     """Of a drawn picture what a labeled photograph has."""
     kept = {name: picture[name] for name in ("keypoints", "visible", "box", "side", "drawn", "number")}
     return {"rgb": picture.get("noisy_rgb", picture["rgb"])} | kept
-
-
-def _settled(config: RenderConfig) -> RenderConfig:
-    """The configuration with a painter, and with a depth sensor that measures near hands."""
-    if config.depth_sensor == "auto":
-        config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
-    return config.settled()
 
 
 def _camera(camera: Camera | str, crop: int | None) -> Camera:

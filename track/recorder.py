@@ -53,11 +53,6 @@ class TakeRecorder:
         """Number of recorded frames."""
         return len(self._rows)
 
-    @property
-    def duration(self) -> float:
-        """Time from the first frame to the last [s]."""
-        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
-
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream."""
         if not frame.silent:
@@ -140,18 +135,12 @@ class Recorder:
             worn_arrays(self._hands, self._bodies),
             [column.sized(sizes) for column in (*FRAMES, *OPTIONAL, KEYPOINTS)],
         )
-        self._times: tuple[float, float] | None = None
         self._closed = False
 
     @property
     def num_frames(self) -> int:
         """Number of recorded frames."""
         return self._archive.num_frames
-
-    @property
-    def duration(self) -> float:
-        """Time from the first frame to the last [s]."""
-        return self._times[1] - self._times[0] if self._times else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream.
@@ -171,7 +160,6 @@ class Recorder:
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
                 f"kept in {self.part}"
             ) from error
-        self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def close(self) -> None:
         """Write what still waits, and close the recording without writing the take."""
