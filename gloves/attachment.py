@@ -105,11 +105,7 @@ class Attachment:
 
 
 def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
-    """Put a glove on a hand: from each marker's point on its bone outwards to the skin.
-
-    Raises:
-        LayoutError: A marker's ray meets no skin; the message names the marker.
-    """
+    """Put a glove on a hand: from each marker's point on its bone outwards to the skin."""
     surface = model.surface
     rays = np.array([_ray(marker, model) for marker in layout.markers])
     origins, directions = rays[:, 0], rays[:, 1]

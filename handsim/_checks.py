@@ -56,11 +56,7 @@ def fill_settings(config: Any) -> None:
 def make_settings(
     kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
 ) -> Settings:
-    """A dataclass of settings, some given by name, the others from `default` or the dataclass.
-
-    Raises:
-        ArgumentError: There is no field of some name; `noun` is what messages call one.
-    """
+    """A dataclass of settings, some given by name, the others from `default` or the dataclass."""
     known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
     for name in given:
         if name not in known:
@@ -78,11 +74,7 @@ def check_rng(rng: object) -> None:
 
 
 def check_callable(name: str, value: object, expected: str) -> None:
-    """Refuse what cannot be called.
-
-    Raises:
-        ArgumentError: It cannot.
-    """
+    """Refuse what cannot be called."""
     if not callable(value):
         raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
 
@@ -98,11 +90,7 @@ def shown_value(value: Any) -> str:
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """`array` as finite float64 whose last dimensions are `shape` (None: any length).
-
-    Raises:
-        ArgumentError: It has another shape, or holds NaN or infinite values.
-    """
+    """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
     try:
         values = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -119,11 +107,7 @@ def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> N
 
 
 def check_number(name: str, value: float, low: float, high: float = np.inf, *, above: bool = False) -> None:
-    """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too.
-
-    Raises:
-        ArgumentError: It is.
-    """
+    """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too."""
     check_type(name, value, (int, float, np.integer, np.floating), "a number")
     inside = low <= value <= high and value < np.inf and not (above and value == low)
     if not inside:
@@ -134,11 +118,7 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
 
 
 def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
-    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller.
-
-    Raises:
-        ArgumentError: The pair is another.
-    """
+    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller."""
     check_type(name, span, (tuple, list), "two numbers")
     if len(span) != 2 or not low <= span[0] <= span[1] < np.inf:
         raise ArgumentError(f"{name} is {span}, expected two numbers from {low:g} upwards, the smaller first")

@@ -51,10 +51,6 @@ def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[Own
         path: The file; nothing in it is unpickled.
         sides: Whose poses an `.npz` has, in its order, a right hand's when not given; or which are read of a
             `.csv`, all when not given.
-
-    Raises:
-        CaptureError: It cannot be read, an array or column is missing or has another shape or impossible
-            numbers, or there is no hand in any frame.
     """
     if path.suffix.lower() == CSV:
         arrays, sides = _columns(path, sides)

@@ -125,12 +125,7 @@ def source_of(
     glove: MarkerLayout | str | None = None,
     seed: int = 0,
 ) -> Source:
-    """What a public function was given, as a source; see `subject_of_poses` for what belongs to poses.
-
-    Raises:
-        ArgumentError: A take has hands and times of its own, and others were named; or the poses cannot be
-            drawn.
-    """
+    """What a public function was given, as a source; see `subject_of_poses` for what belongs to poses."""
     given = {"model": model, "times": times, "people": people, "person": person, "glove": glove}
     if isinstance(source, Take | str | Path | PoseFile):
         for name, value in given.items():

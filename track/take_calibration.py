@@ -40,9 +40,6 @@ def calibrate_take(
     """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
 
     Labels of hands that are tracked count. Each side begins with `start`; the take was labeled with `before`.
-
-    Raises:
-        CalibrationError: No hand is in the take, or it tells too little of one.
     """
     there = [hand for hand in start if hand.side in take.sides]
     shown = [hand for hand in there if _reliable(take, hand.side).mean() > _SHOWN]

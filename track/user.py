@@ -193,11 +193,7 @@ def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User
 
 
 def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
-    """One side, or both.
-
-    Raises:
-        ArgumentError: It is something else.
-    """
+    """One side, or both."""
     check_type("hands", sides, Sequence, "right, left, or one of each")
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):

@@ -22,11 +22,7 @@ _labeling: ContextVar[int] = ContextVar("labeling", default=1)
 
 
 def check_threads(threads: int | None) -> None:
-    """Refuse a number of threads below one.
-
-    Raises:
-        ArgumentError: It is, or is absurdly large.
-    """
+    """Refuse a number of threads below one."""
     if threads is not None and not 1 <= threads <= _MOST:
         raise ArgumentError(f"threads is {threads}, expected 1 to {_MOST}")
 

@@ -52,11 +52,7 @@ def warn(text: str) -> None:
 
 
 def meters_per(unit: str) -> float:
-    """Meters per unit of length of a file, in any case; a word may be cut ("Mete") or in the singular.
-
-    Raises:
-        CaptureError: It is not millimeters, centimeters or meters.
-    """
+    """Meters per unit of length of a file, in any case; a word may be cut ("Mete") or in the singular."""
     word = unit.strip(" .\t\0").lower()
     scale = METERS.get(word)
     if scale is None and len(word) >= _SHORTEST:
@@ -196,9 +192,6 @@ def parse_table(
         num_columns: Number of cells of a whole row.
         column_name: Name of a column in messages.
         text_columns: Columns that hold no numbers; they are returned as NaN.
-
-    Raises:
-        CaptureError: No rows, a cut last row, a cell that is not a number, or a row that is too long.
     """
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
     if not rows:

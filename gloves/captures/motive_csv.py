@@ -39,10 +39,6 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
-
-    Raises:
-        CaptureError: Not a Motive export, without marker columns, cut, with a cell that is not a number, or
-            with rate, times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
     separator = separator_behind([MOTIVE_BEGIN], lines[0])

@@ -95,12 +95,7 @@ def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
 
 
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
-    """Refuse clouds that are not in meters, see `unit_fault`.
-
-    Raises:
-        ArgumentError: They cannot be; or all points are at the origin, which a single cloud's (`only_wide`)
-            may be.
-    """
+    """Refuse clouds that are not in meters, see `unit_fault`."""
     if not only_wide and all_at_origin(clouds):
         raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
     fault = unit_fault(clouds, only_wide=only_wide)
@@ -123,11 +118,7 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
 
 
 def check_place(capture: Capture, farthest: float) -> None:
-    """Warn of points that will be left out, farther than this from the origin in a coordinate [m].
-
-    Raises:
-        CaptureError: They are most of the points.
-    """
+    """Warn of points that will be left out, farther than this from the origin in a coordinate [m]."""
     there = np.isfinite(capture.positions[..., 0])
     far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())
     points = int(there.sum())

@@ -52,9 +52,6 @@ def read_archive(
     """Read what `write_archive` wrote, or what has been recorded of it until now.
 
     `unpack` makes the content from header and arrays; an exception means that they are damaged.
-
-    Raises:
-        CaptureError: No such file, not a take, of another schema, or damaged.
     """
     path = Path(path)
     header, arrays = _read(path)

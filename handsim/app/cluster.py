@@ -35,10 +35,6 @@ def chosen_workers(
             this machine when not given.
         workers: Processes of this machine, all cores when not given.
         tell: Takes a line for the user.
-
-    Raises:
-        ArgumentError: The options do not fit together, or Dask is not installed.
-        HandSimError: Nobody answers at the address, or a job ended its workers.
     """
     if cluster is None:
         yield check_workers(workers)
@@ -140,11 +136,7 @@ class _Task:
 
 
 def check_worker(worker: str, threads: int, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions.
-
-    Raises:
-        HandSimError: It has several threads, or another version.
-    """
+    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions."""
     if threads != 1:
         raise HandSimError(
             f"the worker {worker} has {threads} threads, expected 1; start workers with --nthreads 1, one "

@@ -31,11 +31,7 @@ def usable_cores() -> int:
 
 
 def check_workers(workers: int | None) -> int:
-    """A number of processes: the given one, or one a core.
-
-    Raises:
-        ArgumentError: It is no number, or less than 1.
-    """
+    """A number of processes: the given one, or one a core."""
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise ArgumentError(f"workers is {workers!r}, expected at least 1")
     return usable_cores() if workers is None else workers

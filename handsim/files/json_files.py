@@ -33,11 +33,7 @@ def _finite(value: Any) -> Any:
 
 
 def load_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        DatasetError: The file does not hold a JSON object.
-    """
+    """Read a JSON object."""
     try:
         content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
     except (ValueError, RecursionError) as error:

@@ -19,9 +19,6 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
     Args:
         inputs: Files and folders that a command reads, and names that may be none; objects are no files.
         outputs: What it writes; None where not given.
-
-    Raises:
-        ArgumentError: An output is one of the inputs, or what should be its folder is a file or is closed.
     """
     read = [Path(name) for name in inputs if isinstance(name, str | Path)]
     for output in (path for path in outputs if path is not None):

@@ -116,9 +116,6 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 
     Args:
         times: Time of each frame [s], increasing.
-
-    Raises:
-        ArgumentError: The rate is not positive, or there would be too many frames.
     """
     if not 0.0 < rate < np.inf:
         raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")

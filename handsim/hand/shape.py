@@ -149,11 +149,7 @@ def shape_from_measures(length: float, breadth: float, *, side: Side = "right") 
 
 
 def named_shape(size: str, *, side: Side = "right") -> HandShape:
-    """One of the five sizes XS, S, M, L, XL.
-
-    Raises:
-        ArgumentError: There is no such size or side.
-    """
+    """One of the five sizes XS, S, M, L, XL."""
     check_type("size", size, str, "the name of one", SIZES)
     if size not in SIZES:
         raise ArgumentError(choices(size, SIZES, noun="size"))

@@ -215,11 +215,7 @@ def _read(path: Path) -> CameraRig:
 def check_outside(
     rig: CameraRig, points: Float[np.ndarray, "*batch 3"], *, clearance: float = 0.05, what: str = "hand"
 ) -> None:
-    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages).
-
-    Raises:
-        ArgumentError: A camera is nearer than `clearance` [m] to one of the points in any frame.
-    """
+    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages)."""
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     flat = flat[~np.isnan(flat).any(axis=1)]
     for number, position in enumerate(rig.positions, 1):

@@ -84,11 +84,7 @@ def object_names() -> tuple[str, ...]:
 
 
 def named_object(name: str) -> RigidObject:
-    """One of the objects that come with handsim.
-
-    Raises:
-        ArgumentError: No object has this name.
-    """
+    """One of the objects that come with handsim."""
     library = _library()
     if name not in library:
         raise ArgumentError(choices(name, library, noun="object"))

@@ -53,11 +53,7 @@ class RigFile(NamedTuple):
 
 
 def read_rig_file(path: Path) -> RigFile:
-    """Read a file of cameras.
-
-    Raises:
-        RigError: It cannot be read, is damaged, or a key is missing, unknown or of another type.
-    """
+    """Read a file of cameras."""
     table = read_toml(path, error=RigError)
     try:
         return _parse(table, path.stem)
@@ -66,12 +62,7 @@ def read_rig_file(path: Path) -> RigFile:
 
 
 def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """The cameras of a file, after a check of their number, their names and their distances.
-
-    Raises:
-        RigError: There are none or too many, a name cannot be part of a file's name or comes twice, or a
-            camera stands beyond 50 m: millimeters taken for meters.
-    """
+    """The cameras of a file, after a check of their number, their names and their distances."""
     if not 1 <= len(cameras) <= _MOST:
         raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MOST}")
     check_names(str(path), cameras)
@@ -88,11 +79,7 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
 
 
 def check_names(owner: str, cameras: Sequence[Camera]) -> None:
-    """Refuse two cameras of one name.
-
-    Raises:
-        RigError: There are such.
-    """
+    """Refuse two cameras of one name."""
     names = [camera.name for camera in cameras]
     for name in names:
         if names.count(name) > 1:
@@ -100,11 +87,7 @@ def check_names(owner: str, cameras: Sequence[Camera]) -> None:
 
 
 def check_near(owner: str, camera: Camera) -> None:
-    """Refuse a camera beyond 50 m.
-
-    Raises:
-        RigError: It stands there.
-    """
+    """Refuse a camera beyond 50 m."""
     distance = float(np.linalg.norm(camera.T_world_camera[:3, 3]))
     if distance > _FARTHEST:
         raise RigError(

@@ -57,11 +57,7 @@ def keep_apart(
     other_motion: HandMotion,
     direction: Float[np.ndarray, "T 3"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand.
-
-    Raises:
-        PoseError: Something touches even when drawn back, in these unit directions.
-    """
+    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand."""
     motion, body = held
     back = np.zeros(len(direction))
     for _ in range(_MOST_RETREATS):

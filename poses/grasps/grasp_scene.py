@@ -112,11 +112,7 @@ def object_penetration(
     qpos: Float[np.ndarray, "T 27"],
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
-    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch.
-
-    Raises:
-        ArgumentError: The arrays have different numbers of frames, or another shape.
-    """
+    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch."""
     qpos = check_array("qpos", qpos, (None, NUM_QPOS))
     poses = check_array("T_world_object", T_world_object, (None, 4, 4))
     if len(qpos) != len(poses):

@@ -70,11 +70,7 @@ def hold_names(obj: RigidObject) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them.
-
-    Raises:
-        ArgumentError: The object has no hold of this name.
-    """
+    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them."""
     holds = _holds(obj)
     if name not in holds:
         raise ArgumentError(choices(name, holds, noun=f"hold of the {obj.name}"))

@@ -91,11 +91,7 @@ class _Player:
     rng: np.random.Generator
 
     def next_part(self, last: Held, current: int) -> tuple[Held, int]:
-        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index.
-
-        Raises:
-            PoseError: No path was valid.
-        """
+        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index."""
         start = Held(last.angles[-1:], last.poses[-1:])
         if self.rng.random() < _SHIFTS:
             other = int(self.rng.integers(len(self.holds)))

@@ -97,11 +97,7 @@ def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generat
 def path_to_rest(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid.
-
-    Raises:
-        PoseError: No path was valid.
-    """
+    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid."""
     # Each round draws other durations, and so other frames: a path close to the limit may pass.
     for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])

@@ -86,10 +86,6 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     """The poses [rad] a script goes through, as this hand can strike them.
 
     Touches that this hand's thumb cannot reach and poses without a valid path to rest are left out.
-
-    Raises:
-        ArgumentError: There is no such script, or it has no poses of its own.
-        PoseError: This hand can strike fewer than two of them.
     """
     if script not in _scripts() or script == FREE:
         raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))

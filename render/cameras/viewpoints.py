@@ -447,9 +447,6 @@ def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> Non
     """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
 
     Cameras among them without a hand are told.
-
-    Raises:
-        RigError: No camera has a keypoint in its picture in any frame.
     """
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):

@@ -60,11 +60,7 @@ class DepthNoiseConfig:
 
 
 def named_sensor(name: str) -> DepthNoise:
-    """A depth sensor as it was published.
-
-    Raises:
-        ArgumentError: The sensor is unknown.
-    """
+    """A depth sensor as it was published."""
     if name not in _SENSORS:
         raise ArgumentError(choices(name, _SENSORS, noun="depth sensor"))
     return _SENSORS[name]
@@ -101,9 +97,6 @@ def apply_depth_noise(
     Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
     infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
     nothing.
-
-    Raises:
-        ArgumentError: A picture is not as large as the camera's.
     """
     shape = camera.size[1], camera.size[0]
     for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):

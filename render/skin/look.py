@@ -93,11 +93,7 @@ class SkinLook:
 
 
 def check_tones(tones: Sequence[float]) -> None:
-    """Check the ranges of typology angles that `sample_skin_look` draws from.
-
-    Raises:
-        ArgumentError: They are no ranges of angles, one after the other.
-    """
+    """Check the ranges of typology angles that `sample_skin_look` draws from."""
     limits = np.array([-90.0, *tones, 90.0], dtype=np.float64)
     if len(tones) < 2 or len(tones) % 2 or not (np.diff(limits) >= 0.0).all():
         raise ArgumentError(

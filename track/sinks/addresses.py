@@ -128,11 +128,7 @@ def open_sinks(addresses: str | Sequence[str]) -> SinkGroup:
 
 
 def open_sink(address: str) -> LiveSink:
-    """Open the sink that an address names, see `open_sinks`.
-
-    Raises:
-        ArgumentError: The address is invalid, a package is missing, or a port is taken.
-    """
+    """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in _NETWORK and rest.startswith("//"):
         return _NETWORK[scheme](address)

@@ -83,11 +83,7 @@ def pack(kind: Kind, payload: bytes = b"") -> bytes:
 
 
 def unpack(packet: bytes) -> tuple[int, bytes]:
-    """Kind and payload of a packet.
-
-    Raises:
-        DamagedPacket: It is truncated.
-    """
+    """Kind and payload of a packet."""
     if len(packet) < 4:
         raise DamagedPacket("no header")
     kind, size = struct.unpack_from("<HH", packet)
@@ -150,11 +146,7 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(payload: bytes, version: Version) -> MarkerFrame:
-    """Read the observed markers of a frame; markers that the server filled in are left out.
-
-    Raises:
-        DamagedPacket: It is truncated, or not a frame of this version.
-    """
+    """Read the observed markers of a frame; markers that the server filled in are left out."""
     reader, sized = _Reader(payload), version >= _SIZED
     number = reader.integer()
     for _ in range(reader.section(5, sized)):  # marker sets: names, and markers once more

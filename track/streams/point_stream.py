@@ -39,9 +39,6 @@ def open_stream(
     """Connect to a NatNet server at `natnet://host` or `natnet://host:port`, with the port for commands.
 
     It listens at the network card of this address, or at the one that leads to the host.
-
-    Raises:
-        CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.
     """
     host, port = _split(url)
     try:

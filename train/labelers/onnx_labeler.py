@@ -156,11 +156,7 @@ def _packed(prior: PosePrior) -> str:
 
 
 def sign_model(content: bytes) -> bytes:
-    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before.
-
-    Raises:
-        ValueError: It has no place for it.
-    """
+    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before."""
     key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
     if content.count(key) != 1:
         raise ValueError("the file has no SHA-256")
@@ -171,11 +167,7 @@ def sign_model(content: bytes) -> bytes:
 
 
 def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
-    """Write a trained labeler as an ONNX file for any number of clouds of any size.
-
-    Raises:
-        HandSimError: onnx is not installed.
-    """
+    """Write a trained labeler as an ONNX file for any number of clouds of any size."""
     import torch
 
     from train.labelers.cnn_network import DeepLabelCNN

@@ -113,11 +113,7 @@ class PosePrior:
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]]) -> PosePrior:
-        """The prior out of a file's tables.
-
-        Raises:
-            WeightsError: Tables are missing, or not those of a prior.
-        """
+        """The prior out of a file's tables."""
         if set(tensors) != {field.name for field in fields(cls)}:
             raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})

@@ -68,11 +68,7 @@ def write_report(
 
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
-    """Lengths of the gaps in a continuous take, beside published figures of real finger markers.
-
-    Raises:
-        DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
-    """
+    """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
     if present.ndim != 2 or not present.size or present.dtype != np.bool_:
         raise DatasetError(
             f"present is {present.dtype} of shape {present.shape}, expected bool (frames, markers)"

@@ -89,11 +89,7 @@ def _tell(sentence: str) -> None:
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
-    """The cameras of a file as `load_cameras` gives them, with what the file says of each.
-
-    Raises:
-        RigError: As `load_cameras`.
-    """
+    """The cameras of a file as `load_cameras` gives them, with what the file says of each."""
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml":
         return _plain(checked_cameras(path, read_rig_file(path).cameras))

@@ -62,9 +62,6 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
 
     The file is a `.yml`, `.yaml` or `.json`. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
     sample writes them, and of `intri.yml` and `extri.yml`, it is either; the other is read too.
-
-    Raises:
-        RigError: It cannot be read, something is missing, or a lens is of a kind that we do not have.
     """
     values, sections = _read(path)
     other = path.with_stem(_PAIRS.get(path.stem, path.stem))

@@ -28,11 +28,7 @@ CENTER: Final = 0.5
 
 
 def centered_K(camera: Camera) -> NDArray[np.float64]:
-    """Camera matrix for pixels that are counted from the first one's center.
-
-    Raises:
-        HandSimError: The camera's lens is not a pinhole, so that no matrix projects points.
-    """
+    """Camera matrix for pixels that are counted from the first one's center."""
     if camera.lens.kind != "pinhole":
         raise HandSimError(
             f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
@@ -89,11 +85,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
 
 
 def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
-    """The frame's hands by their sides.
-
-    Raises:
-        HandSimError: Two are of the same side.
-    """
+    """The frame's hands by their sides."""
     hands = {hand.shape.side: hand for hand in frame.hands}
     if len(hands) < len(frame.hands):
         sides = " and ".join(hand.shape.side for hand in frame.hands)

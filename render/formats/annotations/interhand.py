@@ -106,11 +106,7 @@ def numbered(
 
 
 def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Joints of every frame number, however many cameras saw it.
-
-    Raises:
-        DatasetError: Frames of one number have different joints, which this format cannot hold.
-    """
+    """Joints of every frame number, however many cameras saw it."""
     known: dict[int, int] = {}
     for record in records:
         number, joints = record["image"]["frame_idx"], record["joints"]

@@ -63,11 +63,7 @@ JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
 
 
 def joint_order(name: str) -> tuple[int, ...]:
-    """One of `JOINT_ORDERS`.
-
-    Raises:
-        ArgumentError: The order is unknown.
-    """
+    """One of `JOINT_ORDERS`."""
     if name not in JOINT_ORDERS:
         raise ArgumentError(choices(name, JOINT_ORDERS, noun="joint order"))
     return JOINT_ORDERS[name]
