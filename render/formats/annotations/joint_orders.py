@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_KEYPOINTS
 
 ABSENT: Final = -1
@@ -64,8 +65,7 @@ JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
 
 def joint_order(name: str) -> tuple[int, ...]:
     """One of `JOINT_ORDERS`."""
-    if name not in JOINT_ORDERS:
-        raise ArgumentError(choices(name, JOINT_ORDERS, noun="joint order"))
+    check_choice(name, JOINT_ORDERS, noun="joint order")
     return JOINT_ORDERS[name]
 
 
