@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim._checks import check_type
+from handsim._checks import check_choice, check_type
 from handsim.errors import HandSimError, LayoutError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
@@ -255,8 +255,7 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
 
 def shipped_layout(name: str) -> ShippedLayout:
     """A shipped layout with its description and its source; a `LayoutError` if there is none of this name."""
-    if name not in list_layouts():
-        raise LayoutError(choices(name, list_layouts(), noun="glove"))
+    check_choice(name, list_layouts(), noun="glove", error=LayoutError)
     table = read_toml(_SHIPPED / f"{name}.toml", error=LayoutError)
     return ShippedLayout(
         parse_layout(table), text_of(table, "description", default=""), text_of(table, "source", default="")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, HandSimError, choices
 
 Settings = TypeVar("Settings")
 
@@ -32,6 +32,14 @@ def check_type(
     raise ArgumentError(
         f"{name} is {shown_value(value)}, expected {expected}" + (f"; valid names: {names}" if names else "")
     )
+
+
+def check_choice(
+    given: object, valid: Collection[str], *, noun: str, error: type[HandSimError] = ArgumentError
+) -> None:
+    """Refuse a name that is none of the valid ones, as `choices` tells it."""
+    if given not in valid:
+        raise error(choices(str(given), valid, noun=noun))
 
 
 def fill_settings(config: Any) -> None:
@@ -59,8 +67,7 @@ def make_settings(
     """A dataclass of settings, some given by name, the others from `default` or the dataclass."""
     known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
     for name in given:
-        if name not in known:
-            raise ArgumentError(choices(str(name), known, noun=noun))
+        check_choice(name, known, noun=noun)
     return kind(**given) if default is None else dataclasses.replace(default, **given)
 
 
@@ -115,6 +122,16 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
         both = f"{least}, at most {high:g}" if above else f"a number from {low:g} to {high:g}"
         expected = least if high == np.inf else both
         raise ArgumentError(f"{name} is {value:g}, expected {expected}")
+
+
+def check_count(
+    name: str, value: Any, low: int, high: float = np.inf, *, error: type[HandSimError] = ArgumentError
+) -> None:
+    """Refuse what is not a whole number from `low` to `high`."""
+    check_type(name, value, int, "a whole number")
+    if not low <= value <= high:
+        least = f"at least {low}" if low else "0 or more"
+        raise error(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")
 
 
 def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:

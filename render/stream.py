@@ -15,8 +15,8 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim._checks import check_number, check_span, check_type, shown_value
-from handsim.errors import ArgumentError, PoseError, choices
+from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, pack_hand, sample_shape
@@ -142,8 +142,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         if sum(given is not None for given in (sampler, poses, takes)) > 1:
             raise ArgumentError("expected one of sampler, poses and takes")
         check_type("side", side, str, "left, right or either")
-        if side not in _SIDE_CHOICES:
-            raise ArgumentError(choices(side, _SIDE_CHOICES, noun="side"))
+        check_choice(side, _SIDE_CHOICES, noun="side")
         counts = {"people": people, "sitting": sitting, "batch": batch, "start": start}
         for name, count in counts.items():
             check_type(name, count, (int, np.integer), "a whole number")

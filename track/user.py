@@ -15,8 +15,8 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, FileError, HandSimError, choices
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.model import HandModel
@@ -113,8 +113,7 @@ class User(Sequence[GloveFit]):
         """
         known = {hand.side: hand for hand in self.hands}
         for side in sides:
-            if side not in known:
-                raise ArgumentError(choices(side, known, noun="hand"))
+            check_choice(side, known, noun="hand")
         return dataclasses.replace(self, hands=tuple(known[side] for side in sides))
 
     def of_side(self, side: Side | None = None) -> GloveFit:

@@ -15,7 +15,7 @@ from gloves.captures.formats import find_captures, read_markers
 from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
+from handsim._checks import check_count, check_rng, check_type
 from handsim.errors import ArgumentError, CaptureError
 from train.data.augmentation import Corruption
 from train.data.own_corruption import OwnCorruption
@@ -61,9 +61,7 @@ def evaluate_labeler(
             given with others or to be corrupted, or there is nothing to count.
     """
     network = load_labeler(labeler)
-    check_type("every", every, int, "a whole number")
-    if every < 1:
-        raise ArgumentError(f"every is {every}, expected at least 1")
+    check_count("every", every, 1)
     rng = np.random.default_rng(0) if rng is None else rng
     check_rng(rng)
     several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)

@@ -37,8 +37,8 @@ from gloves.takes.columns import (
     stacked_frames,
 )
 from gloves.takes.formats import motion_format
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
@@ -322,8 +322,7 @@ class Take:
         Raises:
             ArgumentError: It is not in the take.
         """
-        if side not in self.sides:
-            raise ArgumentError(choices(side, self.sides, noun="hand"))
+        check_choice(side, self.sides, noun="hand")
         return self.sides.index(side)
 
     def moving_hands(self) -> tuple[GlovedHand, ...]:
@@ -571,8 +570,7 @@ class Take:
     def _labels_of(self, name: str) -> range:
         """The labels of a hand's markers, or of a body's."""
         names = [*self.sides, *(body.name for body in self.bodies)]
-        if name not in names:
-            raise ArgumentError(choices(name, names, noun="hand or body"))
+        check_choice(name, names, noun="hand or body")
         counts = [hand.layout.num_markers for hand in self.hands]
         return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
 

@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.page import write_page
 from handsim.app.progress import named_steps
-from handsim.errors import ArgumentError
 
 
 def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:
@@ -23,10 +23,8 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
         seed: Of the generated frames and of everything drawn at random.
         num_frames: Frames to generate and label.
     """
-    if num_frames < 1:
-        raise ArgumentError(f"num_frames is {num_frames}, expected at least 1")
-    if seed < 0:
-        raise ArgumentError(f"seed is {seed}, expected 0 or more")
+    check_count("num_frames", num_frames, 1)
+    check_count("seed", seed, 0)
     out.mkdir(parents=True, exist_ok=True)
     console = Console()
     with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, named_steps("starting") as step:

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal, cast
 import tyro
 from rich.console import Console
 
+from handsim._checks import check_choice
 from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import Place, place_of
@@ -221,8 +222,7 @@ def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:
         return ALL_TONES
     known = {name.replace(" ", "-"): name for name in TONES}
     for name in tones:
-        if name not in known:
-            raise HandSimError(choices(name, known, noun="skin tone"))
+        check_choice(name, known, noun="skin tone", error=HandSimError)
     return named_tones([known[name] for name in tones])
 
 

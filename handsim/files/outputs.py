@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from handsim.errors import ArgumentError, HandSimError
+from handsim.files.atomic import atomic_write
 
 _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
@@ -32,6 +33,22 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
         for source in read:
             if _same(source, output):
                 raise ArgumentError(f"the output {output} is the input {source}, expected another file")
+
+
+def check_ending(path: Path, *endings: str, option: str = "--out") -> None:
+    """Refuse an option's file whose name ends otherwise."""
+    if path.suffix.lower() not in endings:
+        raise ArgumentError(f"{option} is {path}, expected a file name that ends in {', '.join(endings)}")
+
+
+def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
+    """Write the text that a file of one's own begins with, under a new name in .toml."""
+    if file.suffix.lower() != ".toml":
+        raise error(f"{file}: expected a file name that ends in .toml")
+    if file.exists():
+        raise error(f"{file} exists already and is left as it is; name a new file")
+    with atomic_write(file) as temporary:
+        temporary.write_text(text, "utf-8")
 
 
 def _same(source: Path, output: Path) -> bool:

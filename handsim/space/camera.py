@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_array, check_choice
+from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from handsim.space.lens import PINHOLE, Lens, distort_ray
 
@@ -281,6 +281,5 @@ def preset(name: str) -> Camera:
         ArgumentError: There is no camera of that name.
     """
     cameras = _presets()
-    if name not in cameras:
-        raise ArgumentError(choices(name, cameras, noun="camera"))
+    check_choice(name, cameras, noun="camera")
     return cameras[name]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_type
+from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
@@ -199,8 +199,7 @@ def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[s
 
 
 def _shipped(name: str) -> Path:
-    if name not in list_rigs():
-        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
+    check_choice(name, list_rigs(), noun="camera rig")
     return _SHIPPED / f"{name}.toml"
 
 

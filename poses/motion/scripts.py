@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-from functools import cache
-from importlib import resources
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError, choices
+from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import HandShape
@@ -29,10 +28,8 @@ FREE: Final = "free"
 _POSES_AT_ONCE: Final = 16
 
 
-@cache
 def _scripts() -> dict[str, dict[str, Any]]:
-    text = resources.files("poses").joinpath("data/scripts.json").read_text(encoding="utf-8")
-    scripts: dict[str, dict[str, Any]] = json.loads(text)["scripts"]
+    scripts: dict[str, dict[str, Any]] = package_data("poses", "scripts")["scripts"]
     return scripts
 
 
@@ -63,8 +60,7 @@ def scripted_motion(
         PoseError: This hand cannot do what the script asks for.
     """
     model = load_model(model)
-    if script not in _scripts():
-        raise ArgumentError(choices(script, _scripts(), noun="script"))
+    check_choice(script, _scripts(), noun="script")
     if script == FREE:
         return sample_motion(model, duration, config, rng=rng)
     entry = _scripts()[script]

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.takes.take import Take
-from handsim._checks import check_number
-from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
+from handsim._checks import check_choice, check_number
+from handsim.errors import ArgumentError, HandSimWarning, RigError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.cameras import load_rig
@@ -89,8 +89,7 @@ class ViewConfig:
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
-        if self.placement not in PLACEMENTS:
-            raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
+        check_choice(self.placement, PLACEMENTS, noun="placement")
         if self.views < 1:
             raise ArgumentError(f"{self.views} views, expected at least 1")
         check_number("share", self.share, 0.01, 1.0)

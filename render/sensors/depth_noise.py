@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
@@ -61,8 +62,7 @@ class DepthNoiseConfig:
 
 def named_sensor(name: str) -> DepthNoise:
     """A depth sensor as it was published."""
-    if name not in _SENSORS:
-        raise ArgumentError(choices(name, _SENSORS, noun="depth sensor"))
+    check_choice(name, _SENSORS, noun="depth sensor")
     return _SENSORS[name]
 
 
