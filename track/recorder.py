@@ -135,12 +135,18 @@ class Recorder:
             worn_arrays(self._hands, self._bodies),
             [column.sized(sizes) for column in (*FRAMES, *OPTIONAL, KEYPOINTS)],
         )
+        self._times: tuple[float, float] | None = None
         self._closed = False
 
     @property
     def num_frames(self) -> int:
         """Number of recorded frames."""
         return self._archive.num_frames
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return self._times[1] - self._times[0] if self._times else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream.
@@ -160,6 +166,7 @@ class Recorder:
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
                 f"kept in {self.part}"
             ) from error
+        self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def close(self) -> None:
         """Write what still waits, and close the recording without writing the take."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import squared_distance
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
@@ -81,9 +82,7 @@ def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
     nearest = np.full(len(cloud), np.inf)
     for i in range(len(cloud)):
         for j in range(i):
-            squared = 0.0
-            for axis in range(3):
-                squared += (cloud[i, axis] - cloud[j, axis]) ** 2
+            squared = squared_distance(cloud[i], cloud[j])
             nearest[i] = min(nearest[i], squared)
             nearest[j] = min(nearest[j], squared)
     return nearest

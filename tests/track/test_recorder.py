@@ -67,7 +67,7 @@ def assert_equal(one: Take, other: Take) -> None:
 
 def test_the_take_on_disk_is_that_in_memory(tmp_path):
     recorder = recorded(tmp_path)
-    assert recorder.num_frames == FRAMES
+    assert recorder.num_frames == FRAMES and recorder.duration == pytest.approx((FRAMES - 1) / 120.0)
     summarized, step = recorder.finish(COUNTS)
     out = tmp_path / "new" / "take.npz"
     assert os.listdir(out.parent) == ["take.npz"], "the recording became the take"
