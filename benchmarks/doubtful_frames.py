@@ -24,11 +24,12 @@ from scipy.ndimage import binary_closing
 
 from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.captures.capture import runs_of
 from gloves.takes.take import Take
 from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
 from track.label_evidence import evidence_of
-from track.take_summary import doubts_of, frame_confidence, runs_of
+from track.take_summary import doubts_of, frame_confidence
 from train.metrics import expected_calibration_error
 
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")

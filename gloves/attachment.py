@@ -105,11 +105,7 @@ class Attachment:
 
 
 def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
-    """Put a glove on a hand: from each marker's point on its bone outwards to the skin.
-
-    Raises:
-        LayoutError: A marker's ray meets no skin; the message names the marker.
-    """
+    """Put a glove on a hand: from each marker's point on its bone outwards to the skin."""
     surface = model.surface
     rays = np.array([_ray(marker, model) for marker in layout.markers])
     origins, directions = rays[:, 0], rays[:, 1]
@@ -121,7 +117,11 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
             f"across {marker.across:g}; move it onto the hand"
         )
     corners = surface.faces[faces]
-    normals = np.einsum("mk,mki->mi", bary, _normals_at(corners, surface))
+    # Skin normals of a few vertices, from the faces around them alone.
+    needed = np.zeros(len(surface.vertices), dtype=np.bool_)
+    needed[corners] = True
+    around = surface.faces[needed[surface.faces].any(axis=1)]
+    normals = np.einsum("mk,mki->mi", bary, vertex_normals(surface.vertices, around)[corners])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = origins + distances[:, None] * directions + layout.heights[:, None] * normals
     indices, shares = _blend_weights(surface, corners, bary)
@@ -240,14 +240,6 @@ def _cross(
     product[0] = first[1] * second[2] - first[2] * second[1]
     product[1] = first[2] * second[0] - first[0] * second[2]
     product[2] = first[0] * second[1] - first[1] * second[0]
-
-
-def _normals_at(corners: NDArray[np.int64], surface: HandSurface) -> NDArray[np.float64]:
-    """Skin normals of a few vertices (M, 3, 3), from the faces around them alone."""
-    needed = np.zeros(len(surface.vertices), dtype=np.bool_)
-    needed[corners] = True
-    around = surface.faces[needed[surface.faces].any(axis=1)]
-    return vertex_normals(surface.vertices, around)[corners]
 
 
 def _blend_weights(

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim._checks import check_type
+from handsim._checks import check_choice, check_type
 from handsim.errors import HandSimError, LayoutError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
@@ -258,8 +258,7 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
 
 def shipped_layout(name: str) -> ShippedLayout:
     """A shipped layout with its description and its source; a `LayoutError` if there is none of this name."""
-    if name not in list_layouts():
-        raise LayoutError(choices(name, list_layouts(), noun="glove"))
+    check_choice(name, list_layouts(), noun="glove", error=LayoutError)
     table = read_toml(_SHIPPED / f"{name}.toml", error=LayoutError)
     return ShippedLayout(
         parse_layout(table), text_of(table, "description", default=""), text_of(table, "source", default="")
@@ -324,14 +323,10 @@ def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
         _parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)
     )
     radius = number_of(table, "radius_mm") * 1e-3
-    return MarkerLayout(text_of(table, "name"), markers, radius, _parse_sides(table))
-
-
-def _parse_sides(table: Mapping[str, object]) -> tuple[Side, ...]:
     sides = table.get("sides", list(SIDES))
     if not isinstance(sides, list) or not all(isinstance(side, str) for side in sides):
         raise LayoutError(f'sides is {sides!r}, expected a list of "right" and "left"')
-    return tuple(sides)
+    return MarkerLayout(text_of(table, "name"), markers, radius, tuple(sides))
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, HandSimError, choices
 
 Settings = TypeVar("Settings")
 
@@ -32,6 +32,14 @@ def check_type(
     raise ArgumentError(
         f"{name} is {shown_value(value)}, expected {expected}" + (f"; valid names: {names}" if names else "")
     )
+
+
+def check_choice(
+    given: object, valid: Collection[str], *, noun: str, error: type[HandSimError] = ArgumentError
+) -> None:
+    """Refuse a name that is none of the valid ones, as `choices` tells it."""
+    if given not in valid:
+        raise error(choices(str(given), valid, noun=noun))
 
 
 def fill_settings(config: Any) -> None:
@@ -58,17 +66,11 @@ def fill_settings(config: Any) -> None:
 def make_settings(
     kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
 ) -> Settings:
-    """A dataclass of settings, some given by name, the others from `default` or the dataclass.
-
-    Raises:
-        ArgumentError: There is no field of some name; `noun` is what messages call one.
-    """
+    """A dataclass of settings, some given by name, the others from `default` or the dataclass."""
     known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
     for name in given:
-        if name not in known:
-            raise ArgumentError(choices(str(name), known, noun=noun))
-    made: Settings = kind(**given) if default is None else dataclasses.replace(default, **given)
-    return made
+        check_choice(name, known, noun=noun)
+    return kind(**given) if default is None else dataclasses.replace(default, **given)
 
 
 def check_rng(rng: object) -> None:
@@ -81,11 +83,7 @@ def check_rng(rng: object) -> None:
 
 
 def check_callable(name: str, value: object, expected: str) -> None:
-    """Refuse what cannot be called.
-
-    Raises:
-        ArgumentError: It cannot.
-    """
+    """Refuse what cannot be called."""
     if not callable(value):
         raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
 
@@ -101,11 +99,7 @@ def shown_value(value: Any) -> str:
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """`array` as finite float64 whose last dimensions are `shape` (None: any length).
-
-    Raises:
-        ArgumentError: It has another shape, or holds NaN or infinite values.
-    """
+    """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
     try:
         values = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -122,11 +116,7 @@ def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> N
 
 
 def check_number(name: str, value: float, low: float, high: float = np.inf, *, above: bool = False) -> None:
-    """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too.
-
-    Raises:
-        ArgumentError: It is.
-    """
+    """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too."""
     check_type(name, value, (int, float, np.integer, np.floating), "a number")
     inside = low <= value <= high and value < np.inf and not (above and value == low)
     if not inside:
@@ -136,12 +126,18 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
         raise ArgumentError(f"{name} is {value:g}, expected {expected}")
 
 
-def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
-    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller.
+def check_count(
+    name: str, value: Any, low: int, high: float = np.inf, *, error: type[HandSimError] = ArgumentError
+) -> None:
+    """Refuse what is not a whole number from `low` to `high`."""
+    check_type(name, value, int, "a whole number")
+    if not low <= value <= high:
+        least = f"at least {low}" if low else "0 or more"
+        raise error(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")
 
-    Raises:
-        ArgumentError: The pair is another.
-    """
+
+def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
+    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller."""
     check_type(name, span, (tuple, list), "two numbers")
     if len(span) != 2 or not low <= span[0] <= span[1] < np.inf:
         raise ArgumentError(f"{name} is {span}, expected two numbers from {low:g} upwards, the smaller first")

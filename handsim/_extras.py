@@ -12,11 +12,7 @@ EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:
-    """A module of an optional package, for something (`what`, in messages) that needs it.
-
-    Raises:
-        ArgumentError: It is not installed; the message names the extra of handsim that brings it.
-    """
+    """A module of an optional package, for something (`what`, in messages) that needs it."""
     try:
         return importlib.import_module(module)
     except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library

@@ -37,9 +37,6 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
 
     The name is `module:name`, or that of an entry point of the group. The current folder is searched last,
     after everything that is installed.
-
-    Raises:
-        ArgumentError: There is nothing of that name, or its module cannot be imported.
     """
     found = _find(name, group, noun)
     try:
@@ -110,12 +107,7 @@ def _find(name: str, group: str, noun: str) -> Any:
 
 
 def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:
-    """Call what a user wrote, and tell in one sentence what went wrong.
-
-    Raises:
-        ArgumentError: It does not take these arguments.
-        HandSimError: It raised an error; the sentence has its line. Ours goes on as it is.
-    """
+    """Call what a user wrote, and tell in one sentence what went wrong."""
     if not callable(function):
         raise ArgumentError(f"{noun} '{name}' is {type(function).__name__}, expected a function or a class")
     try:

@@ -9,8 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from handsim._checks import check_type, fill_settings
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice, check_type, fill_settings
+from handsim.errors import ArgumentError
 from render.cameras.viewpoints import ViewConfig
 from render.frames import PASSES
 from render.painting.painter import PainterChoice, choose_painter
@@ -95,8 +95,7 @@ class RenderConfig:
         if isinstance(self.passes, str):
             object.__setattr__(self, "passes", (self.passes,))
         for name in self.passes:
-            if name not in PASSES:
-                raise ArgumentError(choices(name, PASSES, noun="pass"))
+            check_choice(name, PASSES, noun="pass")
         if not self.passes or self.every < 1 or self.frames_per_shard < 1:
             raise ArgumentError(
                 f"passes are {self.passes}, every is {self.every}, frames_per_shard is "

@@ -121,11 +121,7 @@ class Drawing:
             check_hands_in_view(self.config.view.own_cameras, cameras, self.take)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
-        """Numbers of frames as asked for; else those with a hand.
-
-        Raises:
-            ArgumentError: The take has no such frame.
-        """
+        """Numbers of frames as asked for; else those with a hand."""
         if frames is None:
             present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
             return [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]

@@ -43,11 +43,7 @@ class CutOut(NamedTuple):
 
 
 def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
-    """The hands of a file of COCO keypoints, 21 each in our order; photographs are beside it or in `images`.
-
-    Raises:
-        DatasetError: The file cannot be read, is no such file, or labels no hand; or a photograph is missing.
-    """
+    """The hands of a file of COCO keypoints, 21 each in our order; pictures are beside it or in `images`."""
     path = Path(file)
     content = load_json(path)
     try:
@@ -90,9 +86,6 @@ def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Genera
     """A square of `size` pixels around a hand, whose labeled keypoints span a share of it, somewhere in it.
 
     What is outside of the photograph has the color of its border.
-
-    Raises:
-        DatasetError: The photograph cannot be read.
     """
     photograph = cv2.imread(str(hand.file), cv2.IMREAD_COLOR)
     if photograph is None:

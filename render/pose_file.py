@@ -51,10 +51,6 @@ def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[Own
         path: The file; nothing in it is unpickled.
         sides: Whose poses an `.npz` has, in its order, a right hand's when not given; or which are read of a
             `.csv`, all when not given.
-
-    Raises:
-        CaptureError: It cannot be read, an array or column is missing or has another shape or impossible
-            numbers, or there is no hand in any frame.
     """
     if path.suffix.lower() == CSV:
         arrays, sides = _columns(path, sides)
@@ -232,7 +228,15 @@ def _person(
 ) -> Int[np.ndarray, "T"] | None:
     """Who is in each frame: told, or a person a frame, or one for all; None where nothing tells."""
     if "person" in arrays:
-        return _stored_people(arrays["person"], frames, shapes)
+        person = arrays["person"]
+        most = MOST_PEOPLE if shapes is None else len(shapes)
+        if person.dtype.kind not in "iu" or person.shape != (frames,):
+            raise ArgumentError(
+                f"person is {person.dtype} of shape {person.shape}, expected whole numbers ({frames},)"
+            )
+        if person.min() < 0 or person.max() >= most:
+            raise ArgumentError(f"person is {person.min()} to {person.max()}, expected 0 to {most - 1}")
+        return person.astype(np.int64)
     if shapes is None:
         return None
     if len(shapes) not in (1, frames):
@@ -241,19 +245,6 @@ def _person(
             "the array person that says which"
         )
     return np.arange(frames) if len(shapes) > 1 else np.zeros(frames, dtype=np.int64)
-
-
-def _stored_people(
-    person: NDArray[Any], frames: int, shapes: tuple[HandShape, ...] | None
-) -> Int[np.ndarray, "T"]:
-    most = MOST_PEOPLE if shapes is None else len(shapes)
-    if person.dtype.kind not in "iu" or person.shape != (frames,):
-        raise ArgumentError(
-            f"person is {person.dtype} of shape {person.shape}, expected whole numbers ({frames},)"
-        )
-    if person.min() < 0 or person.max() >= most:
-        raise ArgumentError(f"person is {person.min()} to {person.max()}, expected 0 to {most - 1}")
-    return person.astype(np.int64)
 
 
 def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] | None:

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim._checks import check_type
+from handsim._checks import check_choice, check_type
 from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
-from handsim.errors import HandSimError, HandSimWarning, choices
+from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from render.config import RenderConfig
@@ -31,7 +31,7 @@ from render.formats.annotations.common import centered_K, without_colors
 from render.formats.clip_writer import TAR
 from render.formats.merging import CONFIG
 from render.formats.shards import INDEX
-from render.formats.writer import FORMATS, NEED_COLORS, open_writer
+from render.formats.writer import FORMATS, NEED_COLORS, format_folder, open_writer
 from render.frames import RenderedFrame
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
@@ -125,7 +125,7 @@ def render_take(
         if there and not drew:  # the sheet comes last
             return views * sum(frame not in lost for shard in shards for frame in shard)
         for name in formats:
-            open_writer(name, _folder(output.folder, formats, name)).finish()
+            open_writer(name, format_folder(output.folder, formats, name)).finish()
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
         if not any(drawn):
             raise HandSimError(
@@ -229,33 +229,26 @@ def _settings(drawing: Drawing) -> dict[str, Any]:
 
 def left_out_frames(out: str | Place) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
-    with open_output(out) as output:
-        output.fetch(_LEFT_OUT.format("*"))
-        files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
-        return sorted(frame for file in files for frame in load_json(file)["frames"])
+    return _noted(out, _LEFT_OUT, "frames")
 
 
 def cut_off_pictures(out: str | Place) -> list[str]:
     """Pictures of a rendering that lack a hand of their frame: they have less than half of its keypoints."""
+    return _noted(out, _CUT_OFF, "pictures")
+
+
+def _noted(out: str | Place, name: str, key: str) -> list[Any]:
+    """What the workers noted beside their shards, of all shards."""
     with open_output(out) as output:
-        output.fetch(_CUT_OFF.format("*"))
-        files = sorted(output.folder.glob(_CUT_OFF.format("*")))
-        return sorted(name for file in files for name in load_json(file)["pictures"])
-
-
-def _lacks_a_hand(frame: RenderedFrame) -> bool:
-    """Whether a hand of the frame is not in its picture, or little of it."""
-    inside = [
-        ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1) for hand in frame.hands
-    ]
-    return any(float(shown.mean()) < _SHOWN for shown in inside)
+        output.fetch(name.format("*"))
+        files = sorted(output.folder.glob(name.format("*")))
+        return sorted(one for file in files for one in load_json(file)[key])
 
 
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
         check_type("a format", name, str, "its name", FORMATS)
-        if name not in FORMATS:
-            raise HandSimError(choices(name, FORMATS, noun="format"))
+        check_choice(name, FORMATS, noun="format", error=HandSimError)
         if name in NEED_COLORS and "rgb" not in config.passes:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
@@ -275,12 +268,8 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
     check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
 
 
-def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
-    return out if len(formats) == 1 else out / name
-
-
 def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
-    done = [open_writer(name, _folder(folder, formats, name)).done() for name in formats]
+    done = [open_writer(name, format_folder(folder, formats, name)).done() for name in formats]
     return frozenset.intersection(*done)
 
 
@@ -308,7 +297,11 @@ def _render_shard(
     def counted() -> Iterator[RenderedFrame]:
         with (out / _DRAWN.format(shard)).open("ab", buffering=0) as drawn:
             for frame in drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out):
-                if _lacks_a_hand(frame):
+                inside = [
+                    ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1)
+                    for hand in frame.hands
+                ]
+                if any(float(shown.mean()) < _SHOWN for shown in inside):
                     cut.append(frame.key)
                 yield frame
                 drawn.write(b".")
@@ -318,7 +311,7 @@ def _render_shard(
 
     kept = list(counted()) if len(formats) > 1 else counted()
     for name in formats:
-        writer = open_writer(name, _folder(out, formats, name))
+        writer = open_writer(name, format_folder(out, formats, name))
         if shard not in writer.done():
             writer.write(shard, kept)
     return shard

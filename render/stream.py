@@ -15,8 +15,8 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim._checks import check_number, check_span, check_type, shown_value
-from handsim.errors import ArgumentError, PoseError, choices
+from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, pack_hand, sample_shape
@@ -142,15 +142,17 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         if sum(given is not None for given in (sampler, poses, takes)) > 1:
             raise ArgumentError("expected one of sampler, poses and takes")
         check_type("side", side, str, "left, right or either")
-        if side not in _SIDE_CHOICES:
-            raise ArgumentError(choices(side, _SIDE_CHOICES, noun="side"))
+        check_choice(side, _SIDE_CHOICES, noun="side")
         counts = {"people": people, "sitting": sitting, "batch": batch, "start": start}
         for name, count in counts.items():
             check_type(name, count, (int, np.integer), "a whole number")
             check_number(name, count, 0 if name == "start" else 1)
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
-        self.config = _settled(configured(config, None, seed))
+        config = configured(config, None, seed)
+        if config.depth_sensor == "auto":  # of a stream it measures near hands
+            config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
+        self.config = config.settled()
         self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
@@ -307,13 +309,6 @@ def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]
     """Of a drawn picture what a labeled photograph has."""
     kept = {name: picture[name] for name in ("keypoints", "visible", "box", "side", "drawn", "number")}
     return {"rgb": picture.get("noisy_rgb", picture["rgb"])} | kept
-
-
-def _settled(config: RenderConfig) -> RenderConfig:
-    """The configuration with a painter, and with a depth sensor that measures near hands."""
-    if config.depth_sensor == "auto":
-        config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
-    return config.settled()
 
 
 def _camera(camera: Camera | str, crop: int | None) -> Camera:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, CaptureError, choices
+from handsim._checks import check_choice, check_count, check_type
+from handsim.errors import ArgumentError, CaptureError
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, load_model
 from handsim.hand.shape import HAND_DTYPE, HandShape, pack_hand, sample_shape
@@ -104,8 +104,7 @@ class PoseFile:
     def __post_init__(self) -> None:
         sides = ("right",) if self.sides is None else self.sides
         for side in sides:
-            if side not in SIDES:
-                raise ArgumentError(choices(side, SIDES, noun="hand"))
+            check_choice(side, SIDES, noun="hand")
         if not 1 <= len(set(sides)) == len(sides):
             raise ArgumentError(f"hands are {' '.join(sides) or 'none'}, expected right, left or both")
         _check_people(self.people)
@@ -125,12 +124,7 @@ def source_of(
     glove: MarkerLayout | str | None = None,
     seed: int = 0,
 ) -> Source:
-    """What a public function was given, as a source; see `subject_of_poses` for what belongs to poses.
-
-    Raises:
-        ArgumentError: A take has hands and times of its own, and others were named; or the poses cannot be
-            drawn.
-    """
+    """What a public function was given, as a source; see `subject_of_poses` for what belongs to poses."""
     given = {"model": model, "times": times, "people": people, "person": person, "glove": glove}
     if isinstance(source, Take | str | Path | PoseFile):
         for name, value in given.items():
@@ -300,8 +294,8 @@ def models_of(model: Model | tuple[Model, Model] | None, num_hands: int) -> tupl
 
 
 def _check_people(people: int | None) -> None:
-    if people is not None and not 1 <= people <= MOST_PEOPLE:
-        raise ArgumentError(f"people is {people}, expected 1 to {MOST_PEOPLE}")
+    if people is not None:
+        check_count("people", people, 1, MOST_PEOPLE)
 
 
 def _digest(*arrays: np.ndarray) -> str:

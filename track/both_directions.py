@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures.capture import runs_of
 from track.association.initialization import MOST_POINTS
 from track.association.point_groups import distances_to_nearest
 from track.streams.frame_source import StreamedFrame
@@ -133,8 +134,7 @@ def _exchanges(
         both = (one.labels >= 0) & (other.labels >= 0)
         wrong.append((one.labels[both] // num_markers != other.labels[both] // num_markers).mean() > _MOST
                      if both.any() else False)  # fmt: skip
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], np.array(wrong, dtype=np.int8), [0]])))
-    yield from (slice(int(begin), int(end)) for begin, end in steps.reshape(-1, 2))
+    yield from (slice(first, last + 1) for first, last in runs_of(np.array(wrong, dtype=np.bool_)))
 
 
 def _ask(
@@ -190,7 +190,12 @@ def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> In
     second = (second & ~first_stays) | second_stays
     labels = np.where(second, other.labels, one.labels)
     confidence = np.where(same, one.confidence, _MAJORITY * np.where(second, other_sure, sure))
-    return _without_doubles(labels, confidence)
+    # Every marker is at its most confident point alone.
+    order = np.argsort(-confidence, kind="stable")
+    kept = order[np.unique(labels[order], return_index=True)[1]]
+    single = np.full(len(labels), -1)
+    single[kept] = labels[kept]
+    return single
 
 
 def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
@@ -198,12 +203,3 @@ def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray
     lost = np.isnan(tracked.markers).all(axis=(1, 2))
     of_lost: Bool[np.ndarray, "N"] = lost[np.maximum(labels, 0) // tracked.markers.shape[1]]
     return of_lost & (labels >= 0)
-
-
-def _without_doubles(labels: Int[np.ndarray, "N"], confidence: Float[np.ndarray, "N"]) -> NDArray[np.int64]:
-    """Labels in which every marker is at its most confident point alone."""
-    order = np.argsort(-confidence, kind="stable")
-    kept = order[np.unique(labels[order], return_index=True)[1]]
-    single = np.full(len(labels), -1)
-    single[kept] = labels[kept]
-    return single

@@ -118,8 +118,7 @@ def _solved(
 
 def _of_hand(labels: Int[np.ndarray, "T N"], span: range) -> NDArray[np.int64]:
     """Labels of one hand, -1 for those of others."""
-    own: NDArray[np.int64] = np.where((labels >= span.start) & (labels < span.stop), labels, -1)
-    return own
+    return np.where((labels >= span.start) & (labels < span.stop), labels, -1)
 
 
 def _records(

@@ -60,12 +60,7 @@ class Intake:
     def check_frame(
         self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"] | None, time: float | None
     ) -> IncomingFrame:
-        """Check the next frame; an ID is -1 where there is none, and the stream may have none.
-
-        Raises:
-            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time [s],
-                which is the caller's mistake, not the stream's.
-        """
+        """Check the next frame; an ID is -1 where there is none, and the stream may have none."""
         points = _numbers("points", points, np.float64)
         ids = np.full(points.shape[:1], -1) if ids is None else _numbers("ids", ids, np.int64)
         if ids.ndim != 1 or points.shape != (len(ids), 3):

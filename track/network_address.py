@@ -28,9 +28,6 @@ def split_address(
     """Take `scheme://host:port?option=value` apart; without a host it is this machine's loopback.
 
     The first of an option's valid values holds when none is given; a port must be given where `port` is not.
-
-    Raises:
-        ArgumentError: The address has other parts, or an option is unknown.
     """
     scheme = address.partition("://")[0]
     try:

@@ -53,11 +53,6 @@ class TakeRecorder:
         """Number of recorded frames."""
         return len(self._rows)
 
-    @property
-    def duration(self) -> float:
-        """Time from the first frame to the last [s]."""
-        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
-
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream."""
         if not frame.silent:

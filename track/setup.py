@@ -13,8 +13,8 @@ import numpy as np
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
-from handsim._checks import check_type, shown_value
-from handsim.errors import ArgumentError, HandSimWarning, choices
+from handsim._checks import check_choice, check_type, shown_value
+from handsim.errors import ArgumentError, HandSimWarning
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
@@ -192,8 +192,7 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
 
     Without a glove they wear their own, or dense19 where they are measured. See `TrackerSetup.of` for errors.
     """
-    if size not in get_args(Size):
-        raise ArgumentError(choices(str(size), get_args(Size), noun="size"))
+    check_choice(size, get_args(Size), noun="size")
     check_type("hands", hands, (Sequence, Path), _HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)

@@ -40,9 +40,6 @@ def calibrate_take(
     """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
 
     Labels of hands that are tracked count. Each side begins with `start`; the take was labeled with `before`.
-
-    Raises:
-        CalibrationError: No hand is in the take, or it tells too little of one.
     """
     there = [hand for hand in start if hand.side in take.sides]
     shown = [hand for hand in there if _reliable(take, hand.side).mean() > _SHOWN]
@@ -51,7 +48,9 @@ def calibrate_take(
             f"no {' and no '.join(take.sides)} hand was found in the capture; expected half a minute of one"
         )
     worn = {hand.side: hand for hand in before}
-    out = _held_out(take.num_frames, take.rate)
+    # Frames that the calibration does not see: every third second, or less of a short take.
+    block = max(1, min(round(_BLOCK * take.rate), take.num_frames // _BLOCKS))
+    out: NDArray[np.bool_] = np.arange(take.num_frames) // block % _HELD_OUT == _HELD_OUT - 1
     done = []
     for hand in shown:
         markers = _markers(take, hand.side)
@@ -111,13 +110,6 @@ def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
     return left > _LEFT_OVER * total
 
 
-def _held_out(num_frames: int, rate: float) -> Bool[np.ndarray, "T"]:
-    """Frames that a calibration does not see: every third second, or less of a short take."""
-    block = max(1, min(round(_BLOCK * rate), num_frames // _BLOCKS))
-    out: NDArray[np.bool_] = np.arange(num_frames) // block % _HELD_OUT == _HELD_OUT - 1
-    return out
-
-
 def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFit) -> HeldOut | None:
     """How well two hands fit held-out markers [m], NaN where missing; None if they tell too little."""
     frames = np.flatnonzero(np.isfinite(markers[..., 0]).mean(axis=1) >= _FEWEST_SEEN)
@@ -144,5 +136,4 @@ def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
 
 def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels are reliable."""
-    reliable: NDArray[np.bool_] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
-    return reliable
+    return np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from gloves.captures.capture import runs_of
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
@@ -223,9 +224,3 @@ def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarra
 def _is_known(take: Take) -> bool:
     """Whether every label is certain, as those of a truth."""
     return bool((take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all())
-
-
-def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
-    """The first and the last frame of each unbroken stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

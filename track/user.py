@@ -15,8 +15,8 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, FileError, HandSimError, choices
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.model import HandModel
@@ -113,8 +113,7 @@ class User(Sequence[GloveFit]):
         """
         known = {hand.side: hand for hand in self.hands}
         for side in sides:
-            if side not in known:
-                raise ArgumentError(choices(side, known, noun="hand"))
+            check_choice(side, known, noun="hand")
         return dataclasses.replace(self, hands=tuple(known[side] for side in sides))
 
     def of_side(self, side: Side | None = None) -> GloveFit:
@@ -193,11 +192,7 @@ def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User
 
 
 def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
-    """One side, or both.
-
-    Raises:
-        ArgumentError: It is something else.
-    """
+    """One side, or both."""
     check_type("hands", sides, Sequence, "right, left, or one of each")
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):

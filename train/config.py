@@ -8,9 +8,9 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from handsim._checks import check_callable, check_number, check_type, fill_settings
+from handsim._checks import check_callable, check_choice, check_count, check_number, fill_settings
 from handsim._plugins import plugin_name
-from handsim.errors import ArgumentError, HandSimError, choices
+from handsim.errors import ArgumentError, HandSimError
 from train.data.augmentation import Corruption
 from train.data.batches import BatchRecipe, paper_corruption
 from train.data.own_corruption import OwnCorruption
@@ -42,7 +42,7 @@ class SetLabelerConfig:
 
     def __post_init__(self) -> None:
         for name, (low, high) in _SIZES.items():
-            _check_count(name, getattr(self, name), low, high)
+            check_count(name, getattr(self, name), low, high)
         if self.width % self.gates:
             raise ArgumentError(f"gates is {self.gates}, expected a divisor of width, {self.width}")
         check_number("reach", self.reach, 0.001, 10.0)
@@ -55,14 +55,6 @@ _SIZES: Final = {  # least and greatest; a network beyond these would not fit in
     "depth": (1, 100),
     "num_distances": (2, 1000),
 }
-
-
-def _check_count(name: str, value: int, low: int, high: float = np.inf) -> None:
-    """Refuse what is not a whole number in a range."""
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        least = f"at least {low}" if low else "0 or more"
-        expected = least if high == np.inf else f"a whole number from {low} to {high}"
-        raise ArgumentError(f"{name} is {value!r}, expected {expected}")
 
 
 Views = Literal["aligned", "random"]
@@ -87,9 +79,8 @@ class CNNConfig:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < np.inf:
                 raise HandSimError(f"{name} is {value}, expected more than 0")
-        _check_count("num_labels", self.num_labels, *_SIZES["num_labels"])
-        if self.views not in get_args(Views):
-            raise ArgumentError(choices(str(self.views), get_args(Views), noun="views"))
+        check_count("num_labels", self.num_labels, *_SIZES["num_labels"])
+        check_choice(self.views, get_args(Views), noun="views")
 
 
 NetworkConfig = SetLabelerConfig | CNNConfig
@@ -161,17 +152,14 @@ class TrainConfig:
             ("schedule", ("cosine", "steps")),
             ("precision", ("auto", "32", "bf16")),
         ):
-            if getattr(self, name) not in valid:
-                raise ArgumentError(choices(str(getattr(self, name)), valid, noun=name))
+            check_choice(getattr(self, name), valid, noun=name)
         for name in ("samples", "batch", "devices", "average_every"):
-            check_type(name, getattr(self, name), int, "a whole number")
-            if getattr(self, name) < 1:
-                raise HandSimError(f"{name} is {getattr(self, name)}, expected at least 1")
-        _check_count("seed", self.seed, 0)
-        _check_count("batch", self.batch, 1, _MOST_CLOUDS)
-        _check_count("ghosts", self.ghosts, 0, _MOST_POINTS)
+            check_count(name, getattr(self, name), 1)
+        check_count("seed", self.seed, 0)
+        check_count("batch", self.batch, 1, _MOST_CLOUDS)
+        check_count("ghosts", self.ghosts, 0, _MOST_POINTS)
         if self.occlude is not None:
-            _check_count("occlude", self.occlude, 0, _MOST_POINTS)
+            check_count("occlude", self.occlude, 0, _MOST_POINTS)
         check_number("learning_rate", self.learning_rate, 0.0, 10.0, above=True)
         check_number("weight_decay", self.weight_decay, 0.0, 10.0)
         check_number("average", self.average, 0.0, 1.0)

@@ -15,7 +15,7 @@ from gloves.captures.formats import find_captures, read_markers
 from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
+from handsim._checks import check_count, check_rng, check_type
 from handsim.errors import ArgumentError, CaptureError
 from train.data.augmentation import Corruption
 from train.data.own_corruption import OwnCorruption
@@ -61,9 +61,7 @@ def evaluate_labeler(
             given with others or to be corrupted, or there is nothing to count.
     """
     network = load_labeler(labeler)
-    check_type("every", every, int, "a whole number")
-    if every < 1:
-        raise ArgumentError(f"every is {every}, expected at least 1")
+    check_count("every", every, 1)
     rng = np.random.default_rng(0) if rng is None else rng
     check_rng(rng)
     several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
@@ -110,11 +108,19 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
     parts = []
     for one in truth:
         if isinstance(one, np.ndarray):
-            parts.append(_checked_markers(one, len(names)))
+            count = len(names)
+            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
+                raise ArgumentError(
+                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
+                )
+            parts.append(one.astype(np.float64))
         elif isinstance(one, Capture):
             parts += select_hands(one, names)
         elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
-            parts.append(_markers_of_set(load_dataset(one), names))
+            dataset = load_dataset(one)
+            _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
+            markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
+            parts.append(markers)
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)
@@ -122,20 +128,6 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
     if not parts:
         raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
     return np.concatenate(parts)
-
-
-def _checked_markers(markers: NDArray[Any], count: int) -> NDArray[np.float64]:
-    if markers.ndim != 3 or markers.shape[1:] != (count, 3) or markers.dtype.kind not in "fiu":
-        raise ArgumentError(
-            f"markers are {markers.dtype} of shape {markers.shape}, expected (T, {count}, 3) numbers [m]"
-        )
-    return markers.astype(np.float64)
-
-
-def _markers_of_set(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.float64]:
-    _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
-    markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
-    return markers
 
 
 def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:

@@ -82,7 +82,8 @@ def train_labeler(
         PeerError: Another process of the run failed, and tells why.
         Stopped: A signal came; the last step is kept in the checkpoint.
     """
-    config, out = _chosen_config(config, settings), _folder(out)
+    check_type("out", out, (str, Path), "the path of a folder")
+    config, out = _chosen_config(config, settings), Path(out)
     if config.devices == 1 or world_of().size > 1:
         return _train(
             dataset, config, out, threads=threads, progress=progress, told=told, save_every=save_every
@@ -102,11 +103,6 @@ def _chosen_config(config: TrainConfig | None, settings: dict[str, Any]) -> Trai
         config = default_config(labeler) if labeler in KINDS else TrainConfig(labeler=labeler)
     check_type("config", config, TrainConfig, "a TrainConfig")
     return make_settings(TrainConfig, "setting of a training", settings, default=config)
-
-
-def _folder(out: str | Path) -> Path:
-    check_type("out", out, (str, Path), "the path of a folder")
-    return Path(out)
 
 
 def _train(
@@ -194,7 +190,13 @@ def _prepare(
     def claimed() -> tuple[Dataset, TrainConfig, MappedRows, MappedRows]:
         opened = load_dataset(dataset)
         whole = _for_set(config, len(opened.marker_names), fabric.world_size)
-        parts = _split(opened, config.batch)
+        rows = opened.mapped_rows()
+        held_out = min(MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
+        if len(rows) - held_out < config.batch:
+            raise DatasetError(
+                f"{opened.path} has {len(rows)} frames, expected at least {config.batch + held_out + 1}"
+            )
+        parts = rows.span(0, len(rows) - held_out), rows.span(len(rows) - held_out, len(rows))
         if fabric.is_global_zero:
             _claim(out, whole, opened)
         return opened, whole, *parts
@@ -297,12 +299,3 @@ class _Run:
                 f"{min(done, expected)} of {expected} samples are kept in {checkpoint}, and the same command "
                 "goes on after them",
             ) from stop
-
-
-def _split(dataset: Dataset, batch: int) -> tuple[MappedRows, MappedRows]:
-    """Rows to train on, and the held-out ones."""
-    rows = dataset.mapped_rows()
-    held_out = min(MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
-    if len(rows) - held_out < batch:
-        raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
-    return rows.span(0, len(rows) - held_out), rows.span(len(rows) - held_out, len(rows))

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Final
 
-from handsim.errors import ArgumentError
+from handsim._checks import check_count
 
 _MOST: Final = 1024
 _STEPS: Final = 2  # of each number of threads, the faster of which counts, after one to warm up
@@ -22,13 +22,9 @@ _labeling: ContextVar[int] = ContextVar("labeling", default=1)
 
 
 def check_threads(threads: int | None) -> None:
-    """Refuse a number of threads below one.
-
-    Raises:
-        ArgumentError: It is, or is absurdly large.
-    """
-    if threads is not None and not 1 <= threads <= _MOST:
-        raise ArgumentError(f"threads is {threads}, expected 1 to {_MOST}")
+    """Refuse a number of threads below one."""
+    if threads is not None:
+        check_count("threads", threads, 1, _MOST)
 
 
 def label_on(threads: int) -> None:

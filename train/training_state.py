@@ -137,11 +137,7 @@ class TrainingState:
             temporary.write_bytes(buffer.getbuffer())
 
     def restore(self, path: Path) -> None:
-        """Continue from a checkpoint, if there is one; the first process reads it for all.
-
-        Raises:
-            WeightsError: The checkpoint is damaged.
-        """
+        """Continue from a checkpoint, if there is one; the first process reads it for all."""
         found = path.read_bytes() if self.fabric.is_global_zero and path.is_file() else None
         found = self.fabric.broadcast(found)
         if found is None:

@@ -73,11 +73,7 @@ class _Extent:
 def read_points(
     data: bytes, parameters: Parameters, header: Header, tell: Tell
 ) -> Float[np.ndarray, "T N 4"]:
-    """Coordinates in the file's unit and residuals of all frames.
-
-    Raises:
-        CaptureError: There is no point or frame, the file is cut, or it contradicts itself.
-    """
+    """Coordinates in the file's unit and residuals of all frames."""
     processor = parameters.processor
     num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
     if not num_points:
@@ -104,11 +100,7 @@ def read_points(
 
 
 def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
-    """POINT:SCALE, or the header's where there is none; see `Header.scale`.
-
-    Raises:
-        CaptureError: It is 0, or the two contradict each other and the data do not decide.
-    """
+    """POINT:SCALE, or the header's where there is none; see `Header.scale`."""
     scale = parameters.number("POINT", "SCALE", default=header.scale)
     if scale == 0.0 or not np.isfinite(scale):
         raise CaptureError(f"POINT:SCALE is {scale:g}, expected a number that is not 0")
@@ -133,12 +125,7 @@ def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: 
 def _analog_numbers(
     parameters: Parameters, header: Header, extent: _Extent, size: int, num_points: int, tell: Tell
 ) -> int:
-    """Analog numbers of a frame, which lie between its points and those of the next.
-
-    Raises:
-        CaptureError: Header and parameters contradict each other and the data do not decide, so that points
-            would be read from other places than they were written to.
-    """
+    """Analog numbers of a frame, which lie between its points and those of the next."""
     channels = int(parameters.number("ANALOG", "USED", default=0.0 if header.per_frame == 0 else -1.0))
     stated = header.per_frame
     if channels < 0 or stated == channels * header.samples:  # less than none: nothing is stated
@@ -178,11 +165,7 @@ def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
 def _num_frames(
     data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, tell: Tell
 ) -> int:
-    """Number of frames to read, each of so many words (numbers) of so many bytes.
-
-    Raises:
-        CaptureError: There are none, or fewer than stated, or their size contradicts the file's.
-    """
+    """Number of frames to read, each of so many words (numbers) of so many bytes."""
     present, stated = extent.room // (words * size), extent.stated
     if stated == 0 or (stated is None and present == 0):
         raise CaptureError("no frames: the file holds no frame")

@@ -42,11 +42,7 @@ class Parameters:
 
     @staticmethod
     def parse(data: bytes, start: int, tell: Tell) -> Parameters:
-        """Read the records from byte `start` of a file of at least one block; nothing outside it is touched.
-
-        Raises:
-            CaptureError: The section makes no sense, or a parameter of points is damaged.
-        """
+        """Read the records from byte `start` of a file of a block or more; nothing outside it is touched."""
         if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]

@@ -52,11 +52,7 @@ def warn(text: str) -> None:
 
 
 def meters_per(unit: str) -> float:
-    """Meters per unit of length of a file, in any case; a word may be cut ("Mete") or in the singular.
-
-    Raises:
-        CaptureError: It is not millimeters, centimeters or meters.
-    """
+    """Meters per unit of length of a file, in any case; a word may be cut ("Mete") or in the singular."""
     word = unit.strip(" .\t\0").lower()
     scale = METERS.get(word)
     if scale is None and len(word) >= _SHORTEST:
@@ -150,7 +146,8 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
     decimals = False
     for index, line in enumerate(lines):
         numbers = _TIME_CODE.sub(b"", line)
-        if _is_row(numbers):
+        # A row of a frame and a position, with decimal points or commas and without quotes.
+        if numbers.count(b",") > _LEADING and _NUMBERS.fullmatch(numbers) is not None:
             if b"." in numbers:
                 return
             rows.append(index)
@@ -168,11 +165,6 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
                 f"line {first + index} has {width} cells where {expected} are expected: commas are both "
                 "between cells and in numbers; export it with decimal points, or with semicolons or tabs"
             )
-
-
-def _is_row(line: bytes) -> bool:
-    """Whether a line is a row of a frame and a position, with decimal points or commas and without quotes."""
-    return line.count(b",") > _LEADING and _NUMBERS.fullmatch(line) is not None
 
 
 def parse_table(
@@ -200,9 +192,6 @@ def parse_table(
         num_columns: Number of cells of a whole row.
         column_name: Name of a column in messages.
         text_columns: Columns that hold no numbers; they are returned as NaN.
-
-    Raises:
-        CaptureError: No rows, a cut last row, a cell that is not a number, or a row that is too long.
     """
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
     if not rows:

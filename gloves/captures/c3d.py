@@ -31,9 +31,6 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a C3D file; points with a negative residual are missing.
 
     A missing unit is told, and where the file contradicts itself.
-
-    Raises:
-        CaptureError: Not a C3D, cut or damaged, without points or frames, or in unknown units.
     """
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")

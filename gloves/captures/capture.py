@@ -96,3 +96,9 @@ def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[
     begins, ends = np.nonzero(steps == 1)[1], np.nonzero(steps == -1)[1]
     lengths: np.ndarray = ends - begins
     return lengths[(begins > 0) & (ends < len(flags))] if inside else lengths
+
+
+def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
+    """The first and the last frame of each unbroken stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

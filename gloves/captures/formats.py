@@ -156,11 +156,7 @@ def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
 
 
 def find_captures(paths: Sequence[Path]) -> list[Path]:
-    """The capture files among paths, folders searched through.
-
-    Raises:
-        CaptureError: There is none, or a folder holds none.
-    """
+    """The capture files among paths, folders searched through."""
     files = []
     for path in paths:
         inside = (

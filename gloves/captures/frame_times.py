@@ -73,9 +73,6 @@ def timed_positions(
     """Positions of all frames from the first to the last [m], and their rate [Hz].
 
     Frames that are missing are NaN, and told, as is a rate that is stated by the times alone.
-
-    Raises:
-        CaptureError: Rate, times and numbers contradict each other, or there are fewer frames than stated.
     """
     numbers, times = _increasing_numbers(stated.numbers), _increasing_times(stated)
     steps, stride = np.ones(len(positions) - 1, dtype=np.int64), 1

@@ -16,11 +16,7 @@ UNLABELED: Final = "Unlabeled"
 
 
 def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The columns of the named markers, in their order; a subject's prefix ("Anna:ThumbTip") is ignored.
-
-    Raises:
-        CaptureError: A marker is not among the columns, or is among them twice.
-    """
+    """The columns of the named markers, in their order; a subject's prefix ("Anna:ThumbTip") is ignored."""
     bare = [column.rsplit(":", 1)[-1].strip() for column in capture.names]
     for name in names:
         if name not in bare:
@@ -38,9 +34,6 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
     A capture of one hand has one column per marker, as `select_markers` takes it. One of two hands, as
     `handsim track` and `handsim label` write it, has a set of columns for each: "right:ThumbTip" and so on.
     Of such a set, the frames without a marker are left out: the hand was not there.
-
-    Raises:
-        CaptureError: A marker is not among the columns, or is among those of a hand twice or not at all.
     """
     columns = [_split_name(column) for column in capture.names]
     sets = list(dict.fromkeys(prefix for prefix, name in columns if name in names))

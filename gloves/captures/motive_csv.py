@@ -39,10 +39,6 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
-
-    Raises:
-        CaptureError: Not a Motive export, without marker columns, cut, with a cell that is not a number, or
-            with rate, times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
     separator = separator_behind([MOTIVE_BEGIN], lines[0])
@@ -60,7 +56,9 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     axes = rows[end]
     types, names = _types_and_names(rows[1:end], len(axes))
-    quantities = _quantities(rows[1:end], len(axes))
+    header = rows[1:end]
+    row = next((row for row in reversed(header) if any(row)), [])
+    quantities = row + [""] * (len(axes) - len(row))
     columns = _marker_columns(types, quantities, axes)
 
     table = parse_table(
@@ -138,12 +136,6 @@ def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
         if next(cell for cell in row if cell) == label:
             return row
     raise CaptureError(f"not a Motive CSV export: no header row is labeled '{label}'")
-
-
-def _quantities(rows: list[list[str]], width: int) -> list[str]:
-    """The row above the axes; it has no label, its first text is a quantity itself."""
-    row = next((row for row in reversed(rows) if any(row)), [])
-    return row + [""] * (width - len(row))
 
 
 def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) -> list[int]:

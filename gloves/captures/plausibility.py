@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import squared_distance
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
@@ -81,9 +82,7 @@ def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
     nearest = np.full(len(cloud), np.inf)
     for i in range(len(cloud)):
         for j in range(i):
-            squared = 0.0
-            for axis in range(3):
-                squared += (cloud[i, axis] - cloud[j, axis]) ** 2
+            squared = squared_distance(cloud[i], cloud[j])
             nearest[i] = min(nearest[i], squared)
             nearest[j] = min(nearest[j], squared)
     return nearest
@@ -95,12 +94,7 @@ def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
 
 
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
-    """Refuse clouds that are not in meters, see `unit_fault`.
-
-    Raises:
-        ArgumentError: They cannot be; or all points are at the origin, which a single cloud's (`only_wide`)
-            may be.
-    """
+    """Refuse clouds that are not in meters, see `unit_fault`."""
     if not only_wide and all_at_origin(clouds):
         raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
     fault = unit_fault(clouds, only_wide=only_wide)
@@ -123,11 +117,7 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
 
 
 def check_place(capture: Capture, farthest: float) -> None:
-    """Warn of points that will be left out, farther than this from the origin in a coordinate [m].
-
-    Raises:
-        CaptureError: They are most of the points.
-    """
+    """Warn of points that will be left out, farther than this from the origin in a coordinate [m]."""
     there = np.isfinite(capture.positions[..., 0])
     far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())
     points = int(there.sum())

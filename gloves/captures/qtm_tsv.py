@@ -34,11 +34,7 @@ _UNIT: Final = "mm"  # the only one that QTM writes
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers in the bytes of a Qualisys TSV with 3D data; frames that are missing or too many are told.
-
-    Raises:
-        CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
-    """
+    """The markers in the bytes of a Qualisys TSV with 3D data; frames missing or too many are told."""
     lines, ended = split_lines(data)
     separator = separator_behind(_BEGINS, lines[0])
     if separator is None:

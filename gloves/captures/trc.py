@@ -48,10 +48,6 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 
     Cells are separated by tabs, or by commas or semicolons where the first line is. Missing frames are told,
     and a rate that only the column of times states.
-
-    Raises:
-        CaptureError: Not a TRC, header or last row cut, unknown units, a cell that is not a number, or rate,
-            times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
     if not lines[0].lstrip(b' \t"').startswith(_BEGIN):

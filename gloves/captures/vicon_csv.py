@@ -49,9 +49,6 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The trajectories in the bytes of a Vicon CSV, labeled or not.
 
     Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
-
-    Raises:
-        CaptureError: Not such an export, without trajectories, cut, or with a cell that is not a number.
     """
     lines, ended = split_lines(data)
     sections = vicon_sections(lines)

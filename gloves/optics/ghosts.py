@@ -110,5 +110,4 @@ def keep_some(
     """At most `MAX_GHOSTS` of each frame's candidates [m], chosen at random; NaN candidates come last."""
     order = rng.random(candidates.shape[:2]) + np.isnan(candidates[..., 0])
     chosen = order.argsort(axis=1)[:, :MAX_GHOSTS]
-    kept: NDArray[np.float64] = np.take_along_axis(candidates, chosen[..., None], axis=1)
-    return kept
+    return np.take_along_axis(candidates, chosen[..., None], axis=1)

@@ -14,8 +14,7 @@ def number_runs(present: Bool[np.ndarray, "T S"]) -> Int[np.ndarray, "T S"]:
     begins[1:] &= ~present[:-1]
     numbers = np.cumsum(begins.ravel()).reshape(begins.shape) - 1
     running = np.maximum.accumulate(np.where(begins, numbers, -1), axis=0)
-    ids: np.ndarray = np.where(present, running, -1)
-    return ids
+    return np.where(present, running, -1)
 
 
 def pack_columns(

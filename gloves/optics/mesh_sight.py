@@ -23,9 +23,6 @@ def clear_of_mesh(
 
     A line that starts inside a closed mesh is not clear. NaN points are never clear. Points [m] are one for
     all cameras, or one for each. Lines that are not needed cost nothing and count as not clear.
-
-    Raises:
-        ArgumentError: Shapes do not fit together, or the vertices or cameras are not finite.
     """
     vertices = np.ascontiguousarray(vertices, dtype=np.float64)
     starts, ends = _check_lines(points, cameras, needed)
@@ -47,11 +44,7 @@ def clear_of_body(
     cameras: Float[np.ndarray, "C 3"],
     needed: Bool[np.ndarray, "T P C"],
 ) -> Bool[np.ndarray, "T P C"]:
-    """`clear_of_mesh` for a rigid body: lines are transformed into its frame, the tree is used as built.
-
-    Raises:
-        ArgumentError: Shapes do not fit together, a pose is not rigid, or poses or cameras are not finite.
-    """
+    """`clear_of_mesh` for a rigid body: lines are transformed into its frame, the tree is used as built."""
     poses = check_array("T_world_body", T_world_body, (len(needed), 4, 4))
     starts, ends = _check_lines(points, cameras, needed)
     rotations, positions = poses[:, :3, :3], poses[:, None, :3, 3]

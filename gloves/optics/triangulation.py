@@ -8,6 +8,7 @@ import numpy as np
 
 from gloves.optics.blobs import cast_rays, draw_blobs
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import squared_distance
 
 _FALSE_REACH = 0.25  # [m] farther than this from every source is outside the capture volume
 _FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same
@@ -129,10 +130,7 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
     for s in range(len(rays)):
         for o in range(s):
             if rays[s] > 0 and rays[o] > 0:
-                squared = 0.0
-                for i in range(3):
-                    squared += (positions[s, i] - positions[o, i]) ** 2
-                if squared < min_distance * min_distance:
+                if squared_distance(positions[s], positions[o]) < min_distance * min_distance:
                     gone = o if rays[o] < rays[s] else s
                     rays[gone] = 0
                     positions[gone] = np.nan
@@ -207,13 +205,10 @@ def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float)
     """Whether a false point lies in the capture volume and away from all other points."""
     near = False
     for s in range(len(sources)):
-        there, true = 0.0, 0.0
-        for i in range(3):
-            there += (positions[s, i] - point[i]) ** 2
-            true += (sources[s, i] - point[i]) ** 2
-        if there < min_distance * min_distance:  # False where there is none: NaN
+        # False where there is none: NaN
+        if squared_distance(positions[s], point) < min_distance * min_distance:
             return False
-        near |= true < _FALSE_REACH * _FALSE_REACH
+        near |= squared_distance(sources[s], point) < _FALSE_REACH * _FALSE_REACH
     return near
 
 

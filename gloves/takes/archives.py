@@ -52,9 +52,6 @@ def read_archive(
     """Read what `write_archive` wrote, or what has been recorded of it until now.
 
     `unpack` makes the content from header and arrays; an exception means that they are damaged.
-
-    Raises:
-        CaptureError: No such file, not a take, of another schema, or damaged.
     """
     path = Path(path)
     header, arrays = _read(path)
@@ -86,7 +83,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         )
     try:
         arrays = read_npz(path)
-        header = json.loads(_text(arrays["header"]))
+        array = arrays["header"]
+        if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
+            raise ValueError("not a text")
+        header = json.loads(str(array))
         if not isinstance(header, dict):
             raise ValueError("the header is not a table")
     except CaptureError:
@@ -120,13 +120,6 @@ def _damaged(path: Path) -> str:
     if path.suffix.lower() != ".npz":
         return f"{path}: not a take (.npz); handsim track makes one of a capture"
     return f"{path}: not a take, or a damaged one"
-
-
-def _text(array: np.ndarray) -> str:
-    """The text in an array; raises a `ValueError` if it is not one."""
-    if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
-        raise ValueError("not a text")
-    return str(array)
 
 
 def names_of(stored: object) -> tuple[str, ...]:

@@ -70,11 +70,7 @@ def corrections_path(take: Path) -> Path:
 
 
 def load_corrections(path: Path) -> tuple[Correction, ...]:
-    """Read a file of corrections.
-
-    Raises:
-        CaptureError: It cannot be read, or holds something else; the sentence names the file.
-    """
+    """Read a file of corrections."""
     table = read_toml(path, error=CaptureError)
     try:
         check_keys(table, "the file", ("correction",), optional=("correction",))
@@ -97,11 +93,7 @@ def corrections_of(take: Path) -> tuple[Correction, ...]:
 
 
 def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
-    """Write corrections; `load_corrections` gives the same again.
-
-    Raises:
-        CaptureError: The file cannot be written.
-    """
+    """Write corrections; `load_corrections` gives the same again."""
     lines = [_COMMENT]
     for correction in corrections:
         record = correction.record()
@@ -121,12 +113,7 @@ def find_pins(
     ids: Int[np.ndarray, "T N"],
     label_names: Sequence[str],
 ) -> Pins:
-    """The points that corrections are about; of two about one point, the later counts.
-
-    Raises:
-        CaptureError: A span is not within the frames, a label is unknown, or two points of a frame have one
-            label.
-    """
+    """The points that corrections are about; of two about one point, the later counts."""
     pinned = np.full(points.shape[:2], FREE, dtype=np.int64)
     unfitting = []
     for number, correction in enumerate(corrections, start=1):
@@ -135,7 +122,11 @@ def find_pins(
         if not len(frames):
             unfitting.append(correction)
         pinned[frames, columns] = label
-    _check_single(pinned, label_names)
+    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
+        given = np.bincount(pinned[frame, pinned[frame] >= 0])
+        if given.max() > 1:
+            name = label_names[int(given.argmax())]
+            raise CaptureError(f"two points of frame {frame} are corrected to {name}, expected one point")
     return Pins(pinned, tuple(unfitting))
 
 
@@ -213,14 +204,6 @@ def _label_of(correction: Correction, number: int, frames: int, names: Sequence[
         unknown = choices(correction.label, (*names, NO_MARKER), noun="label")
         raise CaptureError(f"correction {number}: {unknown}")
     return list(names).index(correction.label)
-
-
-def _check_single(pinned: NDArray[np.int64], names: Sequence[str]) -> None:
-    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
-        given = np.bincount(pinned[frame, pinned[frame] >= 0])
-        if given.max() > 1:
-            name = names[int(given.argmax())]
-            raise CaptureError(f"two points of frame {frame} are corrected to {name}, expected one point")
 
 
 def _parse(table: Mapping[str, object], owner: str) -> Correction:

@@ -32,11 +32,7 @@ class MotionFormat(NamedTuple):
 
 
 def motion_format(path: Path) -> MotionFormat:
-    """The format that the end of a name says.
-
-    Raises:
-        ArgumentError: There is no such format.
-    """
+    """The format that the end of a name says."""
     for ending, form in MOTION_FORMATS.items():
         if path.name.lower().endswith(ending):
             return form

@@ -321,8 +321,7 @@ def _unpack_array(content: bytes) -> NDArray[Any]:
     buffer = io.BytesIO(content)
     check_npy_header(buffer, len(content))
     buffer.seek(0)
-    array: NDArray[Any] = np.lib.format.read_array(buffer, allow_pickle=False)
-    return array
+    return np.lib.format.read_array(buffer, allow_pickle=False)
 
 
 def _column(stored: Mapping[str, Any]) -> Column:

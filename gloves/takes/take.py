@@ -37,8 +37,9 @@ from gloves.takes.columns import (
     stacked_frames,
 )
 from gloves.takes.formats import motion_format
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError
+from handsim.files.outputs import check_ending
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
@@ -150,9 +151,12 @@ class Take:
         object.__setattr__(self, "bodies", tuple(self.bodies))
         try:
             points = np.asarray(self.points)
-            sizes = _sizes(
-                len(self.times), points.shape[1] if points.ndim == 3 else 0, self.hands, self.bodies
-            )
+            sizes = {
+                "T": len(self.times),
+                "N": points.shape[1] if points.ndim == 3 else 0,
+                "H": len(self.hands),
+                "B": len(self.bodies),
+            }
             for column in FRAMES:
                 object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
             for column in self._known():
@@ -319,8 +323,7 @@ class Take:
         Raises:
             ArgumentError: It is not in the take.
         """
-        if side not in self.sides:
-            raise ArgumentError(choices(side, self.sides, noun="hand"))
+        check_choice(side, self.sides, noun="hand")
         return self.sides.index(side)
 
     def moving_hands(self) -> tuple[GlovedHand, ...]:
@@ -557,8 +560,7 @@ class Take:
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
-        if Path(path).suffix.lower() != ".npz":
-            raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
+        check_ending(Path(path), ".npz", option="path")
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
@@ -571,8 +573,7 @@ class Take:
     def _labels_of(self, name: str) -> range:
         """The labels of a hand's markers, or of a body's."""
         names = [*self.sides, *(body.name for body in self.bodies)]
-        if name not in names:
-            raise ArgumentError(choices(name, names, noun="hand or body"))
+        check_choice(name, names, noun="hand or body")
         counts = [hand.layout.num_markers for hand in self.hands]
         return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
 
@@ -685,13 +686,6 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         **{column.name: arrays[column.name] for column in FRAMES},
         **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
-
-
-def _sizes(
-    frames: int, columns: int, hands: Sequence[GloveFit], bodies: Sequence[RigidBody]
-) -> dict[str, int]:
-    """What the letters of shapes stand for."""
-    return {"T": frames, "N": columns, "H": len(hands), "B": len(bodies)}
 
 
 def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:

@@ -35,10 +35,6 @@ def chosen_workers(
             this machine when not given.
         workers: Processes of this machine, all cores when not given.
         tell: Takes a line for the user.
-
-    Raises:
-        ArgumentError: The options do not fit together, or Dask is not installed.
-        HandSimError: Nobody answers at the address, or a job ended its workers.
     """
     if cluster is None:
         yield check_workers(workers)
@@ -47,7 +43,10 @@ def chosen_workers(
         raise ArgumentError(f"--workers counts processes of this machine, but {cluster} has its own workers")
     distributed = import_extra("distributed", f"the cluster {cluster}", "cluster")
     with _client(distributed, cluster, check_workers(workers)) as client:
-        tell(_about(client, cluster))
+        count = len(client.nthreads())
+        there = f"{count} workers" if count else "no workers yet; waiting for the first"
+        link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
+        tell(f"{cluster}: {there}{link}")
         try:
             yield ClusterExecutor(client)
         except distributed.KilledWorker as error:
@@ -86,14 +85,6 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         ) from error
     with client:
         yield client
-
-
-def _about(client: Any, address: str) -> str:
-    """How many workers there are, and where to watch them."""
-    count = len(client.nthreads())
-    there = f"{count} workers" if count else "no workers yet; waiting for the first"
-    link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
-    return f"{address}: {there}{link}"
 
 
 class ClusterExecutor(Executor):
@@ -145,11 +136,7 @@ class _Task:
 
 
 def check_worker(worker: str, threads: int, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions.
-
-    Raises:
-        HandSimError: It has several threads, or another version.
-    """
+    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions."""
     if threads != 1:
         raise HandSimError(
             f"the worker {worker} has {threads} threads, expected 1; start workers with --nthreads 1, one "

@@ -8,9 +8,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Final, Self, TextIO
+from typing import Final, TextIO
 
+from handsim._closing import Closing
 from handsim.errors import HandSimWarning
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
@@ -50,7 +50,7 @@ def told_warnings(program: str) -> Iterator[None]:
         yield
 
 
-class LiveStatus:
+class LiveStatus(Closing):
     """Shows a line on standard error until the end of a `with` block.
 
     A terminal shows as much of it as fits into one of its lines. A terminal that is gone ends nothing.
@@ -79,18 +79,11 @@ class LiveStatus:
 
     def say(self, line: str) -> None:
         """Print a line that stays."""
-        self._clear()
+        self.close()
         self._write(line + "\n")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._clear()
-
-    def _clear(self) -> None:
+    def close(self) -> None:
+        """Clear the line that is shown."""
         if self._shown:
             self._write("\r\x1b[K")
             self._shown = False

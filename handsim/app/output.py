@@ -32,11 +32,7 @@ _AGAIN: Final = "what is there stays, and the same command goes on after it"
 
 
 def place_of(out: str | Place) -> Place:
-    """What a name stands for: a folder, or a folder of an object store, as s3://bucket/prefix.
-
-    Raises:
-        ArgumentError: It is neither.
-    """
+    """What a name stands for: a folder, or a folder of an object store, as s3://bucket/prefix."""
     if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):
         return Path(out)
     wrong = f"the address is '{shortened(str(out), 200)}', expected"

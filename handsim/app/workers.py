@@ -16,7 +16,8 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, Final
 
-from handsim.errors import ArgumentError, DatasetError, HandSimError
+from handsim._checks import check_count
+from handsim.errors import DatasetError, HandSimError
 
 Job = Callable[[int], int]
 """Takes a number, leaves files that depend on nothing else, and returns the number; it can be pickled."""
@@ -31,14 +32,11 @@ def usable_cores() -> int:
 
 
 def check_workers(workers: int | None) -> int:
-    """A number of processes: the given one, or one a core.
-
-    Raises:
-        ArgumentError: It is no number, or less than 1.
-    """
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise ArgumentError(f"workers is {workers!r}, expected at least 1")
-    return usable_cores() if workers is None else workers
+    """A number of processes: the given one, or one a core."""
+    if workers is None:
+        return usable_cores()
+    check_count("workers", workers, 1)
+    return workers
 
 
 def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:

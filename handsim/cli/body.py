@@ -10,7 +10,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_ending, check_outputs
 from handsim.space.objects import named_object
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     from track.bodies.body_file import save_body
     from track.calibration.body_learning import learn_body
 
-    if out.suffix.lower() != TOML:
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in {TOML}")
+    check_ending(out, TOML)
     check_outputs([source], [out])
     found = _take_body(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
     save_body(out, found)

@@ -10,8 +10,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.errors import ArgumentError
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_ending, check_outputs
 from handsim.hand.topology import Side
 from track.config import BOTH, Size
 
@@ -44,8 +43,7 @@ def calibrate(
     """
     from track import capture_calibration
 
-    if out.suffix.lower() != ".json":
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
+    check_ending(out, ".json")
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("") as (bar, task):
         user = capture_calibration.calibrate(

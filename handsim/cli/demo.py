@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.page import write_page
 from handsim.app.progress import named_steps
-from handsim.errors import ArgumentError
 
 
 def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:
@@ -24,10 +23,8 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
         seed: Of the generated frames and of everything drawn at random.
         num_frames: Frames to generate and label.
     """
-    if num_frames < 1:
-        raise ArgumentError(f"num_frames is {num_frames}, expected at least 1")
-    if seed < 0:
-        raise ArgumentError(f"seed is {seed}, expected 0 or more")
+    check_count("num_frames", num_frames, 1)
+    check_count("seed", seed, 0)
     out.mkdir(parents=True, exist_ok=True)
     console = Console()
     with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, named_steps("starting") as step:
@@ -35,7 +32,12 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
 
         sections = list(demo_sections(out, Path(work), seed=seed, num_frames=num_frames, report=step))
     figures = sections[-1]
-    _print_table(console, figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
+    printed = Table(title=f"{num_frames} generated frames, glove {GLOVE}")
+    for number, column in enumerate(figures.table[0]):
+        printed.add_column(Text(column), justify="right" if number else "left")
+    for row in figures.table[1:]:
+        printed.add_row(*row)
+    console.print(printed)
     page = out / "index.html"
     write_page(
         page,
@@ -46,12 +48,3 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
     )
     console.print(figures.notes[0])
     print_line(f"page: {page.resolve()}")
-
-
-def _print_table(console: Console, table: Sequence[Sequence[str]], *, title: str) -> None:
-    printed = Table(title=title)
-    for number, column in enumerate(table[0]):
-        printed.add_column(Text(column), justify="right" if number else "left")
-    for row in table[1:]:
-        printed.add_row(*row)
-    console.print(printed)

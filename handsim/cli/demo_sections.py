@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim import __version__
 from handsim.app.page import Section
+from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import load_rig
 from poses.shapes.library import gesture
@@ -266,7 +266,6 @@ def _figures_section(figures: DemoFigures, seed: int, num_frames: int) -> Sectio
         f"{package} {metadata.version(package)}"
         for package in ("mujoco", "numpy", "torch", "pyrender-maintained")
     )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Section(
         "Figures of this run",
         f"{num_frames} freshly generated frames (seed {seed}) of random people, none of whom is in the "
@@ -275,7 +274,7 @@ def _figures_section(figures: DemoFigures, seed: int, num_frames: int) -> Sectio
         table=_table(figures.columns),
         notes=[
             f"generated {figures.generated_per_second:,.0f} frames/s (start included), "
-            f"labeled {figures.labeled_per_second:,.0f} frames/s, on {cores} CPU cores",
+            f"labeled {figures.labeled_per_second:,.0f} frames/s, on {usable_cores()} CPU cores",
             f"handsim {__version__}, Python {platform.python_version()}, {versions}.",
         ],
     )

@@ -18,6 +18,7 @@ from typing import Final
 from handsim._extras import EGL_PACKAGES
 from handsim._kernel_cache import VARIABLE, kernel_cache
 from handsim._siblings import SIBLINGS, shadowed_siblings
+from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
 # These run in processes of their own: a broken driver ends its process, and torch and GL stay out of ours.
@@ -194,8 +195,7 @@ def check_learned_gloves() -> Finding:
 
 def check_room() -> Iterator[Finding]:
     """Cores for the workers and space on the disk of the current folder."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("CPU cores", str(cores))
+    yield Finding("CPU cores", str(usable_cores()))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     remedy = "" if free >= 1.0 else "free some space, or give --out on another disk"
     yield Finding("free disk here", f"{free:.1f} GB", "1 GB", remedy, needed=False)

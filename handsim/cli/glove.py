@@ -24,11 +24,11 @@ from gloves.layout import (
     shipped_layout,
     starter_layout,
 )
+from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError, LayoutError
-from handsim.files.atomic import atomic_write
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
@@ -105,12 +105,7 @@ def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         file: A new .toml file.
     """
-    if file.suffix.lower() != ".toml":
-        raise LayoutError(f"{file}: expected a file name that ends in .toml")
-    if file.exists():
-        raise LayoutError(f"{file} exists already and is left as it is; name a new file")
-    with atomic_write(file) as temporary:
-        temporary.write_text(starter_layout(), "utf-8")
+    write_starter(file, starter_layout(), error=LayoutError)
     print_line(f"{file}: edit it, then run `handsim glove check {file}`")
 
 
@@ -201,11 +196,9 @@ def score_glove(
 
     layout, cameras = load_layout(glove), load_rig(rig)
     page = Path(glove).with_suffix(".html") if out is None else out
-    if page.suffix.lower() != ".html":
-        raise ArgumentError(f"--out is {page}, expected a file name that ends in .html")
-    if frames < _FEWEST_FRAMES:
-        raise ArgumentError(f"--frames is {frames}, expected at least {_FEWEST_FRAMES}")
-    _check_captures(captures)
+    check_ending(page, ".html")
+    check_count("--frames", frames, _FEWEST_FRAMES)
+    check_count("--captures", captures, 0)
     check_outputs([glove, rig, motion], [page])
     from track.glove_advice.advice import advice
     from track.glove_advice.layout_score import score_layout
@@ -233,11 +226,6 @@ def score_glove(
 
 def _told_capture(step: Callable[[str], None], what: str, words: str) -> None:
     step(f"{what}: {words}")
-
-
-def _check_captures(captures: int) -> None:
-    if captures < 0:
-        raise ArgumentError(f"--captures is {captures}, expected 0 or more")
 
 
 def _hands(
@@ -327,13 +315,11 @@ def improve_glove(
 
     layout, cameras = load_layout(glove), load_rig(rig)
     count = layout.num_markers if markers is None else markers
-    if not FEWEST_MARKERS <= count <= MOST_MARKERS:
-        raise ArgumentError(f"--markers is {count}, expected {FEWEST_MARKERS} to {MOST_MARKERS}")
-    _check_captures(captures)
+    check_count("--markers", count, FEWEST_MARKERS, MOST_MARKERS)
+    check_count("--captures", captures, 0)
     if not 0.0 <= minutes < np.inf:
         raise ArgumentError(f"--minutes is {minutes:g}, expected 0 or more")
-    if out.suffix.lower() != ".toml":
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
+    check_ending(out, ".toml")
     check_outputs([glove, rig], [out])
     from track.glove_advice.improvement import Improvement
     from track.glove_advice.trials import try_layout, verdict

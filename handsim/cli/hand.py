@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_ending, check_outputs
 from handsim.hand.topology import NUM_JOINTS, Side
 
 if TYPE_CHECKING:
@@ -48,10 +48,9 @@ def hand(
     from gloves.hand_files import ENDINGS, MESH_ENDINGS, WITH_MARKERS, write_hand, write_skin
 
     suffix = out.suffix.lower()
-    if suffix not in ENDINGS:
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in {', '.join(ENDINGS)}")
-    if mesh is not None and mesh.suffix.lower() not in MESH_ENDINGS:
-        raise ArgumentError(f"--mesh is {mesh}, expected a file name that ends in {', '.join(MESH_ENDINGS)}")
+    check_ending(out, *ENDINGS)
+    if mesh is not None:
+        check_ending(mesh, *MESH_ENDINGS, option="--mesh")
     for option, given, endings in (
         ("--actuators", actuators, (".xml",)),
         ("--glove", glove is not None, WITH_MARKERS),

@@ -20,9 +20,6 @@ def check_take_file(out: Path, *, live: bool) -> None:
     Args:
         out: The option --out.
         live: Whether a stream is recorded; corrections would fit no other recording.
-
-    Raises:
-        ArgumentError: The name does not end as a take's, or somebody corrected the take there.
     """
     from gloves.takes.corrections import corrections_path
     from gloves.takes.take import SUFFIX

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 
+from handsim._checks import check_count
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
@@ -46,8 +47,7 @@ def replay(
 
     if rate is not None and not 0.0 < rate < np.inf:
         raise ArgumentError(f"--rate is {rate:g}, expected a positive number")
-    if not 0 <= port <= _MOST_PORT:
-        raise ArgumentError(f"--port is {port}, expected 0 to {_MOST_PORT}")
+    check_count("--port", port, 0, _MOST_PORT)
     with (
         interrupt_flag() as ended,
         ReplayServer(capture, rate=rate, host=host, port=port, loop=loop) as server,

@@ -14,12 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from gloves.layout import load_layout
+from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError, RigError
-from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
-from handsim.files.outputs import check_outputs
+from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.space.camera import Camera, focal_of_angle, pinhole
 from handsim.space.cameras import (
     FEWEST_CAMERAS,
@@ -88,12 +88,7 @@ def new_rig(file: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         file: A new .toml file.
     """
-    if file.suffix.lower() != ".toml":
-        raise RigError(f"{file}: expected a file name that ends in .toml")
-    if file.exists():
-        raise RigError(f"{file} exists already and is left as it is; name a new file")
-    with atomic_write(file) as temporary:
-        temporary.write_text(_STARTER, "utf-8")
+    write_starter(file, _STARTER, error=RigError)
     print_line(f"{file}: edit it, then run `handsim rig check {file}`")
 
 
@@ -145,8 +140,7 @@ def import_rig(
         up: The axis that points up in the calibration; y for Motive and z for the others when not given.
             The rig's is z.
     """
-    if out.suffix.lower() != ".toml":
-        raise RigError(f"--out is {out}, expected a file name that ends in .toml")
+    check_ending(out, ".toml")
     check_outputs([file], [out])
     name = "".join(one for one in file.stem if one.isprintable()) or "rig"
     try:
@@ -207,10 +201,8 @@ def score_rig_file(
     cameras = load_rig(rig)
     page = Path(f"{cameras.name}.html" if not rig.endswith(".toml") else Path(rig).with_suffix(".html"))
     page = page if out is None else out
-    if page.suffix.lower() != ".html":
-        raise ArgumentError(f"--out is {page}, expected a file name that ends in .html")
-    if frames < _FEWEST_FRAMES:
-        raise ArgumentError(f"--frames is {frames}, expected at least {_FEWEST_FRAMES}")
+    check_ending(page, ".html")
+    check_count("--frames", frames, _FEWEST_FRAMES)
     sides = _checked_sides("--volume", volume)
     check_outputs([rig, take, glove], [page, json])
     from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
@@ -264,12 +256,10 @@ def plan_rig(
         glove: Marker layout: a shipped name or the path of a .toml file.
         seed: Seed of people and motion.
     """
-    if out.suffix.lower() != ".toml":
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
+    check_ending(out, ".toml")
     hung = None if keep is None else load_rig(keep)
     fewest = FEWEST_CAMERAS if hung is None else len(hung.cameras) + 1
-    if not fewest <= cameras <= MAX_CAMERAS:
-        raise ArgumentError(f"--cameras is {cameras}, expected {fewest} to {MAX_CAMERAS}")
+    check_count("--cameras", cameras, fewest, MAX_CAMERAS)
     sides, middle = _checked_sides("--volume", volume), _checked_center(center)
     check_outputs([keep, glove], [out])
     from train.rig_advice.planning import plan

@@ -40,7 +40,11 @@ def simulate(
     truth = out.with_suffix(SUFFIX)
     check_suffix(out, WRITABLE)
     check_outputs((str(config.glove), str(config.rig)), (out, truth))
-    _check_space(out, config.num_frames or 0)
+    num_frames = config.num_frames or 0
+    what = f"{num_frames} frames"
+    remedy = "simulate shorter captures with different seeds"
+    check_memory(num_frames * _MEMORY, what, remedy)
+    check_free(out.parent, num_frames * _DISK, what, remedy, error=ArgumentError)
     if cluster is None:
         take = _simulate_into(out, config)
     else:
@@ -67,11 +71,3 @@ def _simulate_into(out: Path, config: TakeConfig) -> Take:
         write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)
         take.save(truth_file)
     return take
-
-
-def _check_space(out: Path, num_frames: int) -> None:
-    """Whether the machine can hold a capture and the disk can take it."""
-    what = f"{num_frames} frames"
-    remedy = "simulate shorter captures with different seeds"
-    check_memory(num_frames * _MEMORY, what, remedy)
-    check_free(out.parent, num_frames * _DISK, what, remedy, error=ArgumentError)

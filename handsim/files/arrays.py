@@ -56,11 +56,7 @@ def check_members(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array in an `.npy` of `size` bytes, whose header must state exactly these.
-
-    Raises:
-        ValueError: It does not, or the array holds Python objects.
-    """
+    """Shape and type of the array in an `.npy` of `size` bytes, whose header must state exactly these."""
     version = np.lib.format.read_magic(file)
     if version not in {(1, 0), (2, 0)}:
         raise ValueError(f"an array file of version {version}")

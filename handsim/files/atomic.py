@@ -121,10 +121,14 @@ def remove_leftovers(folder: Path) -> None:
     Only for a folder that one job owns: what another living process is writing there would be lost.
     """
     for leftover in folder.glob("**/.*.tmp-*"):
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
-            leftover.unlink(missing_ok=True)
+        _remove(leftover)
+
+
+def _remove(leftover: Path) -> None:
+    if leftover.is_dir() and not leftover.is_symlink():
+        shutil.rmtree(leftover, ignore_errors=True)
+    else:
+        leftover.unlink(missing_ok=True)
 
 
 def remove_abandoned(final: Path) -> None:
@@ -132,12 +136,8 @@ def remove_abandoned(final: Path) -> None:
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix)
-        if not number.isdecimal() or _is_running(int(number)):
-            continue
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
-            leftover.unlink(missing_ok=True)
+        if number.isdecimal() and not _is_running(int(number)):
+            _remove(leftover)
 
 
 def _is_running(process: int) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Collection, Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,11 +35,7 @@ def _finite(value: Any) -> Any:
 
 
 def load_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        DatasetError: The file does not hold a JSON object.
-    """
+    """Read a JSON object."""
     try:
         content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
     except (ValueError, RecursionError) as error:
@@ -45,6 +43,14 @@ def load_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
     return content
+
+
+@functools.cache
+def package_data(package: str, name: str) -> dict[str, Any]:
+    """A JSON file of a package's own data."""
+    text = resources.files(package).joinpath(f"data/{name}.json").read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
 
 
 def claim(

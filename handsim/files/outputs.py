@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from handsim.errors import ArgumentError, HandSimError
+from handsim.files.atomic import atomic_write
 
 _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
@@ -19,25 +20,35 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
     Args:
         inputs: Files and folders that a command reads, and names that may be none; objects are no files.
         outputs: What it writes; None where not given.
-
-    Raises:
-        ArgumentError: An output is one of the inputs, or what should be its folder is a file or is closed.
     """
     read = [Path(name) for name in inputs if isinstance(name, str | Path)]
     for output in (path for path in outputs if path is not None):
-        _check_place(output)
+        there = next((path for path in output.absolute().parents if path.exists()), None)
+        if there is not None and not there.is_dir():
+            raise ArgumentError(
+                f"the output {output} lies in {there.name}, which is a file, expected a folder"
+            )
+        if there is not None and not os.access(there, os.W_OK | os.X_OK):
+            raise ArgumentError(f"the output {output} cannot be written: {there} is closed to this user")
         for source in read:
             if _same(source, output):
                 raise ArgumentError(f"the output {output} is the input {source}, expected another file")
 
 
-def _check_place(output: Path) -> None:
-    """Refuse an output below a file, or in a folder in which this user may not write."""
-    there = next((path for path in output.absolute().parents if path.exists()), None)
-    if there is not None and not there.is_dir():
-        raise ArgumentError(f"the output {output} lies in {there.name}, which is a file, expected a folder")
-    if there is not None and not os.access(there, os.W_OK | os.X_OK):
-        raise ArgumentError(f"the output {output} cannot be written: {there} is closed to this user")
+def check_ending(path: Path, *endings: str, option: str = "--out") -> None:
+    """Refuse an option's file whose name ends otherwise."""
+    if path.suffix.lower() not in endings:
+        raise ArgumentError(f"{option} is {path}, expected a file name that ends in {', '.join(endings)}")
+
+
+def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
+    """Write the text that a file of one's own begins with, under a new name in .toml."""
+    if file.suffix.lower() != ".toml":
+        raise error(f"{file}: expected a file name that ends in .toml")
+    if file.exists():
+        raise error(f"{file} exists already and is left as it is; name a new file")
+    with atomic_write(file) as temporary:
+        temporary.write_text(text, "utf-8")
 
 
 def _same(source: Path, output: Path) -> bool:

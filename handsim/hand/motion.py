@@ -48,8 +48,7 @@ class HandMotion:
 
     def speeds(self) -> Float[np.ndarray, "S 20"]:
         """Joint speeds between frames [rad/s]."""
-        speeds: np.ndarray = np.diff(self.qpos[:, 7:], axis=0) * self.rate
-        return speeds
+        return np.diff(self.qpos[:, 7:], axis=0) * self.rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,9 +116,6 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 
     Args:
         times: Time of each frame [s], increasing.
-
-    Raises:
-        ArgumentError: The rate is not positive, or there would be too many frames.
     """
     if not 0.0 < rate < np.inf:
         raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")

@@ -57,7 +57,10 @@ def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
     )
     for bone in range(len(BONES)):
         _add_body(bodies, model, bone)
-    _add_wrist(joints, side)
+    # The palm turns about its own axes and moves along those of the ground, in which it is free.
+    names = coordinate_names(side)[:6]
+    joint = _add_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
+    _add_motion(joint, [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)])
     for bone in range(1, len(BONES)):
         _add_knuckle(joints, model, bone)
     for site in markers:
@@ -119,13 +122,6 @@ def _add_capsule(
         _add(frame, "socket_parent", "..")
         _add(frame, "translation", vector_text(center))
         _add(frame, "orientation", vector_text(body_fixed_angles(turn.as_matrix()[None])[0]))
-
-
-def _add_wrist(joints: ET.Element, side: Side) -> None:
-    """The palm is free in the ground: it turns about its own axes and moves along those of the ground."""
-    names = coordinate_names(side)[:6]
-    joint = _add_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
-    _add_motion(joint, [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)])
 
 
 def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim._checks import check_array, check_number, check_rng, check_type
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
+from handsim.errors import ArgumentError
 from handsim.hand.topology import DIGITS, SIDES, Side
 
 # A man of hand length 193.9 mm (Buryanov's middle ray on a 37 mm carpus) and breadth 88.3 mm (ANSUR II mean).
@@ -109,8 +109,7 @@ class HandShape:
 
     def __post_init__(self) -> None:
         check_type("side", self.side, str, "the name of one", SIDES)
-        if self.side not in SIDES:
-            raise ArgumentError(choices(self.side, SIDES, noun="side"))
+        check_choice(self.side, SIDES, noun="side")
         for name, shape in (
             ("bone_lengths", (5, 3)),
             ("knuckles", (5, 3)),
@@ -149,14 +148,9 @@ def shape_from_measures(length: float, breadth: float, *, side: Side = "right") 
 
 
 def named_shape(size: str, *, side: Side = "right") -> HandShape:
-    """One of the five sizes XS, S, M, L, XL.
-
-    Raises:
-        ArgumentError: There is no such size or side.
-    """
+    """One of the five sizes XS, S, M, L, XL."""
     check_type("size", size, str, "the name of one", SIZES)
-    if size not in SIZES:
-        raise ArgumentError(choices(size, SIZES, noun="size"))
+    check_choice(size, SIZES, noun="size")
     length, breadth = SIZES[size]
     return shape_from_measures(length * 1e-3, breadth * 1e-3, side=side)
 
@@ -207,8 +201,7 @@ def sample_shape(
     """
     check_type("population", population, Population, "a Population")
     check_type("side", side, str, "the name of one", SIDES)
-    if side not in SIDES:
-        raise ArgumentError(choices(side, SIDES, noun="side"))
+    check_choice(side, SIDES, noun="side")
     check_rng(rng)
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
 
@@ -117,6 +118,20 @@ def rotate_quaternion(
 
 
 @kernel
+def horn_matrix(products: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """Horn's matrix (4, 4) of a sum of outer products: its last eigenvector is the best rotation."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = products
+    return np.array(
+        [
+            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        ]
+    )
+
+
+@kernel
 def align_rigid(
     source: Float[np.ndarray, "N 3"],
     target: Float[np.ndarray, "N 3"],
@@ -153,16 +168,7 @@ def align_rigid(
             size += weights[point] * (a * a + (target[point, i] - centers[1, i]) ** 2)
             for j in range(3):
                 products[i, j] += weights[point] * a * (target[point, j] - centers[1, j])
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = products
-    form = np.array(
-        [
-            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
-            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
-            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
-            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
-        ]
-    )
-    values, vectors = np.linalg.eigh(form)
+    values, vectors = np.linalg.eigh(horn_matrix(products))
     rotation = np.empty((3, 3))
     pose[3:7] = vectors[:, 3]
     write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])

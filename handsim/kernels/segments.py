@@ -9,9 +9,15 @@ from handsim.kernels.kernel import kernel
 
 
 @kernel(inline=True)
+def squared_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Squared distance of two points [m^2]."""
+    return (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2  # type: ignore[no-any-return]
+
+
+@kernel(inline=True)
 def point_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
     """Distance of two points [m]."""
-    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]
+    return np.sqrt(squared_distance(one, other))  # type: ignore[no-any-return]
 
 
 @kernel(inline=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -52,12 +52,9 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.write("HIERARCHY\n" + "\n".join([*lines, "}"]) + "\n")
-        _write_motion(file, np.concatenate(columns, axis=1), motion.rate)
-
-
-def _write_motion(file: TextIO, table: Float[np.ndarray, "T K"], rate: float) -> None:
-    file.write(f"MOTION\nFrames: {len(table)}\nFrame Time: {1.0 / rate:.9f}\n")
-    np.savetxt(file, table, fmt="%.6f")
+        table = np.concatenate(columns, axis=1)
+        file.write(f"MOTION\nFrames: {len(table)}\nFrame Time: {1.0 / motion.rate:.9f}\n")
+        np.savetxt(file, table, fmt="%.6f")
 
 
 def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "T 51"]:
@@ -73,8 +70,7 @@ def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.n
 
 def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Angles (T, 3) about z, y and x [deg], without jumps from frame to frame."""
-    degrees: NDArray[np.float64] = np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
-    return degrees
+    return np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
 
 
 def _order(bone: int) -> Iterator[int]:

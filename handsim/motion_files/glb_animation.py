@@ -264,9 +264,6 @@ class GlbBuffer:
 
         Args:
             document: The JSON without buffers, views and accessors.
-
-        Raises:
-            ArgumentError: It would be larger than a .glb can be.
         """
         arrays = {"buffers": [{"byteLength": self._size}], "bufferViews": self._views}
         text = json.dumps(

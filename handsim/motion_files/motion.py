@@ -148,15 +148,13 @@ def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
     """The first frame, and every frame from which on something appears or disappears."""
-    indices: NDArray[np.intp] = np.flatnonzero(np.diff(present, prepend=not present[0]))
-    return indices
+    return np.flatnonzero(np.diff(present, prepend=not present[0]))
 
 
 def _held(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Rows, with the last row that is present in the place of each that is not."""
     last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
-    held: NDArray[np.float64] = values[np.where(last < 0, np.argmax(present), last)]
-    return held
+    return values[np.where(last < 0, np.argmax(present), last)]
 
 
 def local_rotations(rotations: Float[np.ndarray, "T L 3 3"]) -> Float[np.ndarray, "T L 3 3"]:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_array, check_choice
+from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from handsim.space.lens import PINHOLE, Lens, distort_ray
 
@@ -109,8 +109,7 @@ class Camera:
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
         """Whether world points [m] are in front of the camera and, through its lens, inside its picture."""
-        seen: NDArray[np.bool_] = points_in_view(camera_arrays((self,)), points)[..., 0]
-        return seen
+        return points_in_view(camera_arrays((self,)), points)[..., 0]
 
     def rays(self) -> Float[np.ndarray, "H W 3"]:
         """Unit directions in the camera's axes through the centers of all pixels."""
@@ -142,6 +141,11 @@ def _checked_size(name: str, size: object) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """K of focal lengths and a principal point [px]."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def pinhole(
     name: str, size: tuple[int, int], focal: float, center: tuple[float, float] | None = None
 ) -> Camera:
@@ -152,7 +156,7 @@ def pinhole(
         center: Principal point [px]; the picture's center when not given.
     """
     x, y = (size[0] / 2, size[1] / 2) if center is None else center
-    return Camera(name, size, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]))
+    return Camera(name, size, camera_matrix(focal, focal, x, y))
 
 
 def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
@@ -261,7 +265,7 @@ def _presets() -> dict[str, Camera]:
         "headset_fisheye": Camera(
             "headset_fisheye",
             (640, 480),
-            np.array([[240.0, 0.0, 320.0], [0.0, 240.0, 240.0], [0.0, 0.0, 1.0]]),
+            camera_matrix(240.0, 240.0, 320.0, 240.0),
             lens=Lens("fisheye", (0.02, -0.006, 0.0, 0.0)),
         ),
     }
@@ -277,6 +281,5 @@ def preset(name: str) -> Camera:
         ArgumentError: There is no camera of that name.
     """
     cameras = _presets()
-    if name not in cameras:
-        raise ArgumentError(choices(name, cameras, noun="camera"))
+    check_choice(name, cameras, noun="camera")
     return cameras[name]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_type
+from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
@@ -199,8 +199,7 @@ def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[s
 
 
 def _shipped(name: str) -> Path:
-    if name not in list_rigs():
-        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
+    check_choice(name, list_rigs(), noun="camera rig")
     return _SHIPPED / f"{name}.toml"
 
 
@@ -215,11 +214,7 @@ def _read(path: Path) -> CameraRig:
 def check_outside(
     rig: CameraRig, points: Float[np.ndarray, "*batch 3"], *, clearance: float = 0.05, what: str = "hand"
 ) -> None:
-    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages).
-
-    Raises:
-        ArgumentError: A camera is nearer than `clearance` [m] to one of the points in any frame.
-    """
+    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages)."""
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     flat = flat[~np.isnan(flat).any(axis=1)]
     for number, position in enumerate(rig.positions, 1):

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
@@ -44,8 +45,7 @@ class Lens:
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in _COEFFICIENTS:
-            raise ArgumentError(choices(self.kind, _COEFFICIENTS, noun="lens"))
+        check_choice(self.kind, _COEFFICIENTS, noun="lens")
         expected = _COEFFICIENTS[self.kind]
         if len(self.coefficients) != expected or not np.isfinite(self.coefficients).all():
             raise ArgumentError(

@@ -5,10 +5,7 @@ Five objects come with handsim, in `data/objects.json`; any closed mesh can be l
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, ObjectError, choices, shortened
+from handsim._checks import check_array, check_choice
+from handsim.errors import ArgumentError, ObjectError, shortened
 from handsim.files.inputs import check_regular
+from handsim.files.json_files import package_data
 from handsim.space import solids as object_solids
 from handsim.space.solids import Part
 
@@ -84,14 +82,9 @@ def object_names() -> tuple[str, ...]:
 
 
 def named_object(name: str) -> RigidObject:
-    """One of the objects that come with handsim.
-
-    Raises:
-        ArgumentError: No object has this name.
-    """
+    """One of the objects that come with handsim."""
     library = _library()
-    if name not in library:
-        raise ArgumentError(choices(name, library, noun="object"))
+    check_choice(name, library, noun="object")
     return _build(name, library[name])
 
 
@@ -170,10 +163,8 @@ def _close(mesh: Any, path: Path) -> Part:
     return hull
 
 
-@cache
 def _library() -> dict[str, Any]:
-    text = resources.files("handsim").joinpath("data/objects.json").read_text(encoding="utf-8")
-    library: dict[str, Any] = json.loads(text)["objects"]
+    library: dict[str, Any] = package_data("handsim", "objects")["objects"]
     return library
 
 

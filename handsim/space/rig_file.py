@@ -25,7 +25,7 @@ from handsim.files.toml_values import (
     tables_of,
     text_of,
 )
-from handsim.space.camera import Camera, focal_of_angle, look_at
+from handsim.space.camera import Camera, camera_matrix, focal_of_angle, look_at
 from handsim.space.lens import Lens, LensKind
 
 _SIZES: Final = ("size", "resolution")
@@ -53,11 +53,7 @@ class RigFile(NamedTuple):
 
 
 def read_rig_file(path: Path) -> RigFile:
-    """Read a file of cameras.
-
-    Raises:
-        RigError: It cannot be read, is damaged, or a key is missing, unknown or of another type.
-    """
+    """Read a file of cameras."""
     table = read_toml(path, error=RigError)
     try:
         return _parse(table, path.stem)
@@ -66,12 +62,7 @@ def read_rig_file(path: Path) -> RigFile:
 
 
 def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """The cameras of a file, after a check of their number, their names and their distances.
-
-    Raises:
-        RigError: There are none or too many, a name cannot be part of a file's name or comes twice, or a
-            camera stands beyond 50 m: millimeters taken for meters.
-    """
+    """The cameras of a file, after a check of their number, their names and their distances."""
     if not 1 <= len(cameras) <= _MOST:
         raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MOST}")
     check_names(str(path), cameras)
@@ -100,11 +91,7 @@ def check_names(owner: str, cameras: Sequence[Camera]) -> None:
 
 
 def check_near(owner: str, camera: Camera) -> None:
-    """Refuse a camera beyond 50 m.
-
-    Raises:
-        RigError: It stands there.
-    """
+    """Refuse a camera beyond 50 m."""
     distance = float(np.linalg.norm(camera.T_world_camera[:3, 3]))
     if distance > _FARTHEST:
         raise RigError(
@@ -196,12 +183,10 @@ def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDAr
         if "center" in given:
             raise RigError(f"{owner} has K and center, expected one of them")
         return numbers(f"{prefix}K", given["K"], (3, 3), "three rows of three numbers")
-    if key == "focal" and isinstance(given["focal"], list):
-        focal = numbers(f"{prefix}focal", given["focal"], (2,), "one or two focal lengths in pixels")
-    elif key == "focal":
-        focal = np.full(
-            2, numbers(f"{prefix}focal", given["focal"], (), "one or two focal lengths in pixels")
-        )
+    if key == "focal":
+        shape = (2,) if isinstance(given["focal"], list) else ()
+        focal = numbers(f"{prefix}focal", given["focal"], shape, "one or two focal lengths in pixels")
+        focal = np.broadcast_to(focal, 2)
     else:
         degrees = number_of(given, key, prefix)
         if not 1.0 <= degrees <= _WIDEST:
@@ -211,7 +196,7 @@ def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDAr
     expected = "the principal point [cx, cy] in pixels"
     middle = [size[0] / 2, size[1] / 2]
     center = numbers(f"{prefix}center", given.get("center", middle), (2,), expected)
-    return np.array([[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]])
+    return camera_matrix(*focal, *center)
 
 
 def _lens(given: Mapping[str, Any], owner: str) -> Lens:

@@ -37,8 +37,7 @@ Solid = tuple[list[Part], Any]
 
 def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
     """Parts and mesh of one entry of `data/objects.json` (millimeters and degrees there, meters here)."""
-    solid: Solid = _SOLIDS[kind](np.asarray(numbers, dtype=np.float64))
-    return solid
+    return _SOLIDS[kind](np.asarray(numbers, dtype=np.float64))
 
 
 def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:

@@ -35,8 +35,7 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    matrix: NDArray[np.float64] = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    return matrix
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
@@ -74,10 +73,7 @@ def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
     """Rotations Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
     yaw, pitch, roll = np.moveaxis(np.asarray(angles), -1, 0)
     x, y, z = np.eye(3)
-    matrix: NDArray[np.float64] = (
-        axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
-    )
-    return matrix
+    return axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
 
 
 def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
@@ -91,8 +87,7 @@ def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     yaw = np.where(locked, 0.0, np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
     free, fixed = rotations[:, 2, 1:], np.stack([-rotations[:, 1, 2], rotations[:, 1, 1]], axis=1)
     sine, cosine = np.where(locked[:, None], fixed, free).T
-    angles: NDArray[np.float64] = np.stack([yaw, pitch, np.arctan2(sine, cosine)], axis=1)
-    return angles
+    return np.stack([yaw, pitch, np.arctan2(sine, cosine)], axis=1)
 
 
 def body_fixed_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,7 +11,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
+from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, bones_of
 from handsim.space.transforms import MIRROR, euler_matrix
@@ -29,15 +28,7 @@ _SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
 _WANDER: Final = 0.4  # noise from beat to beat, as a share of the noise that a whole interaction keeps
 
 
-@cache
-def library() -> dict[str, Any]:
-    """The data file."""
-    text = resources.files("poses").joinpath("data/interactions.json").read_text(encoding="utf-8")
-    data: dict[str, Any] = json.loads(text)
-    return data
-
-
-INTERACTIONS: Final[tuple[str, ...]] = tuple(library()["interactions"])
+INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
 """Names of all interactions."""
 
 
@@ -100,13 +91,12 @@ def check_names(names: tuple[str, ...]) -> None:
     if not names:
         raise ArgumentError(f"no interactions were named; valid names: {', '.join(INTERACTIONS)}")
     for name in names:
-        if name not in INTERACTIONS:
-            raise ArgumentError(choices(name, INTERACTIONS, noun="interaction"))
+        check_choice(name, INTERACTIONS, noun="interaction")
 
 
 def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
     """One of the variants of an interaction, chosen at random."""
-    variants = library()["interactions"][name]
+    variants = package_data("poses", "interactions")["interactions"][name]
     variant: dict[str, Any] = variants[rng.integers(len(variants))]
     return variant
 
@@ -197,8 +187,7 @@ class _Noise:
         size = (self.count, len(scale))
         lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
         new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
-        noise: NDArray[np.float64] = scale * (common * lasting + wander * new)
-        return noise
+        return scale * (common * lasting + wander * new)
 
 
 def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -225,24 +214,21 @@ def _sketch_fingers(
 def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
     """The fingers of all sketches, one after another, none in another's way."""
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
-    lasting = _loosened(model, make_valid(model, np.clip(opened, LOW, HIGH)))
+    # Poses with deep contact come a little nearer to rest, because fingers need room.
+    angles = make_valid(model, np.clip(opened, LOW, HIGH))
+    hard = ~is_valid(model, angles, max_penetration=_SNUG)
+    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
+    lasting = angles
     wandering = np.clip(lasting + wander, LOW, HIGH)
     valid = is_valid(model, wandering, max_penetration=_SNUG)
     return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
-
-
-def _loosened(model: HandModel, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Valid poses, those with deep contact a little nearer to rest, because fingers need room."""
-    hard = ~is_valid(model, angles, max_penetration=_SNUG)
-    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
-    return angles
 
 
 def _angles(name: str) -> NDArray[np.float64]:
     """Joint angles [rad] of a gesture, or of a hand pose of this data file alone."""
     if name in gesture_names():
         return gesture(name)
-    return np.deg2rad(np.array(library()["hands"][name], dtype=np.float64).ravel())
+    return np.deg2rad(np.ravel(package_data("poses", "interactions")["hands"][name]))
 
 
 def _anchors(

@@ -57,11 +57,7 @@ def keep_apart(
     other_motion: HandMotion,
     direction: Float[np.ndarray, "T 3"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand.
-
-    Raises:
-        PoseError: Something touches even when drawn back, in these unit directions.
-    """
+    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand."""
     motion, body = held
     back = np.zeros(len(direction))
     for _ in range(_MOST_RETREATS):
@@ -93,5 +89,4 @@ def _rotated_to_the_arm(
     rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
     shift = np.eye(4)
     shift[:3, 3] = -tip
-    posed: np.ndarray = rotation @ shift
-    return posed
+    return rotation @ shift

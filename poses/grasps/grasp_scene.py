@@ -112,11 +112,7 @@ def object_penetration(
     qpos: Float[np.ndarray, "T 27"],
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
-    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch.
-
-    Raises:
-        ArgumentError: The arrays have different numbers of frames, or another shape.
-    """
+    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch."""
     qpos = check_array("qpos", qpos, (None, NUM_QPOS))
     poses = check_array("T_world_object", T_world_object, (None, 4, 4))
     if len(qpos) != len(poses):
@@ -138,8 +134,7 @@ def pose_to_qpos(poses: Float[np.ndarray, "*batch 4 4"]) -> NDArray[np.float64]:
     """Position and wxyz quaternion (..., 7) of rigid transforms."""
     flat = poses.reshape(-1, 4, 4)
     rows = np.concatenate([flat[:, :3, 3], rotation_quaternions(flat[:, :3, :3])], axis=1)
-    qpos: NDArray[np.float64] = rows.reshape(*poses.shape[:-2], 7)
-    return qpos
+    return rows.reshape(*poses.shape[:-2], 7)
 
 
 def qpos_to_pose(qpos: Float[np.ndarray, "7"]) -> NDArray[np.float64]:

@@ -93,7 +93,9 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
         return "the fingers penetrate each other"
     if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
         return "the fingers penetrate it"
-    contacts = _contacts(scene, angles, pose)
+    distances = scene.distances(scene.new_data(angles, pose))
+    names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
+    contacts = tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)
     why = why_not_held(style, set(contacts))
     if why:
         return why
@@ -156,9 +158,3 @@ def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64])
     rotation = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
     slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
     return bool(drift < _MOST_DRIFT and rotation < _MOST_ROTATION and slow and np.isfinite(data.qpos).all())
-
-
-def _contacts(scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[str, ...]:
-    distances = scene.distances(scene.new_data(angles, pose))
-    names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
-    return tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)

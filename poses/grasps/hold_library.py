@@ -5,10 +5,8 @@ Their joint angles are the mean hand's; retargeting brings another hand's finger
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from importlib import resources
+from functools import lru_cache
 from typing import Any, Final
 
 import mujoco
@@ -16,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.files.json_files import package_data
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import shape_from_measures
@@ -70,14 +69,9 @@ def hold_names(obj: RigidObject) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them.
-
-    Raises:
-        ArgumentError: The object has no hold of this name.
-    """
+    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them."""
     holds = _holds(obj)
-    if name not in holds:
-        raise ArgumentError(choices(name, holds, noun=f"hold of the {obj.name}"))
+    check_choice(name, holds, noun=f"hold of the {obj.name}")
     entry = holds[name]
     opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
     fitted = retarget_angles(model, np.stack([opened, _angles(opened, entry["closed"])]))
@@ -96,15 +90,8 @@ def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
     )
 
 
-@cache
-def _library() -> dict[str, Any]:
-    text = resources.files("poses").joinpath("data/holds.json").read_text(encoding="utf-8")
-    library: dict[str, Any] = json.loads(text)["objects"]
-    return library
-
-
 def _holds(obj: RigidObject) -> dict[str, Any]:
-    library = _library()
+    library = package_data("poses", "holds")["objects"]
     holds: dict[str, Any] = library.get(obj.name, library[_ANY])
     return holds
 
@@ -122,7 +109,7 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     model, obj, entry = scene.hand, scene.obj, style.entry
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
     placement, vary = entry["place"], entry["vary"]
-    frame = np.eye(4) if obj.name in _library() else _box_frame(obj)
+    frame = np.eye(4) if obj.name in package_data("poses", "holds")["objects"] else _box_frame(obj)
     point = 1e-3 * np.array(placement["point"], dtype=np.float64)
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]

@@ -91,11 +91,7 @@ class _Player:
     rng: np.random.Generator
 
     def next_part(self, last: Held, current: int) -> tuple[Held, int]:
-        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index.
-
-        Raises:
-            PoseError: No path was valid.
-        """
+        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index."""
         start = Held(last.angles[-1:], last.poses[-1:])
         if self.rng.random() < _SHIFTS:
             other = int(self.rng.integers(len(self.holds)))
@@ -152,5 +148,4 @@ def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator
         for frequency in rng.uniform(1.0, 3.5, size=2):
             loops[:, axis] += 0.5 * np.sin(2 * np.pi * (frequency * time + rng.random()))
     swell = 0.5 + 0.5 * np.sin(2 * np.pi * (rng.uniform(0.1, 0.3) * time + rng.random()))
-    scribble: NDArray[np.float64] = size * swell[:, None] ** 2 * loops
-    return scribble
+    return size * swell[:, None] ** 2 * loops

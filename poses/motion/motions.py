@@ -94,11 +94,7 @@ def motion_through(
 
 
 def count_frames(duration: float, config: MotionConfig) -> int:
-    """Frames of a motion of this duration [s], the first one included.
-
-    Raises:
-        ArgumentError: The duration is not positive, or less than half a step.
-    """
+    """Frames of a motion of this duration [s], the first one included."""
     steps = duration * config.rate
     if not np.isfinite(steps) or round(steps) < 1:
         raise ArgumentError(

@@ -72,8 +72,7 @@ class MotionConfig:
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
     """Share of the path after each of `frames` frames, the last one being 1."""
     time = np.arange(1, frames + 1) / frames
-    share: NDArray[np.float64] = time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
-    return share
+    return time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
 
 
 def straight_path(
@@ -98,11 +97,7 @@ def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generat
 def path_to_rest(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid.
-
-    Raises:
-        PoseError: No path was valid.
-    """
+    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid."""
     # Each round draws other durations, and so other frames: a path close to the limit may pass.
     for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-from functools import cache
-from importlib import resources
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError, choices
+from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import HandShape
@@ -29,10 +28,8 @@ FREE: Final = "free"
 _POSES_AT_ONCE: Final = 16
 
 
-@cache
 def _scripts() -> dict[str, dict[str, Any]]:
-    text = resources.files("poses").joinpath("data/scripts.json").read_text(encoding="utf-8")
-    scripts: dict[str, dict[str, Any]] = json.loads(text)["scripts"]
+    scripts: dict[str, dict[str, Any]] = package_data("poses", "scripts")["scripts"]
     return scripts
 
 
@@ -63,8 +60,7 @@ def scripted_motion(
         PoseError: This hand cannot do what the script asks for.
     """
     model = load_model(model)
-    if script not in _scripts():
-        raise ArgumentError(choices(script, _scripts(), noun="script"))
+    check_choice(script, _scripts(), noun="script")
     if script == FREE:
         return sample_motion(model, duration, config, rng=rng)
     entry = _scripts()[script]
@@ -86,10 +82,6 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     """The poses [rad] a script goes through, as this hand can strike them.
 
     Touches that this hand's thumb cannot reach and poses without a valid path to rest are left out.
-
-    Raises:
-        ArgumentError: There is no such script, or it has no poses of its own.
-        PoseError: This hand can strike fewer than two of them.
     """
     if script not in _scripts() or script == FREE:
         raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
@@ -111,8 +103,7 @@ def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
     for finger in fingers:
         with contextlib.suppress(PoseError):  # other fingers remain
             poses.append(touching_angles(model, finger))
-    touches: NDArray[np.float64] = np.array(poses).reshape(-1, NUM_JOINTS)
-    return touches
+    return np.array(poses).reshape(-1, NUM_JOINTS)
 
 
 def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
@@ -121,5 +112,4 @@ def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> 
         steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
     else:
         steps = rng.integers(1, count, size=_POSES_AT_ONCE)
-    indices: NDArray[np.int64] = (at + np.concatenate([[0], np.cumsum(steps)])) % count
-    return indices
+    return (at + np.concatenate([[0], np.cumsum(steps)])) % count

@@ -98,5 +98,4 @@ def _quaternions(
 
 
 def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    position: NDArray[np.float64] = ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)
-    return position
+    return ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)

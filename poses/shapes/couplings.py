@@ -28,8 +28,7 @@ _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
     """The same angles (T, 5, 4), one row per digit; a view, so writing to it writes to `angles`."""
-    view: np.ndarray = angles.reshape(*angles.shape[:-1], 5, 4)
-    return view
+    return angles.reshape(*angles.shape[:-1], 5, 4)
 
 
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:

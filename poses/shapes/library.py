@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
-from importlib import resources
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from handsim._checks import check_choice
 from handsim.errors import ArgumentError, choices
+from handsim.files.json_files import package_data
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
 """Names of all libraries; no two hold the same name."""
@@ -19,17 +19,10 @@ _SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, po
 
 
 @cache
-def _data(library: str) -> dict[str, Any]:
-    text = resources.files("poses").joinpath(f"data/{library}.json").read_text(encoding="utf-8")
-    data: dict[str, Any] = json.loads(text)
-    return data
-
-
-@cache
 def _library(library: str) -> dict[str, NDArray[np.float64]]:
-    if library not in LIBRARIES:
-        raise ArgumentError(choices(library, LIBRARIES, noun="library"))
-    shapes, data = _data("gestures"), _data(library)  # the shapes of single digits serve all libraries
+    check_choice(library, LIBRARIES, noun="library")
+    data = package_data("poses", library)
+    shapes = package_data("poses", "gestures")  # those of single digits serve all libraries
     gestures: dict[str, NDArray[np.float64]] = {}
     for name, entry in data["gestures"].items():
         fingers = np.array([_numbers(finger, shapes["fingers"]) for finger in entry["fingers"]])

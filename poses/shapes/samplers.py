@@ -84,15 +84,11 @@ def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]
     progress = rng.uniform(-0.1, 1.1, size=(count, 1)) + 0.12 * rng.standard_normal((count, 5))
     weight = np.repeat(np.clip(progress, 0.0, 1.0), 4, axis=1)
     angles: NDArray[np.float64] = (1.0 - weight) * first + weight * second
-    angles += _tremble(count, rng)
-    return angles
-
-
-def _tremble(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     noise = np.stack([_shared_normals(count, rng, digits=5) for _ in range(4)], axis=2) * _FLEXION_NOISE
     noise[..., 0] *= _ABDUCTION_NOISE / _FLEXION_NOISE
     flat: NDArray[np.float64] = noise.reshape(count, 20)
-    return flat
+    angles += flat
+    return angles
 
 
 def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:

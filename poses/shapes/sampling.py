@@ -114,13 +114,9 @@ def load_sampler(sampler: PoseSampler | str) -> PoseSampler:
 def checked_sampler(sampler: PoseSampler | str) -> PoseSampler:
     """As `load_sampler`, but not tried."""
     if not isinstance(sampler, str):
-        check_callable("sampler", sampler, _expected())
+        names = ", ".join(list_plugins(SAMPLERS))
+        check_callable("sampler", sampler, _EXPECTED + (f"; valid names: {names}" if names else ""))
     return functools.partial(_drawn, sampler)
-
-
-def _expected() -> str:
-    names = ", ".join(list_plugins(SAMPLERS))
-    return _EXPECTED + (f"; valid names: {names}" if names else "")
 
 
 def _drawn(

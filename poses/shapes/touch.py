@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, PoseError, choices
+from handsim._checks import check_array, check_choice
+from handsim.errors import PoseError
 from handsim.hand.capsules import Capsules
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import HandShape
@@ -70,8 +70,7 @@ def thumb_contact(
         ArgumentError: There is no such finger, or `angles` is not (T, 20).
     """
     model = load_model(model)
-    if finger not in FINGERS:
-        raise ArgumentError(choices(finger, FINGERS, noun="finger"))
+    check_choice(finger, FINGERS, noun="finger")
     return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
 
 
@@ -111,8 +110,7 @@ def touching_angles(
         PoseError: This hand's thumb was not brought to it.
     """
     model = load_model(model)
-    if finger not in FINGERS:
-        raise ArgumentError(choices(finger, FINGERS, noun="finger"))
+    check_choice(finger, FINGERS, noun="finger")
     if start is None:
         pinches = [gesture(f"{kind}_{finger}") for kind in ("pinch_pad", "pinch_tip")]
         starts = make_valid(model, np.stack(pinches))
@@ -219,8 +217,7 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     first = np.clip((uv * vw - vv * uw) / determinant, 0.0, 1.0)
     second = np.clip((uv * first + vw) / vv, 0.0, 1.0)
     first = np.clip((uv * second - uw) / uu, 0.0, 1.0)
-    nearest: NDArray[np.float64] = start + np.stack([first, second], axis=1)[..., None] * along
-    return nearest
+    return start + np.stack([first, second], axis=1)[..., None] * along
 
 
 @kernel

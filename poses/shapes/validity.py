@@ -48,11 +48,7 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 
 
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, its fingers fanned just as far as their girth needs.
-
-    Raises:
-        PoseError: The fingers overlap however far they are fanned.
-    """
+    """A valid relaxed pose of this hand, its fingers fanned just as far as their girth needs."""
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.takes.take import Take
-from handsim._checks import check_number
-from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
+from handsim._checks import check_choice, check_number
+from handsim.errors import ArgumentError, HandSimWarning, RigError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.cameras import load_rig
@@ -92,8 +92,7 @@ class ViewConfig:
             check_names("cameras", self.cameras)
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
-        if self.placement not in PLACEMENTS:
-            raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
+        check_choice(self.placement, PLACEMENTS, noun="placement")
         if self.placement != "rig" and self.rig != "six":
             raise ArgumentError(
                 f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"
@@ -454,9 +453,6 @@ def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> Non
     """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
 
     Cameras among them without a hand are told.
-
-    Raises:
-        RigError: No camera has a keypoint in its picture in any frame.
     """
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):

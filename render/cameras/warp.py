@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 
 Interpolation = Literal["nearest", "linear"]
@@ -169,9 +169,7 @@ def _faces(camera: Camera) -> tuple[_Face, ...]:
 def _faces_of_lens(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> tuple[_Face, ...]:
-    fx, fy, cx, cy = middle
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    rays = Camera("rays", size, K, lens=lens).rays()
+    rays = Camera("rays", size, camera_matrix(*middle), lens=lens).rays()
     known = np.isfinite(rays).all(axis=-1)
     rays = np.where(known[..., None], rays, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -43,12 +43,7 @@ def linear_light(picture: UInt8[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*
 
 
 def write_exr(path: str | Path, frame: RenderedFrame) -> None:
-    """Write all pictures of a frame and its camera.
-
-    Raises:
-        HandSimError: The name does not end in .exr, or there are no pictures.
-        OSError: The file cannot be written.
-    """
+    """Write all pictures of a frame and its camera."""
     import OpenEXR
 
     if Path(path).suffix.lower() != ".exr":

@@ -25,7 +25,7 @@ from render.formats.shards import (
     save_index,
     shard_name,
 )
-from render.formats.writer import open_writer
+from render.formats.writer import format_folder, open_writer
 
 CONFIG: Final = "render.json"
 """Settings of a rendering, in its folder."""
@@ -71,11 +71,12 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
         raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
-    _check_space(folders, out)
+    needed = sum(file.stat().st_size for one in folders for file in one.rglob("*") if file.is_file())
+    check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
     count = 0
     for name in formats:
         count = _merge_format(name, folders, [one["frames"] for one in settings], formats, out)
-        open_writer(name, _folder(out, formats, name)).finish()
+        open_writer(name, format_folder(out, formats, name)).finish()
     frames = sum(one["frames"] for one in settings)
     save_json(out / CONFIG, {"formats": formats, "frames": frames, "merged": settings})
     return count
@@ -92,30 +93,21 @@ def _settings(folder: Path) -> dict[str, Any]:
     return settings
 
 
-def _check_space(folders: Sequence[Path], out: Path) -> None:
-    needed = sum(file.stat().st_size for one in folders for file in one.rglob("*") if file.is_file())
-    check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
-
-
-def _folder(folder: Path, formats: Sequence[str], name: str) -> Path:
-    return folder if len(formats) == 1 else folder / name
-
-
 def _merge_format(
     name: str, folders: Sequence[Path], frames: Sequence[int], formats: Sequence[str], out: Path
 ) -> int:
     """Copy all shards of one format, and return their number."""
     number, offset = 0, 0
-    target = open_writer(name, _folder(out, formats, name))
+    target = open_writer(name, format_folder(out, formats, name))
     for folder, count in zip(folders, frames, strict=True):
-        source = open_writer(name, _folder(folder, formats, name))
+        source = open_writer(name, format_folder(folder, formats, name))
         for shard in sorted(source.done()):
             with one_sentence(out, f"copying shard {shard} of {folder}"):
                 if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
                     _copy_folder(source, shard, target, number, offset)
                 else:
                     start, end = (
-                        _folder(one, formats, name) / f"{shard_name(which)}{TAR}"
+                        format_folder(one, formats, name) / f"{shard_name(which)}{TAR}"
                         for one, which in ((folder, shard), (out, number))
                     )
                     _copy_tar(start, end, offset)

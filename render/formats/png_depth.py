@@ -117,8 +117,7 @@ def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]
 def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None) -> bytes:
     done, data = cv2.imencode(suffix, np.ascontiguousarray(picture), options or [])
     assert done, "these formats take any picture"
-    encoded: bytes = data.tobytes()
-    return encoded
+    return data.tobytes()
 
 
 def _chunk(name: bytes, content: bytes) -> bytes:

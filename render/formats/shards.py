@@ -35,11 +35,7 @@ def shards_in(folder: Path, *, suffix: str = "") -> frozenset[int]:
 
 @contextmanager
 def one_sentence(folder: Path, doing: str) -> Iterator[None]:
-    """Tell trouble with the disk in one sentence.
-
-    Raises:
-        HandSimError: Instead of an OSError.
-    """
+    """Tell trouble with the disk in one sentence."""
     try:
         yield
     except OSError as error:
@@ -125,11 +121,7 @@ def load_indexes(folder: Path, shards: Iterable[int]) -> Iterator[dict[str, Any]
 
 
 def load_index(folder: Path) -> list[dict[str, Any]]:
-    """The records of one shard.
-
-    Raises:
-        DatasetError: The index is missing or damaged.
-    """
+    """The records of one shard."""
     path = folder / INDEX
     remedy = f"delete the folder {folder.name} and render again"
     try:

@@ -7,11 +7,12 @@ done, one of them calls `finish`, which merges what the format stores in one fil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final, Protocol
 
-from handsim.errors import HandSimError, choices
+from handsim._checks import check_choice
+from handsim.errors import HandSimError
 from render.formats.clip_writer import WebdatasetWriter
 from render.formats.folder_writers import (
     CocoWriter,
@@ -63,12 +64,16 @@ NEED_COLORS: Final = ("coco", "yolo", "freihand", "interhand")
 """Formats of color pictures."""
 
 
+def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
+    """Where one of a rendering's formats is: in a folder of its own if there are several."""
+    return folder if len(formats) == 1 else folder / name
+
+
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """The writer of one of `FORMATS`, into a folder that is made when it is not there.
 
     Raises:
         HandSimError: There is no such format.
     """
-    if name not in WRITERS:
-        raise HandSimError(choices(name, WRITERS, noun="format"))
+    check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name](Path(folder))

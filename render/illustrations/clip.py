@@ -46,10 +46,6 @@ def write_clip(
     """Write a video (.mp4) of frames with the fields of `ClipFrame`, whole or not at all.
 
     The view shows some points in the world [m]; points of frames have this radius [m].
-
-    Raises:
-        ArgumentError: The file's name ends otherwise.
-        FileError: It cannot be written.
     """
     if path.suffix.lower() != SUFFIX:
         raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")

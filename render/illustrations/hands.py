@@ -227,8 +227,7 @@ def draw_labels(
 def marker_colors(layout: MarkerLayout) -> Float[np.ndarray, "M 3"]:
     """Color (sRGB) of each marker's digit."""
     bones = [BONE_NAMES.index(marker.bone) for marker in layout.markers]
-    colors: NDArray[np.float64] = bone_colors()[bones]
-    return colors
+    return bone_colors()[bones]
 
 
 def byte_color(color: tuple[float, float, float]) -> tuple[int, int, int]:

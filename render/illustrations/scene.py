@@ -157,20 +157,18 @@ def scene_surfaces(scene: HandScene) -> list[Drawn]:
     """The surfaces of a scene: skins with smooth normals, markers and free points."""
     surfaces: list[Drawn] = []
     for hand in scene.hands:
-        surfaces.append(_hand_surface(hand))
+        vertices, faces = hand.vertices(), hand.model.surface.faces
+        colors = skin_tint(hand.model) if hand.covering == "skin" else np.ones((len(vertices), 3))
+        surfaces.append(
+            _surface(
+                vertices, vertex_normals(vertices, faces), faces, colors, covering_material(hand.covering)
+            )
+        )
         if isinstance(hand.hand, GloveFit):
             surfaces += _ball_surfaces(Balls(hand.markers(), hand.hand.layout.radius, hand.marker_colors))
     for balls in scene.balls:
         surfaces += _ball_surfaces(balls)
     return surfaces
-
-
-def _hand_surface(hand: PosedHand) -> Drawn:
-    vertices, faces = hand.vertices(), hand.model.surface.faces
-    colors = skin_tint(hand.model) if hand.covering == "skin" else np.ones((len(vertices), 3))
-    return _surface(
-        vertices, vertex_normals(vertices, faces), faces, colors, covering_material(hand.covering)
-    )
 
 
 def _ball_surfaces(balls: Balls) -> list[Drawn]:

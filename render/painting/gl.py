@@ -26,11 +26,7 @@ _NAME_OF_RENDERER: Final = (
 
 
 def load_pyrender() -> Any:
-    """The pyrender module, which draws without a screen unless PYOPENGL_PLATFORM asks for something else.
-
-    Raises:
-        HandSimError: pyrender is missing or broken, or there is no OpenGL driver.
-    """
+    """The pyrender module, which draws without a screen unless PYOPENGL_PLATFORM asks for something else."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
         import pyrender
@@ -52,9 +48,6 @@ def offscreen_renderer(width: int, height: int) -> Any:
     """This process's renderer, set to a picture size [px].
 
     EGL contexts fail when they are made again and again, so there is one, kept until the process ends.
-
-    Raises:
-        HandSimError: There is no OpenGL driver, or the size is out of range.
     """
     if not (1 <= width <= 8192 and 1 <= height <= 8192):
         raise HandSimError(f"picture size is {width} x {height}, expected 1 to 8192 pixels each way")

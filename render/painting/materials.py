@@ -40,8 +40,7 @@ class Material:
 
 def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> NDArray[np.float64]:
     """Linear light of an sRGB color, with the plain 2.2 power that pyrender's shader undoes."""
-    light: NDArray[np.float64] = np.asarray(color, dtype=np.float64) ** 2.2
-    return light
+    return np.asarray(color, dtype=np.float64) ** 2.2
 
 
 def plain_material(color: tuple[float, float, float]) -> Material:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import NDArray
 
+from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
 from handsim.kernels.kernel import kernel
 from render.scenery.photographs import draw_photo, pick_photo
@@ -97,8 +98,7 @@ class BackgroundConfig:
         if not chosen and folder is None:
             return cls()
         for kind in chosen:
-            if kind not in KINDS:
-                raise HandSimError(choices(str(kind), KINDS, noun="background"))
+            check_choice(kind, KINDS, noun="background")
         return cls(**{kind: float(kind in (chosen or ("photo",))) for kind in KINDS}, photos=folder)
 
     def shares(self) -> tuple[float, ...]:

@@ -182,8 +182,7 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
     pixels, functions = _looked_up(width, height)
     light = picture.reshape(-1, 3).take(pixels, axis=0).astype(np.float64)
     projected = functions.T @ light * (4.0 * np.pi / len(functions))
-    coefficients: NDArray[np.float64] = (_MATT / _SQUARES)[:, None] * projected
-    return coefficients
+    return (_MATT / _SQUARES)[:, None] * projected
 
 
 @functools.lru_cache(maxsize=4)

@@ -24,11 +24,7 @@ _GAMMA: Final = 2.2
 
 @functools.lru_cache(maxsize=2)
 def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Photographs in a folder and its subfolders: those with the first bytes of a picture, and the others.
-
-    Raises:
-        HandSimError: There is no such folder, or none in it is readable.
-    """
+    """Photographs in a folder and its subfolders: those with the first bytes of a picture, and the others."""
     if not folder.is_dir():
         raise HandSimError(f"{folder}: no such folder of photographs")
     files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)

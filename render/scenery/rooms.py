@@ -389,8 +389,7 @@ def _wall_color(
 def _paint(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
     """Linear light (count, 3) of some paints, woods or cloths."""
     gray = rng.uniform(0.1, 0.95, (count, 1)) ** 2.2
-    colors: NDArray[np.float64] = np.clip(gray * np.exp(paint_tints(rng, count)), 0.003, 0.95)
-    return colors
+    return np.clip(gray * np.exp(paint_tints(rng, count)), 0.003, 0.95)
 
 
 def paint_tints(rng: np.random.Generator, count: int) -> NDArray[np.float64]:

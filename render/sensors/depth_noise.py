@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight
 from render.sensors.structured_light import StructuredLight
@@ -60,13 +61,8 @@ class DepthNoiseConfig:
 
 
 def named_sensor(name: str) -> DepthNoise:
-    """A depth sensor as it was published.
-
-    Raises:
-        ArgumentError: The sensor is unknown.
-    """
-    if name not in _SENSORS:
-        raise ArgumentError(choices(name, _SENSORS, noun="depth sensor"))
+    """A depth sensor as it was published."""
+    check_choice(name, _SENSORS, noun="depth sensor")
     return _SENSORS[name]
 
 
@@ -101,9 +97,6 @@ def apply_depth_noise(
     Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
     infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
     nothing.
-
-    Raises:
-        ArgumentError: A picture is not as large as the camera's.
     """
     shape = camera.size[1], camera.size[0]
     for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
@@ -154,11 +147,8 @@ def _back(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> NDArray[np.float32]:
     """Directions (3, H, W) from what is seen to the camera."""
-    fx, fy, cx, cy = middle
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    rays = np.nan_to_num(Camera("rays", size, K, lens=lens).rays())
-    back: NDArray[np.float32] = np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
-    return back
+    rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
+    return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
 
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
@@ -169,5 +159,4 @@ def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"
 
 @functools.cache
 def _luminance() -> NDArray[np.float32]:
-    table: NDArray[np.float32] = ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
-    return table
+    return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)

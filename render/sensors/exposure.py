@@ -177,8 +177,7 @@ def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]
     scaled = light * np.float32(_LEVELS - 1)
     scaled += np.float32(0.5)
     np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
-    rgb: NDArray[np.uint8] = _curve().take(scaled.astype(np.uint16), mode="clip")
-    return rgb
+    return _curve().take(scaled.astype(np.uint16), mode="clip")
 
 
 def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
@@ -198,8 +197,7 @@ def _decoded() -> NDArray[np.float32]:
 @functools.cache
 def _root_curve() -> NDArray[np.uint8]:
     """The sRGB values of light in even steps of its root: sixteen or more to each."""
-    values: NDArray[np.uint8] = encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
-    return values
+    return encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
 
 
 @functools.cache

@@ -113,7 +113,8 @@ def _sigma(
         return None
     sigma = (c2 * depth + c1) * depth + c0
     if cosines is not None and noise.angle_sigma > 0.0:
-        sigma += depth * np.sqrt(depth) * _by_cosine(_angle_terms(noise.angle_sigma), cosines)
+        bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+        sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
     if reflectance is not None:  # shot noise: as the root of the light
         sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
     return sigma
@@ -145,14 +146,8 @@ def _drop_weak(
     there.ravel()[dim] = rng.random(len(dim), dtype=np.float32) > chance
 
 
-def _by_cosine(table: NDArray[np.float32], cosines: NDArray[np.float32]) -> NDArray[np.float32]:
-    bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
-    return table.take(bands, mode="clip")
-
-
 @functools.lru_cache(maxsize=16)
 def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
     angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
     angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
-    terms: NDArray[np.float32] = (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
-    return terms
+    return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)

@@ -57,14 +57,13 @@ def _add_octave(
         total[number] += low + u * (high - low)
 
 
-def smooth(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+def smooth(values: NDArray[Any], low: float | NDArray[Any], high: float | NDArray[Any]) -> NDArray[Any]:
     """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    result: NDArray[Any] = share * share * (3.0 - 2.0 * share)
-    return result
+    smoothed: NDArray[Any] = share * share * (3.0 - 2.0 * share)
+    return smoothed
 
 
 def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:
     """A Gaussian bell of height 1."""
-    height: NDArray[Any] = np.exp(-((distance / width) ** 2))
-    return height
+    return np.exp(-((distance / width) ** 2))

@@ -62,8 +62,7 @@ class Flexion:
     ) -> Float[np.ndarray, "U 3"]:
         """Vertices at rest as the angles [rad] shape them [m]."""
         angle = np.where(self._joints < 0, self._full, angles[self._joints])
-        share = np.clip((angle - self._start) / (self._full - self._start), 0.0, 1.0)
-        share = share * share * (3.0 - 2.0 * share)
+        share = smooth(angle, self._start, self._full)
         shaped: NDArray[np.float64] = rest.copy()
         shaped[self._rows] += (self._heights @ share)[:, None] * self._normals
         return shaped

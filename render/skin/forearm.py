@@ -24,6 +24,7 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_BONES
 from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR
+from render.skin.fields import smooth
 
 FOREARM: Final = NUM_BONES
 """Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
@@ -123,10 +124,10 @@ def forearm_rings(
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
     axes_of = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if forearm.sleeve < forearm.length:
-        loose = 1.0 + (forearm.looseness - 1.0) * _smooth((behind - forearm.sleeve) / _CUFF + 0.5)
+        loose = 1.0 + (forearm.looseness - 1.0) * smooth((behind - forearm.sleeve) / _CUFF + 0.5, 0.0, 1.0)
         width, depth = loose * width, loose * depth
     round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
-    share = _smooth(behind / (_BLEND * shape.length))[:, None, None]
+    share = smooth(behind, 0.0, _BLEND * shape.length)[:, None, None]
     sections = (1.0 - share) * section + share * round_section
     axes, middles = _course(shape, forearm, behind)
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
@@ -157,7 +158,7 @@ def bent_rings(
     axis = axis / sine if sine > 1e-6 else np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
     most, aside = np.arctan2(sine, ahead @ towards), np.cross(axis, ahead)
     fine = np.concatenate([np.linspace(-_ELBOW_BEND, _ELBOW_BEND, 33), [REACH]])
-    angles = most * _smooth((fine + _ELBOW_BEND) / (2.0 * _ELBOW_BEND))
+    angles = most * smooth(fine, -_ELBOW_BEND, _ELBOW_BEND)
     ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
     course = np.zeros((len(fine), 3))
     course[1:] = np.cumsum(0.5 * (ways[1:] + ways[:-1]) * np.diff(fine)[:, None], axis=0)
@@ -234,7 +235,7 @@ def _half_axes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
     girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
-    flatness = 0.70 + 0.18 * _smooth(behind / shape.length)
+    flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
     # Ramanujan's ellipse: its girth over its half width
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
@@ -247,7 +248,7 @@ def _course(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
     fine = np.linspace(0.0, behind[-1], 200)
-    share = _smooth(fine / (_BEND * shape.length))
+    share = smooth(fine, 0.0, _BEND * shape.length)
     # A hand that bends towards its palm (-z) or thumb (y) has its arm go there too, seen from the hand.
     up, aside = forearm.flexion * share, forearm.deviation * share
     ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)
@@ -258,10 +259,3 @@ def _course(
     z = np.array([0.0, 0.0, 1.0]) - x[:, 2:] * x
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1), middles
-
-
-def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smoothstep from 0 to 1."""
-    inside = np.clip(share, 0.0, 1.0)
-    result: NDArray[np.float64] = inside * inside * (3.0 - 2.0 * inside)
-    return result

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from handsim._checks import check_type
-from handsim.errors import ArgumentError, HandSimError, choices
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError, HandSimError
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -94,11 +94,7 @@ class SkinLook:
 
 
 def check_tones(tones: Sequence[float]) -> None:
-    """Check the ranges of typology angles that `sample_skin_look` draws from.
-
-    Raises:
-        ArgumentError: They are no ranges of angles, one after the other.
-    """
+    """Check the ranges of typology angles that `sample_skin_look` draws from."""
     limits = np.array([-90.0, *tones, 90.0], dtype=np.float64)
     if len(tones) < 2 or len(tones) % 2 or not (np.diff(limits) >= 0.0).all():
         raise ArgumentError(
@@ -129,8 +125,7 @@ def named_tones(names: Sequence[str]) -> tuple[float, ...]:
     known = {hyphened(name): angles for name, angles in TONES.items()}
     for name in names:
         check_type("a skin tone", name, str, "its name", known)
-        if hyphened(name) not in known:
-            raise ArgumentError(choices(name, known, noun="skin tone"))
+        check_choice(hyphened(name), known, noun="skin tone")
     ranges: list[float] = []
     for low, high in sorted({known[hyphened(name)] for name in names}):
         if ranges and low <= ranges[-1]:

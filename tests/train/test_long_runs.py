@@ -182,7 +182,7 @@ OPTION_ERRORS = {
     "--learning-rate nan": "learning_rate is nan, expected a number above 0, at most 10",
     "--learning-rate 1e9": "learning_rate is 1e+09, expected a number above 0, at most 10",
     "--seed -1": "seed is -1, expected 0 or more",
-    "--network.width 0": "width is 0, expected a whole number from 1 to 4096",
+    "--network.width 0": "width is 0, expected 1 to 4096",
     "--network.gates 7": "gates is 7, expected a divisor of width, 64",
     "--batch 0": "batch is 0, expected at least 1",
     "--average nan": "average is nan, expected a number from 0 to 1",

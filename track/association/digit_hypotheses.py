@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
+from handsim.kernels.segments import point_distance
 from track.association.digit_fit import fit_hypothesis
 from track.kinematics.joint_prior import JointPrior, digit_prior
 from track.kinematics.marker_kinematics import HandArrays, compute_markers, workspace
@@ -56,10 +57,7 @@ def digit_ranges(hand: HandArrays) -> DigitRanges:
         compute_markers(hand, angles, work)
         for one in range(count):
             for other in range(one):
-                squared = 0.0
-                for axis in range(3):
-                    squared += (work.markers[one, axis] - work.markers[other, axis]) ** 2
-                distance = np.sqrt(squared)
+                distance = point_distance(work.markers[one], work.markers[other])
                 nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
                 farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
     return DigitRanges(nearest, farthest)
@@ -297,10 +295,7 @@ def _upper_bound(
                 continue
             if hypothesis[other] == point:
                 return -IMPOSSIBLE
-            distance = 0.0
-            for i in range(3):
-                distance += (points[point, i] - points[hypothesis[other], i]) ** 2
-            distance = np.sqrt(distance)
+            distance = point_distance(points[point], points[hypothesis[other]])
             one, two = markers[slot], markers[other]
             tolerance = _LENGTH_TOLERANCE + slack[one] + slack[two]
             if (

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import squared_distance
 from track.association.frame_state import FrameState, targets_of
 from track.association.hand_state import HandEstimate, HandState, HandTrack, Prediction
 
@@ -155,9 +156,7 @@ def _worst_label(
         marker = markers[point]
         if marker < 0:
             continue
-        square = 0.0
-        for axis in range(3):
-            square += (points[point, axis] - positions[marker, axis]) ** 2
+        square = squared_distance(points[point], positions[marker])
         square /= variance[marker] + _FIT_SPREAD**2
         if square > most:
             worst, most = point, square

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import squared_distance
 
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
@@ -44,10 +45,7 @@ def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np
             for other in range(len(points)):
                 if number[other] >= 0:
                     continue
-                square = 0.0
-                for axis in range(3):
-                    square += (points[here, axis] - points[other, axis]) ** 2
-                if square <= distance**2:
+                if squared_distance(points[here], points[other]) <= distance**2:
                     number[other] = groups
                     stack[height] = other
                     height += 1
@@ -68,9 +66,7 @@ def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
             for other in range(points.shape[1]):
                 if nearest[other] < 0.0:
                     continue
-                square = 0.0
-                for axis in range(3):
-                    square += (points[frame, other, axis] - points[frame, added, axis]) ** 2
+                square = squared_distance(points[frame, other], points[frame, added])
                 nearest[other] = min(nearest[other], square)
                 if nearest[other] < least:
                     least, following = nearest[other], other

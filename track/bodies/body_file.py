@@ -33,11 +33,6 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
     """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
 
     A body itself is given back.
-
-    Raises:
-        ArgumentError: There is no such object, or it has too few markers.
-        BodyError: There is no such file, or it does not describe a body that can be tracked; the sentence
-            names the file.
     """
     check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
     if isinstance(name_or_path, RigidTemplate):
@@ -81,11 +76,7 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
 
 
 def save_body(path: str | Path, body: RigidTemplate) -> None:
-    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again.
-
-    Raises:
-        BodyError: The file cannot be written.
-    """
+    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again."""
     lines = [f"name = {quoted(body.name)}"]
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
         numbers_mm = ", ".join(written(value) for value in position.tolist())

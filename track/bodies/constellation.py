@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import align_rigid, quaternion_product, write_quaternion_matrix
+from handsim.kernels.segments import squared_distance
 
 FEWEST: Final = 3
 """Markers that determine a pose."""
@@ -150,8 +151,7 @@ def assign_remaining(
     for marker in range(len(positions)):
         if assignment[marker] < 0:
             assignment[marker] = nearest_free(points, predicted[marker], _NEW * tight, assignment)
-    fitted: tuple[int, float] = fit_inliers(positions, points, assignment, pose, tight, gate)
-    return fitted
+    return fit_inliers(positions, points, assignment, pose, tight, gate)
 
 
 @kernel
@@ -302,11 +302,3 @@ def velocity_between(
         2.0 / seconds if sine < 1e-12 else 2.0 * np.arctan2(sine, rotation[0]) / sine / seconds
     )
     return velocity
-
-
-@kernel
-def squared_distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Squared distance of two points (3,) [m^2]."""
-    x, y, z = first[0] - second[0], first[1] - second[1], first[2] - second[2]
-    squared: float = x * x + y * y + z * z
-    return squared

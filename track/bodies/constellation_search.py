@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
-from track.bodies.constellation import FEWEST, fit_inliers, nearest_free, squared_distance
+from handsim.kernels.segments import squared_distance
+from track.bodies.constellation import FEWEST, fit_inliers, nearest_free
 
 _FLAT: Final = 0.1  # height of a triangle over its longest side, below which it determines no rotation
 

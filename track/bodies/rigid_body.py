@@ -310,8 +310,7 @@ class BodyTracker:
             kept, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
             if kept < FEWEST:
                 return 0, np.nan
-        fitted: tuple[int, float] = assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
-        return fitted
+        return assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
 
     def _accept(
         self,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures.capture import runs_of
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, bones_of
 from poses.shapes.touch import FINGERS, thumb_contact
@@ -83,8 +84,12 @@ def find_touches(
         speed = _speed(model, angles, finger, window, rate)
         good = (speed < _MOST_SPEED) & (gaps[:, number] < _MOST_GAP) & (gaps.argmin(axis=1) == number)
         good &= complete[:, 0] & complete[:, number + 1]
-        holds = _runs(good, max(2, round(_SHORTEST_HOLD * rate)))
-        stillest = [first + int(speed[first:last].argmin()) for first, last in holds]
+        shortest = max(2, round(_SHORTEST_HOLD * rate))
+        stillest = [
+            first + int(speed[first : last + 1].argmin())
+            for first, last in runs_of(good)
+            if last + 1 - first >= shortest
+        ]
         stillest.sort(key=lambda frame, number=number: float(gaps[frame, number]))  # type: ignore[misc]
         touches += [(frame, finger) for frame in stillest[:_MOST_PER_FINGER]]
     return sorted(touches)
@@ -105,12 +110,6 @@ def _speed(
         distance = np.linalg.norm(position[2 * window :] - position[: -2 * window], axis=1)
         speed[window:-window] = distance * rate / (2 * window)
     return speed
-
-
-def _runs(good: NDArray[np.bool_], shortest: int) -> list[tuple[int, int]]:
-    """Runs of at least `shortest` frames: first frame, and the one after the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= shortest]
 
 
 def initialize_contacts(

@@ -41,11 +41,7 @@ class PoseTrack(NamedTuple):
 
 
 def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
-    """A copy of the markers [m] in which a marker has three finite coordinates or three NaN.
-
-    Raises:
-        ArgumentError: `markers` do not fit the glove, or `rate` is not positive.
-    """
+    """A copy of the markers [m] in which a marker has three finite coordinates or three NaN."""
     values = np.array(markers, dtype=np.float64)
     count = start.attachment.layout.num_markers
     if values.ndim != 3 or values.shape[1:] != (count, 3):
@@ -57,11 +53,7 @@ def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: fl
 
 
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
-    """Numbers of the frames with enough markers for a pose.
-
-    Raises:
-        CalibrationError: There are fewer than `FEWEST_FRAMES`.
-    """
+    """Numbers of the frames with enough markers for a pose."""
     count = markers.shape[1]
     needed = min(count, max(_FEWEST_MARKERS, round(_MARKER_SHARE * count)))
     usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= needed)

@@ -79,8 +79,7 @@ def shape_jacobian(
     """
     nudged = parameters + _STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)  # the first as it is
     values = function([shape_at(start, one) for one in nudged])
-    jacobian: NDArray[np.float64] = np.moveaxis((values[1:] - values[0]) / _STEP, 0, -1)
-    return jacobian
+    return np.moveaxis((values[1:] - values[0]) / _STEP, 0, -1)
 
 
 def skeleton_jacobian(start: HandShape, parameters: Float[np.ndarray, "53"]) -> Float[np.ndarray, "45 53"]:

@@ -236,20 +236,16 @@ def project_onto_skin(
         heights[active] = here.heights + step[:, 2]
         lowest = moved.argmin(axis=1)
         out = moved[np.arange(len(active)), lowest] < _OUTSIDE
-        bary[active] = np.where(out[:, None], _clip_to_triangle(here.bary, moved), moved)
+        # What left its triangle is clipped to its border.
+        inside = np.clip(moved, 0.0, None)
+        edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
+        bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
         done = ~out & (np.linalg.norm(residual, axis=1) < _CLOSE)
         _cross_edges(mesh, faces, bary, active[out], lowest[out])
         active = active[~done]
         if not len(active):
             break
     return SkinCoordinates(faces, bary, heights)
-
-
-def _clip_to_triangle(bary: NDArray[np.float64], moved: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Barycentric coordinates (P, 3) that left their triangle, clipped to its border."""
-    inside = np.clip(moved, 0.0, None)
-    edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
-    return np.where(np.isfinite(edge), edge, bary)
 
 
 def _cross_edges(

@@ -57,8 +57,7 @@ def pose_spreads(
         squares += _variances(fit, qpos[good], seen[good]).sum(axis=0)
         squares += np.count_nonzero(~good) * untold_spreads() ** 2
         count += len(good)
-    spreads: Float[np.ndarray, "20"] = np.sqrt(squares / max(1, count))
-    return spreads
+    return np.sqrt(squares / max(1, count))
 
 
 def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
@@ -95,5 +94,4 @@ def _variances(
     spreads, _ = spreads_of_poses(
         hand, tip_lengths(fit), limits, known_hand(hand.digits, NOISE), qpos, unseen
     )
-    variances: Float[np.ndarray, "T 20"] = spreads**2
-    return variances
+    return spreads**2

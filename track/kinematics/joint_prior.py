@@ -37,8 +37,7 @@ class JointPrior(NamedTuple):
     @property
     def spread(self) -> Float[np.ndarray, "20"]:
         """Standard deviation of each hinge [rad]."""
-        spread: NDArray[np.float64] = np.sqrt(np.diag(self.covariance))
-        return spread
+        return np.sqrt(np.diag(self.covariance))
 
 
 @cache
@@ -53,8 +52,7 @@ def resting_angles() -> Float[np.ndarray, "20"]:
 def resting_covariance() -> Float[np.ndarray, "20 20"]:
     """Covariance of the hinges over all gestures, and a margin for other poses [rad^2]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    covariance: NDArray[np.float64] = np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
-    return covariance
+    return np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
 
 
 @cache

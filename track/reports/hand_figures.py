@@ -43,8 +43,7 @@ class HandFigures:
     @property
     def fitted(self) -> Bool[np.ndarray, "T"]:
         """Frames whose pose was fitted to points, which a coasting hand's is not."""
-        fitted: NDArray[np.bool_] = self.status >= INITIALIZED
-        return fitted
+        return self.status >= INITIALIZED
 
     @property
     def rms(self) -> Float[np.ndarray, "T"]:
@@ -53,8 +52,7 @@ class HandFigures:
         total = np.sum(np.square(self.residuals), axis=1, where=known)
         square: NDArray[np.float64] = np.full(len(total), np.nan)
         np.divide(total, known.sum(axis=1), out=square, where=known.any(axis=1))
-        rms: NDArray[np.float64] = np.sqrt(square)
-        return rms
+        return np.sqrt(square)
 
     def usual_spreads(self) -> Float[np.ndarray, "20"]:
         """Median standard deviation of each joint's angle over the fitted frames [deg]; NaN if unknown."""

@@ -13,8 +13,8 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.page import Section, write_page
-from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
+from handsim.files.outputs import check_ending
 from handsim.hand.topology import JOINTS
 from track.config import Size
 from track.reports import take_plots
@@ -55,8 +55,7 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
         OSError: A file cannot be written.
     """
     out = Path(out)
-    if out.suffix.lower() != ".html":
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .html")
+    check_ending(out, ".html")
     hands, doubts = hand_figures(take), doubts_of(take, most=None)
     sections = [_summary_section(take), _calibration_section(take)]
     for hand in hands:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, LOST
 from handsim.hand.topology import DIGITS, JOINT_NAMES
 from track.reports.hand_figures import HandFigures
-from track.take_summary import runs_of
 from train.reports.plot_style import BAND, BLUE, CARD, GREEN, LINE, SOFT, VIOLET, WARM
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def presence_size(num_markers: int) -> tuple[float, float]:
 def draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
     """One panel for each digit with its four angles and their bands; lost and coasting frames are shaded."""
     panels = figure.subplots(len(DIGITS), 1, sharex=True)
+    starts, _ = _bins(len(times))
     shape = len(times), len(DIGITS), -1
     angles = hand.angles.reshape(shape)
     spread = None if hand.angle_spread is None else hand.angle_spread.reshape(shape)
@@ -46,7 +47,8 @@ def draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures
             panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
             if spread is not None:
                 low, high = values - spread[:, number, joint], values + spread[:, number, joint]
-                panel.fill_between(*_envelope(times, low, high), color=stroke, alpha=0.15, linewidth=0.0)
+                low, high = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+                panel.fill_between(times[starts], low, high, color=stroke, alpha=0.15, linewidth=0.0)
         panel.set_ylabel(f"{digit} [deg]")
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
     panels[-1].set_xlabel("time [s]")
@@ -96,14 +98,6 @@ def decimated(
     middles = (starts + ends) // 2
     pairs = np.stack([np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)], axis=1)
     return np.stack([times[starts], times[middles]], axis=1).ravel(), pairs.ravel()
-
-
-def _envelope(
-    times: Float[np.ndarray, "T"], low: Float[np.ndarray, "T"], high: Float[np.ndarray, "T"]
-) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
-    """A band of at most 750 values: the least and the largest of each bin of frames."""
-    starts, _ = _bins(len(times))
-    return times[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
 
 
 def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[tuple[float, float]]:

@@ -69,7 +69,12 @@ class SinkGroup(Closing):
             try:
                 sink.send(message)
             except Exception as error:  # of the user's code: any; the recording goes on
-                self._leave_out(address, error)
+                warnings.warn(
+                    f"{address} failed and gets no further frame ({type(error).__name__}: {error})",
+                    HandSimWarning,
+                    stacklevel=3,
+                )
+                self._close(address, self._sinks.pop(address))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -87,14 +92,6 @@ class SinkGroup(Closing):
         sinks, self._sinks = self._sinks, {}
         for address, sink in sinks.items():
             self._close(address, sink)
-
-    def _leave_out(self, address: str, error: Exception) -> None:
-        warnings.warn(
-            f"{address} failed and gets no further frame ({type(error).__name__}: {error})",
-            HandSimWarning,
-            stacklevel=3,
-        )
-        self._close(address, self._sinks.pop(address))
 
     def _close(self, address: str, sink: LiveSink) -> None:
         try:
@@ -131,11 +128,7 @@ def open_sinks(addresses: str | Sequence[str]) -> SinkGroup:
 
 
 def open_sink(address: str) -> LiveSink:
-    """Open the sink that an address names, see `open_sinks`.
-
-    Raises:
-        ArgumentError: The address is invalid, a package is missing, or a port is taken.
-    """
+    """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in _NETWORK and rest.startswith("//"):
         return _NETWORK[scheme](address)

@@ -83,11 +83,7 @@ def pack(kind: Kind, payload: bytes = b"") -> bytes:
 
 
 def unpack(packet: bytes) -> tuple[int, bytes]:
-    """Kind and payload of a packet.
-
-    Raises:
-        DamagedPacket: It is truncated.
-    """
+    """Kind and payload of a packet."""
     if len(packet) < 4:
         raise DamagedPacket("no header")
     kind, size = struct.unpack_from("<HH", packet)
@@ -150,11 +146,7 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(payload: bytes, version: Version) -> MarkerFrame:
-    """Read the observed markers of a frame; markers that the server filled in are left out.
-
-    Raises:
-        DamagedPacket: It is truncated, or not a frame of this version.
-    """
+    """Read the observed markers of a frame; markers that the server filled in are left out."""
     reader, sized = _Reader(payload), version >= _SIZED
     number = reader.integer()
     for _ in range(reader.section(5, sized)):  # marker sets: names, and markers once more
@@ -221,21 +213,17 @@ class _Reader:
         number: int = struct.unpack("<i", self.take(4))[0]
         return number
 
-    def count(self, least: int) -> int:
-        """A number of items of at least `least` bytes each."""
+    def count(self, least: int, between: int = 0) -> int:
+        """A number of items of at least `least` bytes each, with so many other bytes between."""
         count = self.integer()
+        self.take(between)
         if not 0 <= count * least <= self.left:
             raise DamagedPacket("counts more than there is")
         return count
 
     def section(self, least: int, sized: bool) -> int:
         """The number of items of a section; its size, if it has one, is not needed to skip it."""
-        count = self.integer()
-        if sized:
-            self.take(4)
-        if not 0 <= count * least <= self.left:
-            raise DamagedPacket("counts more than there is")
-        return count
+        return self.count(least, 4 if sized else 0)
 
     def skip(self, size: int, count: int) -> None:
         self.take(size * count)

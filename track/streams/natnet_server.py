@@ -18,10 +18,10 @@ from handsim._checks import check_type
 from handsim._closing import Closing
 from handsim.errors import CaptureError, choices
 from track.given import read_points
+from track.network_address import LOOPBACK
 from track.streams import natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
-LOOPBACK: Final = "127.0.0.1"
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # in a datagram
 _MOST_CLIENTS: Final = 8

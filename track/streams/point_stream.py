@@ -39,9 +39,6 @@ def open_stream(
     """Connect to a NatNet server at `natnet://host` or `natnet://host:port`, with the port for commands.
 
     It listens at the network card of this address, or at the one that leads to the host.
-
-    Raises:
-        CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.
     """
     host, port = _split(url)
     try:
@@ -134,19 +131,15 @@ class PointStream(Closing):
     def _attend(self) -> None:
         """Keep the server sending, and the socket from running over while the reader is busy."""
         while not self._closed.wait(_ATTENDED):
-            self._keep_alive()
+            now = time.monotonic()
+            if now >= self._kept_alive + _KEEP_ALIVE:
+                _send(self._sockets[0], natnet.pack(Kind.KEEP_ALIVE), self._address)
+                if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
+                    _send(self._sockets[0], natnet.pack_connect(), self._address)
+                self._kept_alive = now
             if time.monotonic() > self._asked + _ATTENDED:
                 with self._reading:
                     self._drain()
-
-    def _keep_alive(self) -> None:
-        """Send a keep-alive packet when it is due."""
-        now = time.monotonic()
-        if now >= self._kept_alive + _KEEP_ALIVE:
-            _send(self._sockets[0], natnet.pack(Kind.KEEP_ALIVE), self._address)
-            if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
-                _send(self._sockets[0], natnet.pack_connect(), self._address)
-            self._kept_alive = now
 
     def _drain(self) -> None:
         """Take what has arrived until now out of the sockets."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from pathlib import Path
@@ -161,10 +162,6 @@ class LayoutEditor:
 
 def edited_path(path: Path) -> Path:
     """A name beside a file that no file has yet: `glove-edited.toml`, `glove-edited-2.toml`, ..."""
-    number = 1
-    while True:
-        ending = "" if number == 1 else f"-{number}"
-        candidate = path.with_name(f"{path.stem}-edited{ending}{path.suffix}")
-        if not candidate.exists():
-            return candidate
-        number += 1
+    endings = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
+    candidates = (path.with_name(f"{path.stem}-edited{ending}{path.suffix}") for ending in endings)
+    return next(candidate for candidate in candidates if not candidate.exists())

@@ -48,7 +48,20 @@ class StatusPanel:
         server, recording = self._server, self._recording
         if recording.curves and recording.num_frames > 1:
             with server.gui.add_folder("Over time", expand_by_default=True):
-                self._plots = _add_plots(server, recording)
+                groups: dict[bool, list[int]] = {}
+                for number, curve in enumerate(recording.curves):
+                    groups.setdefault(curve.name.endswith("]"), []).append(number)
+                plots = []
+                for numbers in groups.values():
+                    series: list[uplot.Series] = [{"label": "time [s]"}]
+                    for number, stroke in zip(numbers, _STROKES, strict=False):
+                        name = recording.curves[number].name
+                        series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
+                    plot = server.gui.add_uplot(
+                        _columns(recording, numbers), tuple(series), scales={"x": {"time": False}}, aspect=2.2
+                    )
+                    plots.append((plot, numbers))
+                self._plots = plots
 
     def renew(self) -> None:
         """Show the rows and the plots of a recording that was changed."""
@@ -80,24 +93,6 @@ class StatusPanel:
 
 def _jump(go_to: Callable[[int], None], frame: int, _event: object) -> None:
     go_to(frame)
-
-
-def _add_plots(server: ViserServer, recording: Recording) -> list[tuple[GuiUplotHandle, list[int]]]:
-    """One plot for the curves of each unit, with the numbers of its curves."""
-    groups: dict[bool, list[int]] = {}
-    for number, curve in enumerate(recording.curves):
-        groups.setdefault(curve.name.endswith("]"), []).append(number)
-    plots = []
-    for numbers in groups.values():
-        series: list[uplot.Series] = [{"label": "time [s]"}]
-        for number, stroke in zip(numbers, _STROKES, strict=False):
-            name = recording.curves[number].name
-            series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
-        plot = server.gui.add_uplot(
-            _columns(recording, numbers), tuple(series), scales={"x": {"time": False}}, aspect=2.2
-        )
-        plots.append((plot, numbers))
-    return plots
 
 
 def _columns(recording: Recording, numbers: list[int]) -> tuple[np.ndarray, ...]:

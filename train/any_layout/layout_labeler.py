@@ -85,11 +85,7 @@ class LayoutLabeler:
 
     @classmethod
     def of_tensors(cls, layout: MarkerLayout, tensors: Mapping[str, NDArray[np.generic]]) -> Self:
-        """The labeler out of a file's tensors.
-
-        Raises:
-            WeightsError: They are not those of a labeler of this layout.
-        """
+        """The labeler out of a file's tensors."""
         network = LayoutNetwork(LayoutNetworkConfig())
         parts, prior = (
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
@@ -128,11 +124,7 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
 
 @cache
 def shipped_network() -> LayoutNetwork:
-    """The network that comes with handsim.
-
-    Raises:
-        WeightsError: Its files are missing or damaged.
-    """
+    """The network that comes with handsim."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 

@@ -48,7 +48,11 @@ class LayoutBatches:
     def __init__(self, bank: SkinBank, rng: np.random.Generator) -> None:
         self._bank, self._rng = bank, rng
         self._spacing = bank.mean_distances()
-        self._features = _mean_features(bank)
+        some = bank.positions[:: max(1, len(bank.positions) // _FEATURE_POSES)].astype(np.float32)
+        total = torch.zeros(len(bank.places), len(bank.places), _CONFIG.num_distances)
+        for points in some:
+            total += distance_features(torch.from_numpy(points)[None], _CONFIG)[0]
+        self._features = (total / len(some)).numpy().astype(np.float16)
         self._bones = bank.bones
 
     def draw(self) -> tuple[Cloud, Float[np.ndarray, "G M M K"]]:
@@ -94,15 +98,6 @@ class LayoutBatches:
         lost = (np.linalg.norm(markers - center, axis=-1) < radius) & (rng.random((batch, count)) < 0.8)
         lost[lost.sum(axis=1) > count - _LEAST_SEEN] = False
         return np.where(lost[..., None], np.nan, markers)
-
-
-def _mean_features(bank: SkinBank) -> Float[np.ndarray, "C C K"]:
-    """Mean distance features between all places."""
-    some = bank.positions[:: max(1, len(bank.positions) // _FEATURE_POSES)].astype(np.float32)
-    total = torch.zeros(len(bank.places), len(bank.places), _CONFIG.num_distances)
-    for points in some:
-        total += distance_features(torch.from_numpy(points)[None], _CONFIG)[0]
-    return (total / len(some)).numpy().astype(np.float16)
 
 
 class LayoutTraining:

@@ -119,8 +119,7 @@ def stretched(
     markers: Float[np.ndarray, "B M 3"], anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
     """Hands stretched at random around the origin, by this standard deviation of the logarithm."""
-    result: NDArray[np.float64] = markers @ _stretches(len(markers), anisotropy, rng)
-    return result
+    return markers @ _stretches(len(markers), anisotropy, rng)
 
 
 def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArray[np.float64]:

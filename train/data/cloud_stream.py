@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from handsim._checks import check_number, check_type
-from handsim.errors import ArgumentError
+from handsim._checks import check_count, check_number
 from train.data.augmentation import Corruption
 from train.data.batches import BatchRecipe, draw_batch
 from train.data.own_corruption import OwnCorruption, check_corruption
@@ -59,9 +58,7 @@ class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
     ) -> None:
         self.dataset = load_dataset(dataset)
         for name, value, least in (("batch", batch, 1), ("seed", seed, 0), ("start", start, 0)):
-            check_type(name, value, int, "a whole number")
-            if value < least:
-                raise ArgumentError(f"{name} is {value}, expected at least {least}")
+            check_count(name, value, least)
         check_number("rig_share", rig_share, 0.0, 1.0)
         check_number("anisotropy", anisotropy, 0.0, 1.0)
         if not isinstance(corruption, Corruption):

@@ -131,9 +131,6 @@ def load_manifest(path: Path) -> Manifest:
 
     Args:
         path: The folder that `handsim generate` wrote.
-
-    Raises:
-        DatasetError: Not a training set, unfinished, of another schema, or the manifest is damaged.
     """
     if not (path / MANIFEST).is_file():
         hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
@@ -176,11 +173,7 @@ def _is_table_of(value: object, kind: type) -> bool:
 
 
 def checked_manifest(file: Path, content: dict[str, Any]) -> Manifest:
-    """The manifest that a file's content is.
-
-    Raises:
-        DatasetError: A field is missing, unknown, or holds something else.
-    """
+    """The manifest that a file's content is."""
     remedy = "delete it and run handsim generate again"
     for name in content.keys() | _MANIFEST_FIELDS.keys():
         if name not in _MANIFEST_FIELDS:

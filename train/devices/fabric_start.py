@@ -30,10 +30,6 @@ def start_fabric(config: TrainConfig, out: Path) -> Fabric:
     """The device of this process, a GPU where there is one, and the writer of the curves.
 
     Waits for the other processes of the run, if there are any.
-
-    Raises:
-        ArgumentError: There are fewer GPUs than processes on this machine, or other processes than
-            `config.devices` asks for.
     """
     world = world_of()
     check_devices(config, world.size, world.local_size)
@@ -72,9 +68,6 @@ def check_devices(config: TrainConfig, size: int, local_size: int) -> None:
 
     Args:
         local_size: Of these on this machine.
-
-    Raises:
-        ArgumentError: There are.
     """
     if config.batch < size:
         raise ArgumentError(f"batch is {config.batch}, expected at least {size}: a cloud for each device")

@@ -47,9 +47,6 @@ def world_of(environ: Mapping[str, str] | None = None) -> World:
     """The processes that an environment (this one's by default) speaks of: torchrun's or a job step's.
 
     A batch script that Slurm runs without srun is one process, however many tasks the job may have.
-
-    Raises:
-        ArgumentError: The variables contradict each other.
     """
     environ = os.environ if environ is None else environ
     if all(name in environ for name in _TORCHRUN):

@@ -155,32 +155,19 @@ def _packed(prior: PosePrior) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def _place_of_digest(content: bytes) -> slice:
-    """Where the digest stands: a text of 64 bytes after its key; a `ValueError` unless it is there once."""
+def sign_model(content: bytes) -> bytes:
+    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before."""
     key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
     if content.count(key) != 1:
         raise ValueError("the file has no SHA-256")
     first = content.index(key) + len(key)
-    return slice(first, first + 64)
-
-
-def sign_model(content: bytes) -> bytes:
-    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before.
-
-    Raises:
-        ValueError: It has no place for it.
-    """
-    place = _place_of_digest(content)
+    place = slice(first, first + 64)
     blank = content[: place.start] + b"0" * 64 + content[place.stop :]
     return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
 
 
 def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
-    """Write a trained labeler as an ONNX file for any number of clouds of any size.
-
-    Raises:
-        HandSimError: onnx is not installed.
-    """
+    """Write a trained labeler as an ONNX file for any number of clouds of any size."""
     import torch
 
     from train.labelers.cnn_network import DeepLabelCNN

@@ -54,11 +54,7 @@ class Labeler(Protocol):
 
 
 def checked_names(names: object) -> tuple[str, ...]:
-    """Marker names out of a file.
-
-    Raises:
-        ValueError: They are not different texts.
-    """
+    """Marker names out of a file."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("marker_names is not a list of names")
     if len(set(names)) < len(names) or not names:
@@ -119,11 +115,7 @@ def pad_clouds(
 
 
 def check_output(numbers: Float[np.ndarray, "..."]) -> None:
-    """Refuse what a network with damaged weights gives.
-
-    Raises:
-        WeightsError: Some numbers are not numbers.
-    """
+    """Refuse what a network with damaged weights gives."""
     if np.isnan(numbers).any():
         raise WeightsError(
             "the labeler's network gives numbers that are NaN, expected weights that are whole"

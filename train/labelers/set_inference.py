@@ -188,8 +188,7 @@ def _centers(config: SetLabelerConfig) -> Float32[np.ndarray, "K"]:
     """Distances around which the bumps stand [m]; torch's linspace counts the second half from its end."""
     reach, count = np.float32(config.reach), config.num_distances
     steps = np.arange(count) * np.float64(reach / np.float32(count - 1))
-    centers: Floats = np.where(np.arange(count) < count // 2, steps, reach - steps[::-1]).astype(np.float32)
-    return centers
+    return np.where(np.arange(count) < count // 2, steps, reach - steps[::-1]).astype(np.float32)
 
 
 def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:

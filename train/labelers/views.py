@@ -75,8 +75,7 @@ class MeanHand:
         mirrors = np.ones((len(markers), 1, 3))
         mirrors[:, 0, 0] = side
         rotations, _ = rigid_fit(markers * mirrors, self.markers)
-        views: NDArray[np.float64] = rotations * mirrors
-        return views
+        return rotations * mirrors
 
     def first_views(
         self, points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"]
@@ -90,8 +89,7 @@ class MeanHand:
         offsets = _moments(points, present, views) - self.moments
         unlikely = np.einsum("bvi,ij,bvj->bv", offsets, self.precision, offsets)
         order = unlikely.argsort(axis=1, kind="stable")
-        likeliest: NDArray[np.float64] = np.take_along_axis(views, order[..., None, None], axis=1)
-        return likeliest
+        return np.take_along_axis(views, order[..., None, None], axis=1)
 
     def training_views(
         self,
@@ -121,8 +119,7 @@ def principal_axes(
     """Orthogonal matrices (B, 3, 3) whose rows are the principal axes of clouds, the longest first."""
     offsets, _ = centered(points, present)
     _, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets)
-    rows: NDArray[np.float64] = axes[:, :, ::-1].swapaxes(1, 2)
-    return rows
+    return axes[:, :, ::-1].swapaxes(1, 2)
 
 
 def random_views(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -39,10 +39,7 @@ def pair_probabilities(
     Returns:
         Probabilities; the last column is "a ghost", the last row "occluded". Rows of points sum to 1.
     """
-    probabilities: NDArray[np.float64] = balance(
-        point_scores.astype(np.float64), label_scores.astype(np.float64), _WEIGHT, _ROUNDS
-    )
-    return probabilities
+    return balance(point_scores.astype(np.float64), label_scores.astype(np.float64), _WEIGHT, _ROUNDS)
 
 
 def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import WeightsError
 from handsim.kernels.kernel import kernel
+from handsim.kernels.rotations import horn_matrix, write_quaternion_matrix
 
 NEAREST: Final = 4
 """Components that count, of all those whose mean hand is compared with the points."""
@@ -113,11 +114,7 @@ class PosePrior:
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]]) -> PosePrior:
-        """The prior out of a file's tables.
-
-        Raises:
-            WeightsError: Tables are missing, or not those of a prior.
-        """
+        """The prior out of a file's tables."""
         if set(tensors) != {field.name for field in fields(cls)}:
             raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
@@ -254,8 +251,7 @@ def factor_of(
     inner = rows.T @ rows
     for direction in range(rank):
         inner[direction, direction] += spread * spread
-    lower: FloatArray = np.linalg.cholesky(inner).astype(np.float64)
-    return lower
+    return np.linalg.cholesky(inner).astype(np.float64)
 
 
 @kernel
@@ -272,14 +268,9 @@ def residual_of(
             for first in range(3):
                 product[first, axis] += cloud[number, first] * there
     root = _largest_root(product.ravel(), False, bound, _EXACT)
-    w, x, y, z = _largest_eigenvector(_quaternion_matrix(product), root)
-    rotation = np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
+    w, x, y, z = _largest_eigenvector(horn_matrix(product), root)
+    rotation = np.empty((3, 3))
+    write_quaternion_matrix(rotation, w, x, y, z)
     residual = np.empty_like(cloud)
     for number in range(len(cloud)):
         for axis in range(3):
@@ -288,23 +279,6 @@ def residual_of(
                 turned += rotation[axis, first] * cloud[number, first]
             residual[number, axis] = turned - mean[labels[number], axis] + center[axis]
     return residual
-
-
-@kernel
-def _quaternion_matrix(p: Float[np.ndarray, "3 3"]) -> FloatArray:
-    """Horn's matrix (4, 4) of a sum of outer products: its first eigenvector is the best rotation."""
-    k = np.empty((4, 4))
-    k[0, 0] = p[0, 0] + p[1, 1] + p[2, 2]
-    k[1, 1] = p[0, 0] - p[1, 1] - p[2, 2]
-    k[2, 2] = p[1, 1] - p[0, 0] - p[2, 2]
-    k[3, 3] = p[2, 2] - p[0, 0] - p[1, 1]
-    k[0, 1] = k[1, 0] = p[1, 2] - p[2, 1]
-    k[0, 2] = k[2, 0] = p[2, 0] - p[0, 2]
-    k[0, 3] = k[3, 0] = p[0, 1] - p[1, 0]
-    k[1, 2] = k[2, 1] = p[0, 1] + p[1, 0]
-    k[1, 3] = k[3, 1] = p[0, 2] + p[2, 0]
-    k[2, 3] = k[3, 2] = p[1, 2] + p[2, 1]
-    return k
 
 
 @kernel

@@ -91,8 +91,7 @@ def _nearest(flat: Float[np.ndarray, "T D"], centers: Float[np.ndarray, "K D"]) 
         (offsets - 2.0 * flat[first : first + _CHUNK] @ centers.T).argmin(axis=1)
         for first in range(0, len(flat), _CHUNK)
     ]
-    nearest: NDArray[np.int64] = np.concatenate(parts)
-    return nearest
+    return np.concatenate(parts)
 
 
 def _moments(

@@ -68,11 +68,7 @@ def write_report(
 
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
-    """Lengths of the gaps in a continuous take, beside published figures of real finger markers.
-
-    Raises:
-        DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
-    """
+    """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
     if present.ndim != 2 or not present.size or present.dtype != np.bool_:
         raise DatasetError(
             f"present is {present.dtype} of shape {present.shape}, expected bool (frames, markers)"
@@ -113,24 +109,19 @@ def angle_shares(rows: Shaped[np.ndarray, "T"], bins: int = ANGLE_BINS) -> Float
     angles = np.rad2deg(rows["qpos"][:, 7:].astype(np.float64))
     index = np.floor((angles - _LOW) / (_HIGH - _LOW) * bins).astype(np.int64).clip(0, bins - 1)
     counts = np.stack([np.bincount(index[:, joint], minlength=bins) for joint in range(len(JOINTS))])
-    shares: NDArray[np.float64] = counts / len(rows)
-    return shares
+    return counts / len(rows)
 
 
 def camera_shares(rows: Shaped[np.ndarray, "T"], num_cameras: int) -> Float[np.ndarray, "M C+1"]:
     """Share of frames in which exactly 0, 1, ... cameras see each marker."""
     counts = np.bitwise_count(rows["cameras"])
-    shares: NDArray[np.float64] = np.stack(
-        [(counts == n).mean(axis=0) for n in range(num_cameras + 1)], axis=1
-    )
-    return shares
+    return np.stack([(counts == n).mean(axis=0) for n in range(num_cameras + 1)], axis=1)
 
 
 def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
     """Frames with 0, 1, ... ghosts."""
     here = np.isfinite(rows["ghosts"][..., 0])
-    counts: NDArray[np.int64] = np.bincount(here.sum(axis=1), minlength=here.shape[1] + 1)
-    return counts
+    return np.bincount(here.sum(axis=1), minlength=here.shape[1] + 1)
 
 
 def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:

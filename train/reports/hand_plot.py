@@ -148,10 +148,7 @@ def arrow_curve(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDAr
     aside = _BEND * (second - first)[::-1] * (1.0, -1.0)
     middle = (first + second) / 2.0 + aside
     along = np.linspace(0.1, 0.9, 15)[:, None]
-    curve: NDArray[np.float64] = (
-        (1 - along) ** 2 * first + 2 * along * (1 - along) * middle + along**2 * second
-    )
-    return curve
+    return (1 - along) ** 2 * first + 2 * along * (1 - along) * middle + along**2 * second
 
 
 def place_names(

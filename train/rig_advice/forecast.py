@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
@@ -234,8 +233,7 @@ def covariances(
         moved = across @ camera.T_world_camera[:3, :2] @ tangents * (local[:, 2] * noise)[:, None, None]
         shifts += moved @ moved.transpose(0, 2, 1)
     inverse = np.linalg.inv(total)
-    spread: NDArray[np.float64] = inverse @ shifts @ inverse
-    return spread
+    return inverse @ shifts @ inverse
 
 
 def ellipsoid(spread: Float[np.ndarray, "N 3 3"]) -> ErrorEllipsoid:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt64
+from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
@@ -157,7 +157,10 @@ class Planning:
         values /= views.num_marker_frames
         told = views.told[:, list(chosen)].sum(axis=1)[:, None]
         values -= _ERROR * _mean_error(told + views.told)
-        values[self._crowded(chosen)] = -np.inf
+        crowded = np.zeros(len(self._positions), dtype=bool)
+        for camera in chosen:
+            crowded |= np.linalg.norm(self._positions - self._positions[camera], axis=1) < _APART
+        values[crowded] = -np.inf
         return values
 
     def _planes(self, chosen: Sequence[int]) -> list[NDArray[np.uint64]]:
@@ -168,12 +171,6 @@ class Planning:
                 planes[level] |= planes[level - 1] & self._views.bits[camera]
             planes[0] |= self._views.bits[camera]
         return planes
-
-    def _crowded(self, chosen: Sequence[int]) -> Bool[np.ndarray, "K"]:
-        crowded = np.zeros(len(self._positions), dtype=bool)
-        for camera in chosen:
-            crowded |= np.linalg.norm(self._positions - self._positions[camera], axis=1) < _APART
-        return crowded
 
 
 def _mean_error(told: Float[np.ndarray, "6 K S"]) -> NDArray[np.float64]:

@@ -29,8 +29,7 @@ def working_point(rig: CameraRig) -> NDArray[np.float64]:
     total = across.sum(axis=0)
     if np.linalg.cond(total) > 1e6:
         return np.array(ROOM_CENTER)
-    point: NDArray[np.float64] = np.linalg.solve(total, np.einsum("cij,cj->i", across, rig.positions))
-    return point
+    return np.linalg.solve(total, np.einsum("cij,cj->i", across, rig.positions))
 
 
 def cube_points(

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from typing import Final, cast
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 
+from gloves.captures.capture import runs_of
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
@@ -107,7 +108,8 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
     fits = [hand if layout is None else attach(layout, hand.model) for hand in take.hands]
     whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames
-    for stretch in _stretches(whole):
+    for first, last in runs_of(whole):
+        stretch = slice(first, last + 1)
         part = slice(stretch.start, min(stretch.stop, stretch.start + left))
         if part.stop - part.start >= _FEWEST:
             left -= part.stop - part.start
@@ -137,12 +139,6 @@ def _scene(take: Take, fits: list[GloveFit], part: slice) -> SceneMotion:
         if held is None and thing is not None and np.isfinite(poses).all():
             held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
     return SceneMotion(hands, held, take.rate)
-
-
-def _stretches(flags: Bool[np.ndarray, "T"]) -> list[slice]:
-    steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
-    begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
-    return [slice(int(begin), int(end)) for begin, end in zip(begins, ends, strict=True)]
 
 
 def _walk(

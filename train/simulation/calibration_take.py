@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, GloveFit
 from gloves.takes.take import Take
+from handsim._checks import check_count
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
@@ -50,8 +51,7 @@ class CalibrationTakeConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.free < np.inf:
             raise ArgumentError(f"free is {self.free:g} s, expected a positive time")
-        if self.rounds < 0:
-            raise ArgumentError(f"rounds is {self.rounds}, expected 0 or more")
+        check_count("rounds", self.rounds, 0)
 
 
 def simulate_calibration(

@@ -9,7 +9,7 @@ from pathlib import Path
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GhostConfig
 from gloves.optics.reconstruction import OpticsConfig
-from handsim._checks import check_number, check_span, check_type, fill_settings
+from handsim._checks import check_count, check_number, check_span, check_type, fill_settings
 from handsim.errors import DatasetError
 from handsim.hand.shape import Population
 from handsim.space.cameras import CameraRig, list_rigs
@@ -63,14 +63,10 @@ class DatasetConfig:
         check_type("rig", self.rig, (CameraRig, str, Path), wanted, list_rigs())
         if self.sampler is not None:
             checked_sampler(self.sampler)
-        for name in ("num_frames", "seed", "min_cameras", "frames_per_hand"):
-            check_type(name, getattr(self, name), int, "a whole number")
         fill_settings(self)
         for name in ("num_frames", "min_cameras", "frames_per_hand"):
-            if getattr(self, name) < 1:
-                raise DatasetError(f"{name} is {getattr(self, name)}, expected at least 1")
-        if self.seed < 0:
-            raise DatasetError(f"seed is {self.seed}, expected 0 or more")
+            check_count(name, getattr(self, name), 1, error=DatasetError)
+        check_count("seed", self.seed, 0, error=DatasetError)
         check_number("slip_along", self.slip_along, 0.0, 1.0)
         check_number("slip_around", self.slip_around, 0.0, 90.0)
         check_number("volume", self.volume, 0.0, 10.0)

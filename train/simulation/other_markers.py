@@ -16,7 +16,6 @@ from train.simulation.motion import SceneMotion
 
 MOST_OTHERS: Final = 60
 """Markers of others at most."""
-_FOREARM: Final = 0.26  # [m]
 _STRAIGHT: Final = 0.6  # share of the hand's own direction in the forearm's
 _SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, to the side and above them
 _WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above

@@ -29,9 +29,6 @@ def sample_hands(
     """A random person's left and right hand, whose fingers do not overlap at rest.
 
     Those who were drawn again are counted in `redrawn`, by reason.
-
-    Raises:
-        ArgumentError: No hand of this population can rest.
     """
     for _ in range(_MAX_PEOPLE):
         shape = sample_shape(population, side=SIDES[0], rng=rng)

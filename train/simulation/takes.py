@@ -17,8 +17,8 @@ import numpy as np
 from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take
-from handsim._checks import check_type, fill_settings
-from handsim.errors import ArgumentError, LayoutError, PoseError, choices
+from handsim._checks import check_choice, check_count, check_type, fill_settings
+from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.topology import SIDES, Side
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
@@ -74,24 +74,16 @@ class TakeConfig:
         check_type("glove", self.glove, (MarkerLayout, str, Path), wanted, list_layouts())
         wanted = "a CameraRig, or the name or path of one"
         check_type("rig", self.rig, (CameraRig, str, Path), wanted, list_rigs())
-        check_type("seed", self.seed, int, "a whole number")
+        check_count("seed", self.seed, 0)
         if self.num_frames is not None:
-            check_type("num_frames", self.num_frames, int, "a whole number, or None for the kind's own")
+            check_count("num_frames", self.num_frames, 1)
+        check_count("others", self.others, 0, MOST_OTHERS)
         check_type("hands", self.hands, (str, tuple, list), "right, left or both", SIDES)
         object.__setattr__(self, "hands", (self.hands,) if isinstance(self.hands, str) else tuple(self.hands))
         fill_settings(self)
-        if self.kind not in SIMULATED_KINDS:
-            raise ArgumentError(choices(self.kind, SIMULATED_KINDS, noun="kind of capture"))
-        if self.num_frames is not None and self.num_frames < 1:
-            raise ArgumentError(f"num_frames is {self.num_frames}, expected at least 1")
-        check_type("others", self.others, int, "a whole number")
-        if not 0 <= self.others <= MOST_OTHERS:
-            raise ArgumentError(f"others is {self.others}, expected 0 to {MOST_OTHERS} markers")
-        if self.seed < 0:
-            raise ArgumentError(f"seed is {self.seed}, expected 0 or more")
+        check_choice(self.kind, SIMULATED_KINDS, noun="kind of capture")
         for side in self.hands:
-            if side not in SIDES:
-                raise ArgumentError(choices(side, SIDES, noun="hand"))
+            check_choice(side, SIDES, noun="hand")
         if set(self.hands) != set(BOTH) and (self.kind not in APART or len(self.hands) != 1):
             raise ArgumentError(
                 f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "

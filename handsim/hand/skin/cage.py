@@ -203,8 +203,7 @@ class CageHands(NamedTuple):
             start = knots[..., part, None]
             line = slopes[..., part, None] * (distances - start) + radii[..., part, None]
             between = np.where(distances >= start, line, between)
-        result: NDArray[np.float64] = np.where(distances >= knots[..., 3:], radii[..., 3:], between)
-        return result
+        return np.where(distances >= knots[..., 3:], radii[..., 3:], between)
 
     def _around(
         self, digits: slice, distances: NDArray[np.float64], offsets: NDArray[np.float64]

@@ -177,10 +177,9 @@ def vertex_normals(
         vertices: Positions in any frame [m].
         faces: Triangles, counter-clockwise from outside.
     """
-    normals: np.ndarray = _vertex_normals(
+    return _vertex_normals(
         np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64)
     )
-    return normals
 
 
 @kernel

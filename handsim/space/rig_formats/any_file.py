@@ -26,11 +26,12 @@ _Y_TO_Z: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 
 _LEVEL: Final = 0.3  # least share of the cameras' tops, on average, along the axis that points up
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")
-_READERS: Final[dict[str, Callable[[ET.Element], list[LabCamera | Skipped]]]] = {
-    vicon_xcp.ROOT: vicon_xcp.read_xcp,
-    qualisys_calibration.ROOT: qualisys_calibration.read_qualisys,
-    motive_mcal.ROOT: motive_mcal.read_mcal,
+_READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
+    vicon_xcp.ROOT: ("Camera", vicon_xcp.read_camera),
+    qualisys_calibration.ROOT: ("camera", qualisys_calibration.read_camera),
+    motive_mcal.ROOT: ("Camera", motive_mcal.read_camera),
 }
+"""Of the element that a calibration begins with: those of its cameras, and what reads one."""
 _CLOSED: Final = {
     ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
     "from there as .mcal",
@@ -88,11 +89,7 @@ def _tell(sentence: str) -> None:
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
-    """The cameras of a file as `load_cameras` gives them, with what the file says of each.
-
-    Raises:
-        RigError: As `load_cameras`.
-    """
+    """The cameras of a file as `load_cameras` gives them, with what the file says of each."""
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml":
         return _plain(checked_cameras(path, read_rig_file(path).cameras))
@@ -118,14 +115,15 @@ def _plain(cameras: Sequence[Camera]) -> tuple[LabCamera, ...]:
 def _of_xml(path: Path) -> tuple[LabCamera, ...]:
     root = read_xml(path)
     tags = [root.tag, *(entry.tag for entry in root)]  # QTM's server wraps its answer
-    reader = next((_READERS[tag] for tag in tags if tag in _READERS), None)
-    if reader is None:
+    known = next((tag for tag in tags if tag in _READERS), None)
+    if known is None:
         raise RigError(
             f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
             "Vicon's, Qualisys' or Motive's calibration"
         )
     try:
-        read = reader(root)
+        tag, read_camera = _READERS[known]
+        read = [read_camera(entry, number) for number, entry in enumerate(root.iter(tag), 1)]
     except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
     skipped = [one for one in read if isinstance(one, Skipped)]

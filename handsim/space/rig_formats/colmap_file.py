@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError, choices, shortened
 from handsim.files.inputs import read_bytes
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from handsim.space.rig_file import checked_cameras
+from handsim.space.rig_formats.lab_camera import brown_lens, rigid
 from handsim.space.transforms import quaternion_matrix
 
 CAMERAS: Final = "cameras.txt"
@@ -84,10 +83,8 @@ def _lens(path: Path, line: str) -> tuple[str, Camera]:
         )
     if model in _ONE_FOCAL:
         parameters.insert(0, parameters[0])
-    fx, fy, cx, cy, *bent = parameters
     try:
-        lens = _bent(model, bent)
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        K, lens = camera_matrix(*parameters[:4]), _bent(model, parameters[4:])
         return number, Camera(number, (int(width), int(height)), K, lens=lens)
     except HandSimError as error:
         raise RigError(f"{owner}: {error}") from error
@@ -96,14 +93,11 @@ def _lens(path: Path, line: str) -> tuple[str, Camera]:
 def _bent(model: str, bent: list[float]) -> Lens:
     if model.endswith("FISHEYE"):
         return Lens("fisheye", (*bent, 0.0, 0.0, 0.0)[:4])
-    if not any(bent):
-        return Lens()
     if model.endswith("RADIAL"):
-        k1, k2 = (*bent, 0.0)[:2]
-        return Lens("brown", (k1, k2, 0.0, 0.0, 0.0))
+        return brown_lens(*(*bent, 0.0)[:2], 0.0, 0.0, 0.0)
     if any(bent[5:]):
         raise RigError("k4, k5 or k6 of FULL_OPENCV is not 0, expected the model OPENCV")
-    return Lens("brown", (*bent, 0.0)[:5])
+    return brown_lens(*(*bent, *[0.0] * 5)[:5])
 
 
 def _image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
@@ -121,30 +115,19 @@ def _image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
         raise RigError(f"{owner}: a quaternion of length {length:.4g}, expected 1")
     if words[8] not in lenses:
         raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
-    T_camera_world = np.eye(4)
-    T_camera_world[:3, :3] = quaternion_matrix(pose[:4] / length)
-    T_camera_world[:3, 3] = pose[4:]
+    R_world_camera = quaternion_matrix(pose[:4] / length).T
     lens = lenses[words[8]]
     name = _NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
-    return Camera(name, lens.size, lens.K, _inverse(T_camera_world), lens.lens)
-
-
-def _inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
-    inverse = np.eye(4)
-    inverse[:3, :3] = transform[:3, :3].T
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse
+    return Camera(name, lens.size, lens.K, rigid(R_world_camera, -R_world_camera @ pose[4:]), lens.lens)
 
 
 def _numbers(owner: str, words: list[str]) -> list[float]:
-    def each() -> Iterator[float]:
-        for word in words:
-            try:
-                value = float(word)
-            except ValueError:
-                value = np.nan
-            if not abs(value) < 1e9:
-                raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
-            yield value
-
-    return list(each())
+    values = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            values.append(np.nan)
+        if not abs(values[-1]) < 1e9:
+            raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
+    return values

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from handsim.errors import RigError
 from handsim.files.toml_values import shown
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, camera_matrix
+from handsim.space.lens import Lens
 
 _LARGEST: Final = 1e9  # in any unit
 _SKEWED: Final = 1e-3  # of a rotation in a file of few digits
@@ -40,11 +41,7 @@ class Skipped(NamedTuple):
 
 
 def attribute_numbers(element: ET.Element, key: str, count: int, owner: str) -> tuple[float, ...]:
-    """The numbers of an attribute, parted by spaces.
-
-    Raises:
-        RigError: The attribute is missing, or is not `count` finite numbers.
-    """
+    """The numbers of an attribute, parted by spaces."""
     text = element.get(key)
     if text is None:
         raise RigError(f"{owner} lacks {key}")
@@ -82,37 +79,25 @@ def child(element: ET.Element, tag: str, owner: str) -> ET.Element:
 
 
 def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
-    """Width and height [px].
-
-    Raises:
-        RigError: They are no whole numbers of at least one pixel; `Camera` checks the rest.
-    """
+    """Width and height [px]."""
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise RigError(f"{owner}: the picture is {width:g} x {height:g}, expected whole numbers of pixels")
     return int(width), int(height)
 
 
-def camera_matrix(
+def checked_matrix(
     owner: str, focal: tuple[float, float], center: tuple[float, float]
 ) -> Float[np.ndarray, "3 3"]:
-    """K of focal lengths and a principal point [px].
-
-    Raises:
-        RigError: A focal length is not positive.
-    """
+    """K of focal lengths and a principal point [px]."""
     if not min(focal) > 0.0:
         raise RigError(
             f"{owner}: the focal lengths are {focal[0]:g} and {focal[1]:g}, expected positive pixels"
         )
-    return np.array([[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]])
+    return camera_matrix(*focal, *center)
 
 
 def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
-    """The rotation (3, 3) that a matrix of few digits stands for.
-
-    Raises:
-        RigError: It is a mirror image, or farther from a rotation than its digits explain.
-    """
+    """The rotation (3, 3) that a matrix of few digits stands for."""
     left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     rotation: NDArray[np.float64] = left @ right
     if np.abs(stretch - 1.0).max() > _SKEWED or np.linalg.det(rotation) < 0.0:
@@ -127,6 +112,11 @@ def rigid(
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = rotation, position
     return transform
+
+
+def brown_lens(*coefficients: float) -> Lens:
+    """OpenCV's lens of k1, k2, p1, p2 and k3; a pinhole where all are zero."""
+    return Lens("brown", coefficients) if any(coefficients) else Lens()
 
 
 def camera_names(given: Sequence[str]) -> list[str]:

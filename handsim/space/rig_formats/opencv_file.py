@@ -22,7 +22,7 @@ from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from handsim.space.rig_file import checked_cameras
-from handsim.space.rig_formats.lab_camera import camera_names, nearest_rotation, rigid
+from handsim.space.rig_formats.lab_camera import brown_lens, camera_names, nearest_rotation, rigid
 from handsim.space.transforms import quaternion_matrix, vector_quaternions
 
 _MOST_BYTES: Final = 1 << 24
@@ -62,9 +62,6 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
 
     The file is a `.yml`, `.yaml` or `.json`. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
     sample writes them, and of `intri.yml` and `extri.yml`, it is either; the other is read too.
-
-    Raises:
-        RigError: It cannot be read, something is missing, or a lens is of a kind that we do not have.
     """
     values, sections = _read(path)
     other = path.with_stem(_PAIRS.get(path.stem, path.stem))
@@ -176,11 +173,9 @@ def _lens(values: Values, names: tuple[str, ...]) -> Lens:
             f"{found} has {len(given)} coefficients, of which those after the fifth are not 0, expected the "
             "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like"
         )
-    if not any(given):
-        return Lens()
-    if len(given) < 4:
+    if any(given) and len(given) < 4:
         raise RigError(f"{found} has {len(given)} coefficients, expected 4 or 5: k1, k2, p1, p2, k3")
-    return Lens("brown", (*given, 0.0)[:5])
+    return brown_lens(*(*given, *[0.0] * 5)[:5])
 
 
 def _size(values: Values) -> tuple[int, int]:
@@ -288,14 +283,11 @@ def _yaml_tables(text: str) -> tuple[Values, Sections]:
     sections: Sections = {}
     for name, body in _yaml_bodies(text):
         if _SECTION.search(body):
-            sections[name] = dict(_yaml_entries(textwrap.dedent(body.strip("\n"))))
+            inner = _yaml_bodies(textwrap.dedent(body.strip("\n")))
+            sections[name] = {key: _yaml_value(value) for key, value in inner}
         else:
             values[name] = _yaml_value(body)
     return values, sections
-
-
-def _yaml_entries(text: str) -> Iterator[tuple[str, tuple[float, ...] | str]]:
-    return ((name, _yaml_value(body)) for name, body in _yaml_bodies(text))
 
 
 def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:

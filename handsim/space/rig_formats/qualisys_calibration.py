@@ -19,7 +19,8 @@ from handsim.space.rig_formats.lab_camera import (
     LabCamera,
     Skipped,
     attribute_number,
-    camera_matrix,
+    brown_lens,
+    checked_matrix,
     child,
     nearest_rotation,
     picture_size,
@@ -33,16 +34,8 @@ _SIDES: Final = ("left", "top", "right", "bottom")
 _TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
 
 
-def read_qualisys(root: ET.Element) -> list[LabCamera | Skipped]:
-    """The cameras of a `calibration` element.
-
-    Raises:
-        RigError: A value is missing or cannot be.
-    """
-    return [_camera(entry, number) for number, entry in enumerate(root.iter("camera"), 1)]
-
-
-def _camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+def read_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+    """The camera of an element; a `RigError` where a value is missing or cannot be."""
     serial = entry.get("serial") or str(number)
     owner = f"camera {shown(serial)}"
     if entry.get("active", "1").lower() in ("0", "false"):
@@ -56,7 +49,7 @@ def _camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     scale = 1.0 / (_PARTS * _binning(entry, view, inner, owner))
     u, v = (attribute_number(inner, f"centerPoint{axis}", owner) * scale for axis in "UV")
     focal = tuple(attribute_number(inner, f"focalLength{axis}", owner) * scale for axis in "UV")
-    K = camera_matrix(owner, (focal[0], focal[1]), (u - left, v - top))
+    K = checked_matrix(owner, (focal[0], focal[1]), (u - left, v - top))
     place = child(entry, "transform", owner)
     rows = [[attribute_number(place, f"r{i}{j}", owner) for j in (1, 2, 3)] for i in (1, 2, 3)]
     axes = nearest_rotation(f"{owner}: the matrix r11 to r33", np.array(rows))
@@ -91,4 +84,4 @@ def _binning(entry: ET.Element, view: str, inner: ET.Element, owner: str) -> int
 def _lens(inner: ET.Element, owner: str) -> Lens:
     k1, k2, k3 = (attribute_number(inner, f"radialDistortion{n}", owner, 0.0) for n in (1, 2, 3))
     p1, p2 = (attribute_number(inner, f"tangentalDistortion{n}", owner, 0.0) for n in (1, 2))
-    return Lens("brown", (k1, k2, p1, p2, k3)) if any((k1, k2, k3, p1, p2)) else Lens()
+    return brown_lens(k1, k2, p1, p2, k3)

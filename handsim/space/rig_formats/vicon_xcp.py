@@ -23,7 +23,7 @@ from handsim.space.rig_formats.lab_camera import (
     Skipped,
     attribute_number,
     attribute_numbers,
-    camera_matrix,
+    checked_matrix,
     picture_size,
     rigid,
 )
@@ -36,16 +36,8 @@ _SAMPLES: Final = 256
 _VIDEO: Final = ("vue", "videoinputdevice")
 
 
-def read_xcp(root: ET.Element) -> list[LabCamera | Skipped]:
-    """The cameras of a `Cameras` element.
-
-    Raises:
-        RigError: A value is missing or cannot be.
-    """
-    return [_camera(entry, number) for number, entry in enumerate(root.iter("Camera"), 1)]
-
-
-def _camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+def read_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+    """The camera of an element; a `RigError` where a value is missing or cannot be."""
     device = entry.get("DEVICEID") or entry.get("USERID") or str(number)
     owner = f"camera {shown(device)}"
     frames = entry.findall("KeyFrames/KeyFrame")
@@ -61,7 +53,7 @@ def _camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     if not aspect > 0.0:
         raise RigError(f"{owner}: PIXEL_ASPECT_RATIO is {aspect:g}, expected a positive number")
     center = attribute_numbers(frame, "PRINCIPAL_POINT", 2, owner)
-    K = camera_matrix(owner, (focal, focal / aspect), (center[0], center[1]))
+    K = checked_matrix(owner, (focal, focal / aspect), (center[0], center[1]))
     kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
     video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
     camera = Camera(device, size, K, _pose(frame, owner), _lens(frame, owner, size, K))

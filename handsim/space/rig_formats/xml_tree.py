@@ -28,12 +28,7 @@ class _Refused(Exception):
 
 
 def read_xml(path: Path) -> ET.Element:
-    """The root of an XML file in UTF-8, UTF-16 or Latin-1.
-
-    Raises:
-        RigError: It cannot be read, is no XML, has a document type (entities may grow without bounds), or
-            has too many elements.
-    """
+    """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
     text = _decoded(path, read_bytes(path, error=RigError, most=_MOST_BYTES))
     try:
         return _parsed(text)

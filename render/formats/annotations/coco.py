@@ -8,7 +8,7 @@ axes [m], its pose, its shape and its skin.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -45,6 +45,9 @@ CATEGORY: Final[dict[str, Any]] = {
 def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
     """The picture and its hands, still without COCO's numbers."""
     camera = frame.camera
+    K = camera.K.copy()
+    K[:2, 2] -= CENTER
+    rows: list[list[float]] = K.tolist()
     image = {
         "file_name": file_name,
         "width": camera.size[0],
@@ -52,7 +55,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
         "frame": frame.number,
         "time": frame.time,
         "camera": camera.name,
-        "K": _centered(camera),
+        "K": rows,
         "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
         "T_world_camera": camera.T_world_camera.tolist(),
         "choices": frame.choices,
@@ -91,16 +94,14 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
     }
     looks = frame.choices.get("people", ())
     if number < len(looks):
-        record["look"], record["skin_tone"] = looks[number], _skin_tone(looks[number]["skin"])
+        angle = SkinLook(**looks[number]["skin"]).typology_angle
+        record["look"], record["skin_tone"] = (
+            looks[number],
+            {"class": tone_name(angle), "typology_angle": round(angle, 3)},
+        )
     if mask is not None:
         record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
     return record
-
-
-def _skin_tone(skin: Mapping[str, Any]) -> dict[str, Any]:
-    """The class of a person's skin, and its individual typology angle [deg]."""
-    angle = SkinLook(**skin).typology_angle
-    return {"class": tone_name(angle), "typology_angle": round(angle, 3)}
 
 
 def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
@@ -109,10 +110,3 @@ def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
     pixels = np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0)
     rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
     return [value for (u, v), flag in rows for value in (u, v, flag)], int((flags > 0).sum())
-
-
-def _centered(camera: Camera) -> list[list[float]]:
-    K = camera.K.copy()
-    K[:2, 2] -= CENTER
-    rows: list[list[float]] = K.tolist()
-    return rows

@@ -28,11 +28,7 @@ CENTER: Final = 0.5
 
 
 def centered_K(camera: Camera) -> NDArray[np.float64]:
-    """Camera matrix for pixels that are counted from the first one's center.
-
-    Raises:
-        HandSimError: The camera's lens is not a pinhole, so that no matrix projects points.
-    """
+    """Camera matrix for pixels that are counted from the first one's center."""
     if camera.lens.kind != "pinhole":
         raise HandSimError(
             f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
@@ -64,8 +60,7 @@ def is_seen(hand: HandTruth) -> bool:
 def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Int[np.ndarray, "21"]:
     """COCO's flags of keypoints in a picture of this size [px]: 0 outside it, 1 hidden, 2 seen."""
     inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # never so for NaN
-    flags: NDArray[np.intp] = np.where(inside, np.where(hand.visible, 2, 1), 0)
-    return flags
+    return np.where(inside, np.where(hand.visible, 2, 1), 0)
 
 
 def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:
@@ -90,11 +85,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
 
 
 def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
-    """The frame's hands by their sides.
-
-    Raises:
-        HandSimError: Two are of the same side.
-    """
+    """The frame's hands by their sides."""
     hands = {hand.shape.side: hand for hand in frame.hands}
     if len(hands) < len(frame.hands):
         sides = " and ".join(hand.shape.side for hand in frame.hands)

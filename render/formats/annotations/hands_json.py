@@ -84,7 +84,9 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     streams = [(frame.camera.name, by_side(frame)) for frame in frames]
     record: dict[str, Any] = {"left": None, "right": None}
     for side, hand in streams[0][1].items():
-        wrist = umetrack_wrist(_wrist(hand))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = quaternion_matrix(hand.qpos[3:7]), hand.qpos[:3]
+        wrist = umetrack_wrist(pose)
         record[side] = {
             "umetrack_pose": {
                 "joint_angles": hand.qpos[7:].tolist(),
@@ -160,12 +162,6 @@ def _truth(hand: HandTruth) -> dict[str, Any]:
         "qpos": hand.qpos.tolist(),
         "shape": shape_record(hand.shape),
     }
-
-
-def _wrist(hand: HandTruth) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = quaternion_matrix(hand.qpos[3:7]), hand.qpos[:3]
-    return pose
 
 
 def umetrack_wrist(T_world_wrist: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

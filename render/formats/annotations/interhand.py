@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handsim.errors import DatasetError
 from handsim.hand.topology import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from handsim.space.camera import Camera
+from render.formats.annotations import coco
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
 from render.frames import HandTruth, RenderedFrame
@@ -94,23 +95,18 @@ def numbered(
     records: Iterable[dict[str, Any]], cameras: Cameras
 ) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
     """Images and their annotations with COCO's numbers; annotations are of pictures, not of hands."""
-    annotation_id = 0
-    for image_id, record in enumerate(records, start=1):
-        names = {"camera": cameras.numeral(record), "camera_name": record["camera_name"]}
-        image = {"id": image_id, **names, **record["image"]}
-        annotations = []
-        if record["annotation"] is not None:
-            annotation_id += 1
-            annotations = [{"id": annotation_id, "image_id": image_id, **record["annotation"]}]
-        yield image, annotations
+
+    def with_cameras() -> Iterator[dict[str, Any]]:
+        for record in records:
+            names = {"camera": cameras.numeral(record), "camera_name": record["camera_name"]}
+            annotations = [] if record["annotation"] is None else [record["annotation"]]
+            yield {"image": names | record["image"], "annotations": annotations}
+
+    return coco.numbered(with_cameras())
 
 
 def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Joints of every frame number, however many cameras saw it.
-
-    Raises:
-        DatasetError: Frames of one number have different joints, which this format cannot hold.
-    """
+    """Joints of every frame number, however many cameras saw it."""
     known: dict[int, int] = {}
     for record in records:
         number, joints = record["image"]["frame_idx"], record["joints"]

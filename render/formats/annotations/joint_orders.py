@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError, choices
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_KEYPOINTS
 
 ABSENT: Final = -1
@@ -63,13 +64,8 @@ JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
 
 
 def joint_order(name: str) -> tuple[int, ...]:
-    """One of `JOINT_ORDERS`.
-
-    Raises:
-        ArgumentError: The order is unknown.
-    """
-    if name not in JOINT_ORDERS:
-        raise ArgumentError(choices(name, JOINT_ORDERS, noun="joint order"))
+    """One of `JOINT_ORDERS`."""
+    check_choice(name, JOINT_ORDERS, noun="joint order")
     return JOINT_ORDERS[name]
 
 
@@ -81,8 +77,7 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
     """
     order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
     nowhere = np.full_like(points[..., :1, :], np.nan)
-    ordered: NDArray[np.floating] = np.concatenate([points, nowhere], axis=-2)[..., order, :]
-    return ordered
+    return np.concatenate([points, nowhere], axis=-2)[..., order, :]
 
 
 def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:

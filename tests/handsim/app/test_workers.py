@@ -112,8 +112,8 @@ def test_a_block_that_raises_ends_workers_at_once(tmp_path):
 
 def test_the_number_of_workers():
     assert check_workers(None) == usable_cores() and check_workers(3) == 3
-    for wrong in (0, -3, "many"):
-        with pytest.raises(ArgumentError, match=f"workers is {wrong!r}, expected at least 1"):
+    for wrong, expected in ((0, "at least 1"), (-3, "at least 1"), ("many", "a whole number")):
+        with pytest.raises(ArgumentError, match=f"workers is {wrong!r}, expected {expected}"):
             check_workers(wrong)
 
 

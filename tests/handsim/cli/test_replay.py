@@ -16,8 +16,8 @@ import pytest
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from tests.waiting import LONG
+from track.network_address import LOOPBACK
 from track.streams.live_stream import LiveStream
-from track.streams.natnet_server import LOOPBACK
 from track.streams.point_stream import open_stream
 
 RUN = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
+from handsim.files.json_files import package_data
 from handsim.hand.contact import overlap_between
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import random_quaternions
 from poses.contact.contact_closing import close_fingers, first_contact, smooth_above, smooth_below
-from poses.contact.interactions import library
 from poses.contact.passages import MAX_ACCELERATION, MAX_SPEED
 from poses.contact.two_hands import (
     INTERACTIONS,
@@ -188,7 +188,9 @@ def test_hands_are_brought_together_from_the_free_side(rng):
 
 def test_fingers_close_until_they_meet_something():
     right, left = hands()
-    flat = np.deg2rad(np.array(library()["hands"]["clap"], dtype=float).reshape(1, 20))
+    flat = np.deg2rad(
+        np.array(package_data("poses", "interactions")["hands"]["clap"], dtype=float).reshape(1, 20)
+    )
     opened, closed = join_qpos(flat), flat.copy()
     closed[:, 5::4] += 0.6
     far = join_qpos(flat, position=np.array([[0.0, 0.0, 1.0]]))
@@ -223,13 +225,13 @@ def test_same_seed_same_motion():
 
 def test_the_data_file_names_what_exists():
     assert set(INTERACTIONS) == {"clasp", "clap", "rub", "point_at_palm", "interlace"}
-    known = set(gesture_names()) | set(library()["hands"])
-    for variants in library()["interactions"].values():
+    known = set(gesture_names()) | set(package_data("poses", "interactions")["hands"])
+    for variants in package_data("poses", "interactions")["interactions"].values():
         for variant in variants:
             assert {
                 variant[role][state] for role in ("still", "moving") for state in ("open", "closed")
             } <= known
-    assert not set(gesture_names()) & set(library()["hands"])
+    assert not set(gesture_names()) & set(package_data("poses", "interactions")["hands"])
 
 
 def test_bad_input_is_told(rng):
