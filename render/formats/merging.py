@@ -53,29 +53,29 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
         DatasetError: A shard is damaged.
     """
     check_type("folders", folders, (list, tuple), "paths of folders")
-    folders, out = [Path(folder) for folder in folders], Path(out)
-    settings = [_settings(folder) for folder in folders]
+    parts, out = [Path(folder) for folder in folders], Path(out)
+    settings = [_settings(folder) for folder in parts]
     formats = settings[0]["formats"]
-    for folder, one in zip(folders, settings, strict=True):
+    for folder, one in zip(parts, settings, strict=True):
         if one["formats"] != formats:
             raise HandSimError(
                 f"{folder} has the formats {', '.join(one['formats'])}, expected {', '.join(formats)} as in "
-                f"{folders[0]}"
+                f"{parts[0]}"
             )
     for name in formats:
         if name not in _MERGEABLE:
             raise HandSimError(
                 f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
             )
-    if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
-        raise HandSimError("expected two or more different folders to merge")
+    if len(parts) < 2 or len({folder.resolve() for folder in parts}) < len(parts):
+        raise HandSimError("expected two or more different parts to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
-    needed = sum(file.stat().st_size for one in folders for file in one.rglob("*") if file.is_file())
+    needed = sum(file.stat().st_size for one in parts for file in one.rglob("*") if file.is_file())
     check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
     count = 0
     for name in formats:
-        count = _merge_format(name, folders, [one["frames"] for one in settings], formats, out)
+        count = _merge_format(name, parts, [one["frames"] for one in settings], formats, out)
         open_writer(name, format_folder(out, formats, name)).finish()
     frames = sum(one["frames"] for one in settings)
     save_json(out / CONFIG, {"formats": formats, "frames": frames, "merged": settings})
