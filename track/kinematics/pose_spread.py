@@ -44,9 +44,9 @@ _CALIBRATED_KNUCKLE: Final = 0.15  # times the noise
 _CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg]; abduction hardly tells where a digit points
 _CALIBRATED_THUMB: Final = 1.6  # times the fingers' directions
 _CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] times the noise
-_CALIBRATED_WRIST: Final = 0.0005  # [m]
-_CALIBRATED_JOINTS: Final = (0.00013, 0.00045)  # [m]
-_SINGLE: Final = 4.0  # times these, of a digit with one marker
+_CALIBRATED_WRIST: Final = 0.0007  # [m]
+_CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m], tips last
+_SINGLE: Final = (7.0, 3.0)  # times these, of a digit with one marker
 _LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
 _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
 _CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
@@ -145,9 +145,9 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """
     before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
-    places = np.where(single, 0.5 * _MEASURED.place, _CALIBRATED_PLACE * noise * few)
+    places = np.where(single, 0.6 * _MEASURED.place, _CALIBRATED_PLACE * noise * few)
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
-    turns[0] *= _CALIBRATED_THUMB
+    turns[0] *= _CALIBRATED_THUMB * few[0]  # few markers tell even less of where a thumb points
     return HandDoubt(
         noise,
         _CALIBRATED_SIZE * noise,
@@ -156,7 +156,7 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
         np.where(single[:, None], 0.5 * before.directions, turns),
         np.where(single[:, None], 0.5 * before.bones, lengths),
         _CALIBRATED_WRIST,
-        np.outer(np.where(single, _SINGLE, few), _CALIBRATED_JOINTS),
+        np.where(single[:, None], _SINGLE, few[:, None]) * _CALIBRATED_JOINTS,
     )
 
 
