@@ -6,7 +6,8 @@
 Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands of
 the nearest size, with hands that are measured in it, and with hands that were calibrated in a capture of
 their own, whose labels are the truth's. Counted are the errors of all poses within one and within two
-standard deviations: of a normal distribution 68 and 95 %. A person's error is the same in all frames, so that single joints need many people.
+standard deviations: of a normal distribution 68 and 95 %. A person's error is the same in all frames, so that
+single joints need many people.
 """
 
 from __future__ import annotations
