@@ -3,10 +3,11 @@
     OMP_NUM_THREADS=1 python -m benchmarks.doubt [--gloves dense19 sparse13 starter10]
         [--seeds 0 1 2 3] [--frames 480] [--free 20] [--without-calibration]
 
-Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands that
-are measured in it, and with hands that were calibrated in a capture of their own, whose labels are the
-truth's. Counted are the errors of all poses within one and within two standard deviations: of a normal
-distribution 68 and 95 %. A person's error is the same in all frames, so that single joints need many people.
+Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands of
+the nearest size, with hands that are measured in it, and with hands that were calibrated in a capture of
+their own, whose labels are the truth's. Counted are the errors of all poses within one and within two
+standard deviations: of a normal distribution 68 and 95 %. A person's error is the same in all frames, so that
+single joints need many people.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.paper.take_evaluation import measured_users, nearest_size, seen_frame
+from benchmarks.paper.take_evaluation import measured_users, nearest_size, nominal_users, seen_frame
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.fit import GloveFit, nominal_fit
 from gloves.takes.take import Take, keypoints_of
 from handsim.hand.topology import JOINT_NAMES
 from track.calibration.user_calibration import calibrate_hand
+from track.setup import USUAL_SIZE
 from track.tracker import Tracker
 from track.user import MEASURED, User
 from train.glove_labeler import load_labeler
@@ -120,7 +122,10 @@ def main() -> None:
             kind = KINDS[seed % len(KINDS)]
             take = simulate_take(kind=kind, glove=glove, num_frames=arguments.frames, seed=seed)
             take = take.without_body()
-            users = {"measured": User(tuple(measured_users(take, load_labeler(glove))), f"{MEASURED}twin")}
+            users = {
+                "named": User(tuple(nominal_users(take)), USUAL_SIZE),  # the notes of hands of a size
+                "measured": User(tuple(measured_users(take, load_labeler(glove))), f"{MEASURED}twin"),
+            }
             if not arguments.without_calibration:
                 users["calibrated"] = calibrated_hands(take, glove, seed, arguments.free)
             for name, user in users.items():

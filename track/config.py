@@ -16,6 +16,8 @@ from handsim.hand.topology import Side
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]
 """Size of hands; auto is measured."""
+HandOrigin = Literal["named", "measured", "calibrated"]
+"""Where a hand is from: of a named size, with size and proportions measured, or calibrated."""
 BOTH: Final[tuple[Side, ...]] = ("right", "left")
 
 

@@ -17,7 +17,7 @@ from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.pose_solver import AnglePrior, PoseSolver
 from track.kinematics.pose_spread import SpreadModel
-from track.user import is_calibrated
+from track.user import hand_origin
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] of hinges that markers leave open, around the tracked ones
 _BAD_RMS: Final = 0.006  # [m] after which a fit from general poses is tried too
@@ -80,7 +80,7 @@ def _spreads(take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]) -
         unseen = (take.times[:, None] - last)[there]
         rms = take.rms[there, number]
         usual = float(np.sqrt(np.nanmean(rms**2))) if np.isfinite(rms).any() else np.nan
-        model = SpreadModel(hand, is_calibrated=is_calibrated(notes, hand.side))
+        model = SpreadModel(hand, hand_origin(notes, hand.side))
         angles[there, number], keypoints[there, number] = model.spreads(qpos[there, number], unseen, usual)
     return {"angle_spread": angles, "keypoint_spread": keypoints}
 

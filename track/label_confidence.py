@@ -16,7 +16,7 @@ from track.label_evidence import Evidence, evidence_of
 
 _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
-_UNLABELED: Final = (-7.07, 3.55, 6.40, 3.60, 5.50, 1.69, 0.32, 1.17)
+_UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 

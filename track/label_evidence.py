@@ -32,6 +32,7 @@ UNLABELED: Final = (
     "labels in its life",
     "a free marker within 10 mm",
     "a free marker within 30 mm",
+    "a free marker within 30 mm in a short life",
     "a point within 30 mm",
     "points beside it and a lost hand",
     "markers not seen",
@@ -61,7 +62,7 @@ class Evidence(NamedTuple):
     """Its label, or that of the nearest marker without a point."""
     labeled: Float[np.ndarray, "L 7"]
     """What is told of the points with a label, see `LABELED`."""
-    unlabeled: Float[np.ndarray, "U 7"]
+    unlabeled: Float[np.ndarray, "U 8"]
     """What is told of those without one, see `UNLABELED`."""
 
 
@@ -76,7 +77,7 @@ def evidence_of(take: Take) -> Evidence:
     starts = np.searchsorted(frames, np.arange(take.num_frames + 1))
     lives = _follow(points, take.ids[frames, columns].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
     own, others, length = _lives(lives, labels, count)
-    of_life = np.log1p(others / own)
+    of_life, short = np.log1p(others / own), np.log(_SHORT / np.minimum(length, _SHORT))
     which, free = np.flatnonzero(labels >= 0), np.flatnonzero(labels < 0)
     seen = labeled_markers(take.points, take.labels, range(count))
     residuals, markers = np.linalg.norm(seen - expected, axis=-1), labels.copy()
@@ -89,7 +90,7 @@ def evidence_of(take: Take) -> Evidence:
         of_life[which],
         np.log1p((length - own - others) / own)[which],
         off - 1.0,
-        np.log(off) * np.log(_SHORT / np.minimum(length, _SHORT))[which],
+        np.log(off) * short[which],
         *of_hand[which].T,
         _improbable(take, owners)[frame, label],
     ]
@@ -98,6 +99,7 @@ def evidence_of(take: Take) -> Evidence:
         of_life[free],
         np.exp(-near[0] / 0.01),
         np.exp(-near[0] / 0.03),
+        np.exp(-near[0] / 0.03) * short[free],
         np.exp(-near[1] / 0.03),
         np.log1p(near[2]) * is_lost,
         *of_hand[free].T,

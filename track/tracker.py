@@ -88,9 +88,7 @@ class Tracker:
         asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
         self._intake = Intake(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [
-            HandState(hand, config, is_calibrated=self.user.is_calibrated(hand.side)) for hand in self.hands
-        ]
+        self._states = [HandState(hand, config, origin=self.user.origin(hand.side)) for hand in self.hands]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)

@@ -23,7 +23,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import SIDES, Side
 from track.calibration.user_calibration import Calibration
-from track.config import Size
+from track.config import HandOrigin, Size
 
 SCHEMA: Final = 1
 MEASURED: Final = "auto, "
@@ -84,9 +84,13 @@ class User(Sequence[GloveFit]):
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)
 
+    def origin(self, side: Side) -> HandOrigin:
+        """Where the hand of a side is from: of a named size, measured, or calibrated."""
+        return hand_origin(self.notes, side)
+
     def is_calibrated(self, side: Side) -> bool:
         """Whether the hand of a side is the person's, not one of the same size."""
-        return is_calibrated(self.notes, side)
+        return self.origin(side) == "calibrated"
 
     def __str__(self) -> str:
         """Length and breadth of the hands [mm], one pair where both are alike."""
@@ -165,14 +169,15 @@ class User(Sequence[GloveFit]):
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def is_calibrated(notes: str, side: Side) -> bool:
-    """Whether the hand of a side, of a user with these notes, is the person's.
+def hand_origin(notes: str, side: Side) -> HandOrigin:
+    """Where the hand of a side is from, of a user with these notes.
 
-    A hand of a size, named or measured (auto), is not, nor one that a calibration left so.
+    A hand whose size could not be measured is of a usual one, and one that a calibration left so is measured.
     """
-    if notes.startswith(MEASURED) or notes in get_args(Size):
-        return False
-    return not any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
+    if notes.removeprefix(MEASURED) in get_args(Size):
+        return "named"
+    left = any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
+    return "measured" if left or notes.startswith(MEASURED) else "calibrated"
 
 
 def _left_as_measured(notes: str) -> list[str]:

@@ -68,7 +68,7 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
                 f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
             )
     if len(parts) < 2 or len({folder.resolve() for folder in parts}) < len(parts):
-        raise HandSimError("expected two or more different parts to merge")
+        raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HandSimError(f"{out} is not empty; name a new folder")
     needed = sum(file.stat().st_size for one in parts for file in one.rglob("*") if file.is_file())

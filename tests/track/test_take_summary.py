@@ -108,7 +108,7 @@ def test_doubtful_frames_are_listed_by_the_stored_confidence_where_there_are_no_
     confidence = np.where(np.isfinite(tracked.points[..., 0]), 0.99, np.nan)
     columns = np.flatnonzero((tracked.labels[4:7] >= 0).all(axis=0) & (tracked.labels[28] >= 0))[:2]
     confidence[4:7, columns[0]], confidence[5, columns[1]], confidence[28, columns[0]] = 0.5, 0.3, 0.1
-    confidence[11, columns[0]], confidence[34, columns[0]] = 0.55, 0.75
+    confidence[11, columns[0]], confidence[34, columns[0]] = 0.55, 0.9
     take = dataclasses.replace(
         tracked,
         rate=40.0,  # a frame around, and spans of less than ten frames from each other are one
@@ -120,7 +120,7 @@ def test_doubtful_frames_are_listed_by_the_stored_confidence_where_there_are_no_
     assert [doubt[:3] for doubt in doubts] == [(3, 12, 5), (27, 29, 28)], "more of the first is wrong"
     assert doubts[0].words == f"{take.label_names[take.labels[5, columns[1]]]} labeled, 30 %"
     assert doubts_of(take, most=1) == doubts[:1]
-    assert frame_confidence(take)[[5, 28, 34, 35]].tolist() == [0.3, 0.1, 0.75, 0.99]
+    assert frame_confidence(take)[[5, 28, 34, 35]].tolist() == [0.3, 0.1, 0.9, 0.99]
 
 
 def test_doubtful_frames_of_a_tracked_take(tracked):

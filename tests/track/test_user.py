@@ -52,8 +52,17 @@ def test_a_hand_that_a_calibration_left_as_measured_is_not_calibrated(hands, tmp
     for user in (load_user(tmp_path / "user.json"), as_user(tmp_path / "user.json")):
         assert not user.is_calibrated("left") and user.is_calibrated("right")
     assert as_user(tmp_path / "user.json").notes == f"user.json; {left}"
-    for notes, calibrated in (("", True), ("M", False), (f"{MEASURED}187 x 83 mm", False)):
-        assert User(hands, notes).is_calibrated("left") == calibrated
+    assert user.origin("left") == "measured"
+
+
+@pytest.mark.parametrize(
+    ("notes", "origin"),
+    [("", "calibrated"), ("M", "named"), (f"{MEASURED}187 x 83 mm", "measured"), (f"{MEASURED}M", "named")],
+)
+def test_notes_tell_where_hands_are_from(hands, notes, origin):
+    """A size that could not be measured is the usual one."""
+    user = User(hands, notes)
+    assert user.origin("left") == origin and user.is_calibrated("left") == (origin == "calibrated")
 
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):

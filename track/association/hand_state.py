@@ -21,7 +21,7 @@ from handsim.kernels.integration import move, velocity_of
 from handsim.kernels.kernel import kernel
 from track.association.assignment import peak_log_odds
 from track.association.digit_hypotheses import DigitModel, digit_ranges
-from track.config import TrackerConfig
+from track.config import HandOrigin, TrackerConfig
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
@@ -112,7 +112,7 @@ class HandState:
 
     Args:
         config: Noise of the markers, and density of strays.
-        is_calibrated: Whether it is the user's hand, not one of the same size.
+        origin: Where the hand is from.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class HandState:
         hand: GloveFit,
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
         *,
-        is_calibrated: bool = True,
+        origin: HandOrigin = "calibrated",
     ) -> None:
         self.hand = hand
         self.config = config
@@ -151,7 +151,7 @@ class HandState:
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.zeros(count)  # [s] of each marker
         self._last_label = np.full(count, -np.inf)  # [s] of each marker
-        self._spread_model = SpreadModel(hand, is_calibrated=is_calibrated)
+        self._spread_model = SpreadModel(hand, origin)
         self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(self.adapted)

@@ -14,8 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
+from handsim.hand.shape import ADULTS
 from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels.kernel import kernel
+from track.config import HandOrigin
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.levenberg_marquardt import MARKER_NOISE, invert_positive
 from track.kinematics.marker_kinematics import (
@@ -32,14 +34,6 @@ _DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
 _LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
 _NOISE_STEP: Final = 1e-5  # [m] in which noise is told apart
-# A hand of which size and proportions are measured, chosen on simulated people that benchmarks.doubt does not
-# try. What the fit of the proportions makes up for is not here: less than people differ by.
-_SIZE: Final = 0.001  # logarithm
-_PLACE: Final = 0.0017  # [m]
-_KNUCKLE: Final = 0.0003  # [m]
-_TURN: Final = 1.8  # [deg]
-_THUMB: Final = 4.0  # times the fingers' directions
-_BONES: Final = (0.01, 0.02)  # logarithms, of each bone and of all of a digit
 # A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
 _DETERMINED: Final = 3  # markers that determine a digit
 _FEW: Final = 1.4  # times the doubt of such a digit, of one with fewer
@@ -50,12 +44,39 @@ _CALIBRATED_KNUCKLE: Final = 0.15  # times the noise
 _CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg]; abduction hardly tells where a digit points
 _CALIBRATED_THUMB: Final = 1.6  # times the fingers' directions
 _CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] times the noise
-_CALIBRATED_WRIST: Final = 0.0005  # [m]
-_CALIBRATED_JOINTS: Final = (0.00013, 0.00045)  # [m]
-_SINGLE: Final = 4.0  # times these, of a digit with one marker
+_CALIBRATED_WRIST: Final = 0.0007  # [m]
+_CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m], tips last
+_SINGLE: Final = (7.0, 3.0)  # times these, of a digit with one marker
 _LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
 _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
 _CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
+
+
+class _Proportions(NamedTuple):
+    """How far a hand that is not calibrated is from its user's: standard deviations."""
+
+    size: float
+    """Logarithm."""
+    place: float
+    """Of a marker [m]."""
+    knuckle: float
+    """[m]"""
+    turn: float
+    """Of a finger's direction [deg]."""
+    thumb: float
+    """Times the fingers' directions."""
+    bones: tuple[float, float]
+    """Logarithms, of each bone and of all of a digit."""
+
+
+# Chosen on simulated people that benchmarks.doubt does not try. What the fit of the proportions makes up for
+# is not here: less than people differ by.
+_MEASURED: Final = _Proportions(0.001, 0.0014, 0.0003, 1.8, 4.0, (0.01, 0.02))
+# Of the nearest of five sizes: what people differ by, and half a step between sizes. Places are off by what
+# slips, and by what girths of digits and lengths of bones that are not the user's move.
+_NAMED: Final = _Proportions(
+    0.02, 0.003, ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0, (ADULTS.bone_spread, ADULTS.digit_spread)
+)
 
 
 class HandDoubt(NamedTuple):
@@ -92,16 +113,26 @@ def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
     Args:
         digits: Digit of each marker, -1 for the palm.
     """
+    return _doubt_of(digits, _MEASURED)
+
+
+def named_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
+    """Of a mean hand of the size nearest to the user's; arguments as `measured_doubt`."""
+    return _doubt_of(digits, _NAMED)
+
+
+def _doubt_of(digits: Int[np.ndarray, "M"], proportions: _Proportions) -> HandDoubt:
+    """Of a hand that is not calibrated."""
     count = len(DIGITS)
-    directions = np.full((count, 3), np.deg2rad(_TURN))
-    directions[0] *= _THUMB
+    directions = np.full((count, 3), np.deg2rad(proportions.turn))
+    directions[0] *= proportions.thumb
     return HandDoubt(
         MARKER_NOISE,
-        _SIZE,
-        np.full(len(digits), _PLACE),
-        np.full(count, _KNUCKLE),
+        proportions.size,
+        np.full(len(digits), proportions.place),
+        np.full(count, proportions.knuckle),
         directions,
-        np.tile(_BONES, (count, 1)),
+        np.tile(proportions.bones, (count, 1)),
         0.0,
         np.zeros((count, 2)),
     )
@@ -114,9 +145,9 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """
     before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
     single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
-    places = np.where(single, 0.5 * _PLACE, _CALIBRATED_PLACE * noise * few)
+    places = np.where(single, 0.6 * _MEASURED.place, _CALIBRATED_PLACE * noise * few)
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
-    turns[0] *= _CALIBRATED_THUMB
+    turns[0] *= _CALIBRATED_THUMB * few[0]  # few markers tell even less of where a thumb points
     return HandDoubt(
         noise,
         _CALIBRATED_SIZE * noise,
@@ -125,7 +156,7 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
         np.where(single[:, None], 0.5 * before.directions, turns),
         np.where(single[:, None], 0.5 * before.bones, lengths),
         _CALIBRATED_WRIST,
-        np.outer(np.where(single, _SINGLE, few), _CALIBRATED_JOINTS),
+        np.where(single[:, None], _SINGLE, few[:, None]) * _CALIBRATED_JOINTS,
     )
 
 
@@ -133,11 +164,11 @@ class SpreadModel:
     """Standard deviations of the poses of one hand.
 
     Args:
-        is_calibrated: Whether it is its user's; otherwise size and proportions are measured.
+        origin: Where it is from.
     """
 
-    def __init__(self, fit: GloveFit, *, is_calibrated: bool) -> None:
-        self._hand, self._tips, self._is_calibrated = hand_arrays(fit), tip_lengths(fit), is_calibrated
+    def __init__(self, fit: GloveFit, origin: HandOrigin) -> None:
+        self._hand, self._tips, self._origin = hand_arrays(fit), tip_lengths(fit), origin
         self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
 
     def of_pose(
@@ -166,10 +197,10 @@ class SpreadModel:
         """What is not known of the hand, at a noise of so many steps."""
         if steps not in self._doubts:
             digits = self._hand.digits
-            calibrated = self._is_calibrated
-            self._doubts[steps] = (
-                calibrated_doubt(digits, steps * _NOISE_STEP) if calibrated else measured_doubt(digits)
-            )
+            if self._origin == "calibrated":
+                self._doubts[steps] = calibrated_doubt(digits, steps * _NOISE_STEP)
+            else:
+                self._doubts[steps] = (measured_doubt if self._origin == "measured" else named_doubt)(digits)
         return self._doubts[steps]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from poses.shapes.sampling import sample_poses
+from track.config import HandOrigin
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
@@ -23,6 +25,7 @@ from track.kinematics.pose_spread import (
     calibrated_doubt,
     known_hand,
     measured_doubt,
+    named_doubt,
     pose_spreads,
     tip_lengths,
 )
@@ -102,10 +105,10 @@ def test_a_further_marker_makes_no_angle_of_a_known_hand_wider(seed, marker):
         assert (one <= other * (1.0 + 1e-6)).all()
 
 
-@pytest.mark.parametrize("is_calibrated", [False, True])
-def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_prior(is_calibrated):
+@pytest.mark.parametrize("origin", get_args(HandOrigin))
+def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_prior(origin):
     fit = nominal_fit("dense19", "M", "left")
-    model = SpreadModel(fit, is_calibrated=is_calibrated)
+    model = SpreadModel(fit, origin)
     qpos = np.zeros((4, 27))
     qpos[:, 3] = 1.0
     unseen = np.zeros((4, 19))
@@ -118,19 +121,21 @@ def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_p
     assert (angles <= resting_prior().spread * 1.5).all()
 
 
-def test_calibration_makes_them_narrower_and_noise_wider(rng):
+def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     fit = nominal_fit("dense19", "M", "right")
     digits, qpos, seen = hand_arrays(fit).digits, sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
-    measured, calibrated, noisy = (
+    named, measured, calibrated, noisy = (
         spreads_of(fit, doubt, qpos, seen, resting_prior().precision)
         for doubt in (
+            named_doubt(digits),
             measured_doubt(digits),
             calibrated_doubt(digits, 0.0002),
             calibrated_doubt(digits, 0.001),
         )
     )
-    for wide, narrow, middle in zip(measured, calibrated, noisy, strict=True):
+    for widest, wide, narrow, middle in zip(named, measured, calibrated, noisy, strict=True):
         assert (narrow < wide).all()
+        assert (wide < widest).all()
         assert (narrow < middle).all()
 
 
