@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
@@ -28,7 +29,7 @@ from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.glove_labeler import labeler_at_once
-from train.labelers.protocol import Labeler
+from train.labelers.protocol import Labeler, Labeling
 
 _WINDOW: Final = 30  # frames of each of two parts in which hands are compared
 _LEAST_FRAMES: Final = 10  # that tell anything
@@ -68,6 +69,17 @@ class _Other(NamedTuple):
     scale: float
     """Factor that makes the points ones in meters."""
     fit: _Fit
+
+
+class _AtOnce:
+    """`labeler_at_once`, made when it is first asked: bodies alone have no points like a hand's."""
+
+    def __init__(self, layout: MarkerLayout) -> None:
+        self._layout, self.marker_names = layout, layout.names
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """See `train.labelers.protocol.Labeler`."""
+        return labeler_at_once(self._layout).label_frames(frames)
 
 
 def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
@@ -122,7 +134,7 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
         return others
     for layout in _gloves():
         if layout != glove:
-            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, labeler_at_once(layout))))
+            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
         if others[-1].fit.is_good:
             return others
     if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
