@@ -60,6 +60,8 @@ class _Fit(NamedTuple):
     """Number of frames in which any is."""
     is_good: bool = False
     """Whether nothing tells of a mistake."""
+    is_whole: bool = False
+    """Whether each marker is seen at times: a glove fits the points of another one that has fewer markers."""
 
 
 class _Other(NamedTuple):
@@ -135,7 +137,7 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
     for layout in _gloves():
         if layout != glove:
             others.append(_Other(layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
-        if others[-1].fit.is_good:
+        if others[-1].fit.is_good and others[-1].fit.is_whole:
             return others
     if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
         for scale in _scales():
@@ -170,14 +172,14 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             near.append(int((distances_to_nearest(free, hand.markers) < _NEAR).sum()))
             odds = score(markers - missing[-1], hand.rms)
             log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
-    all_seen = not any(unseen[side] for side, times in found.items() if times)
+    is_whole = not any(unseen[side] for side, times in found.items() if times)
     is_good = (
         count >= _FOUND * len(frames)
         and float(np.median(rms)) <= _MOST_RMS
-        and float(np.mean(missing)) <= (_MOST_HIDDEN if all_seen else _MOST_MISSING) * markers
+        and float(np.mean(missing)) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
         and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
     )
-    return _Fit(log_odds / len(frames), found, count, is_good)
+    return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
 
 
 def _gloves() -> list[MarkerLayout]:
