@@ -1,14 +1,18 @@
 """Labels of single frames of real hands: as captured, with drops, with ghosts, and with both.
 
-    python -m benchmarks.single_frames DATA [--glove dense19] [--labeler RUN] [--every 1] [--save label]
+    python -m benchmarks.single_frames DATA [--glove dense19] [--labeler RUN] [--every 1] [--command]
+        [--save label]
 
 DATA is a folder of labeled captures, such as the public Mocap_SIG18_Data. The same as four calls of
-`handsim evaluate`. `--save label` keeps label_clean, label_drops, label_ghosts and label_both.
+`handsim evaluate`. With --command the labels are those of `handsim label`, which is given the same frames as
+captures of 4,096 in random order, and measures the hands in each. `--save label` keeps label_clean,
+label_drops, label_ghosts and label_both.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +20,41 @@ import torch
 
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.captures.capture import Capture
 from gloves.captures.formats import find_captures, read_markers
+from track.capture_labeling import label_capture
 from train.glove_labeler import load_labeler
 from train.labeler_evaluation import Report
+from train.labelers.protocol import Labeler, Labeling
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "
     "error without the least sure"
 )
 NAMES = ("clean", "drops", "ghosts", "both")
+RATE = 120.0  # [Hz] of a capture of frames in no order, which nothing depends on
+
+
+class CommandLabeler:
+    """`handsim label` as a labeler of one hand's frames; right or left, a marker counts as the same."""
+
+    def __init__(self, glove: str, labeler: Labeler) -> None:
+        self._glove, self._labeler = glove, labeler
+        self.marker_names = labeler.marker_names
+
+    def label_frames(self, frames: Sequence[np.ndarray]) -> list[Labeling]:
+        """Labels of frames that are one capture, in random order."""
+        points = np.full((len(frames), max(map(len, frames)), 3), np.nan)
+        for row, cloud in zip(points, frames, strict=True):
+            row[: len(cloud)] = cloud
+        names = tuple(f"*{column}" for column in range(points.shape[1]))
+        order = np.random.default_rng(0).permutation(len(frames))
+        take = label_capture(Capture(names, points[order], RATE), self._glove, labeler=self._labeler)
+        labels = np.where(take.labels >= 0, take.labels % len(self.marker_names), -1)
+        return [
+            Labeling(labels[row, : len(cloud)], take.confidence[row, : len(cloud)])
+            for row, cloud in zip(np.argsort(order), frames, strict=True)
+        ]
 
 
 def figures_of(report: Report, markers: tuple[str, ...], title: str) -> Figures:
@@ -49,12 +79,15 @@ def main() -> None:
     parser.add_argument("--glove", default="dense19")
     parser.add_argument("--labeler", type=Path)
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--command", action="store_true", help="label through `handsim label`")
     add_save(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(describe("torch"))
-    labeler = load_labeler(options.glove, options.labeler)
+    labeler: Labeler = load_labeler(options.glove, options.labeler)
     markers = read_markers(find_captures([options.data]), labeler.marker_names)[:: options.every]
+    if options.command:
+        labeler = CommandLabeler(options.glove, labeler)
     print(f"[%]: {COLUMNS}")
     reports = measure_augmentations(labeler, markers, seed=0)
     for name, (test, report) in zip(NAMES, reports.items(), strict=True):

@@ -15,17 +15,16 @@ import numpy as np
 
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
-from gloves.takes.take import LOST, TRACKED, Take
+from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
 from track.association.initialization import FEWEST_POINTS
 from track.association.point_linking import change_of_distances
 from track.association.single_frames import label_alone
-from track.both_directions import BothWays, label_both_ways
+from track.both_directions import label_both_ways
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands
 from track.hand_size import sample_frames
-from track.label_confidence import label_confidence
 from track.setup import AnyHands, choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler
@@ -33,7 +32,6 @@ from train.glove_labeler import load_labeler
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
 _CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most
 _MOST: Final = 0.5  # share of these pairs that change no more
-_AGREED: Final = 5.0  # factor of a label's odds where both directions agree, on simulated captures
 
 
 def label_capture(
@@ -91,24 +89,12 @@ def label_capture(
         settings=settings,
     )
     if _is_continuous(frames):
-        return _labeled_both_ways(take, label_both_ways(frames, user, network, told))
+        return label_both_ways(take, frames, user, network, told)
     labels, confidence = take.labels.copy(), take.confidence.copy()
     found = label_alone([frame.points for frame in frames], user.hands, network, told)
     for row, sure, there, one in zip(labels, confidence, present, found, strict=True):
         row[there], sure[there] = one
     return dataclasses.replace(take, labels=labels, confidence=confidence)
-
-
-def _labeled_both_ways(take: Take, found: BothWays) -> Take:
-    """The take with the labels of frames that follow from each other, and the confidence in them."""
-    present = np.isfinite(take.points[..., 0])
-    labels, odds = take.labels.copy(), np.ones(present.shape)
-    labels[present] = np.concatenate(found.labels)
-    odds[present] = np.where(np.concatenate(found.agreed), _AGREED, 1.0)
-    status = np.where(np.isfinite(found.qpos[..., 0]), TRACKED, LOST)
-    labeled = dataclasses.replace(take, labels=labels)
-    right = label_confidence(dataclasses.replace(labeled, qpos=found.qpos, status=status, rms=found.rms))
-    return dataclasses.replace(labeled, confidence=odds * right / (1.0 - right + odds * right))
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:

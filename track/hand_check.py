@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
@@ -28,7 +29,7 @@ from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.glove_labeler import labeler_at_once
-from train.labelers.protocol import Labeler
+from train.labelers.protocol import Labeler, Labeling
 
 _WINDOW: Final = 30  # frames of each of two parts in which hands are compared
 _LEAST_FRAMES: Final = 10  # that tell anything
@@ -59,6 +60,8 @@ class _Fit(NamedTuple):
     """Number of frames in which any is."""
     is_good: bool = False
     """Whether nothing tells of a mistake."""
+    is_whole: bool = False
+    """Whether each marker is seen at times: a glove fits the points of another one that has fewer markers."""
 
 
 class _Other(NamedTuple):
@@ -68,6 +71,17 @@ class _Other(NamedTuple):
     scale: float
     """Factor that makes the points ones in meters."""
     fit: _Fit
+
+
+class _AtOnce:
+    """`labeler_at_once`, made when it is first asked: bodies alone have no points like a hand's."""
+
+    def __init__(self, layout: MarkerLayout) -> None:
+        self._layout, self.marker_names = layout, layout.names
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """See `train.labelers.protocol.Labeler`."""
+        return labeler_at_once(self._layout).label_frames(frames)
 
 
 def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
@@ -122,8 +136,8 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
         return others
     for layout in _gloves():
         if layout != glove:
-            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, labeler_at_once(layout))))
-        if others[-1].fit.is_good:
+            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
+        if others[-1].fit.is_good and others[-1].fit.is_whole:
             return others
     if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
         for scale in _scales():
@@ -158,14 +172,14 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             near.append(int((distances_to_nearest(free, hand.markers) < _NEAR).sum()))
             odds = score(markers - missing[-1], hand.rms)
             log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
-    all_seen = not any(unseen[side] for side, times in found.items() if times)
+    is_whole = not any(unseen[side] for side, times in found.items() if times)
     is_good = (
         count >= _FOUND * len(frames)
         and float(np.median(rms)) <= _MOST_RMS
-        and float(np.mean(missing)) <= (_MOST_HIDDEN if all_seen else _MOST_MISSING) * markers
+        and float(np.mean(missing)) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
         and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
     )
-    return _Fit(log_odds / len(frames), found, count, is_good)
+    return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
 
 
 def _gloves() -> list[MarkerLayout]:

@@ -1,21 +1,32 @@
-"""Which direction is right where they give points to different hands."""
+"""Which points are of one event where the directions differ, and where they exchange the hands."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from track.both_directions import _exchanges, _Tracked
-
-
-def tracked(labels):
-    row = np.array(labels)
-    return _Tracked(row, np.ones(len(row)), np.zeros((2, 5, 3)), np.zeros((2, 27)), np.zeros(2), 0.0)
+from track.both_directions import _events_of, _exchanges
 
 
 def test_runs_of_exchanged_hands_are_found():
-    right, left, gap = tracked([0, 1, 2, 5, 6]), tracked([5, 6, 7, 0, 1]), tracked([-1] * 5)
-    digit = tracked([1, 0, 2, 5, 6])  # another marker of the same hand
-    forward = [right, right, right, right, gap, right]
-    backward = [right, left, left, digit, left, left]
+    right, left, gap = [0, 1, 2, 5, 6], [5, 6, 7, 0, 1], [-1] * 5
+    digit = [1, 0, 2, 5, 6]  # another marker of the same hand
+    forward = np.array([right, right, right, right, gap, right])
+    backward = np.array([right, left, left, digit, left, left])
     assert list(_exchanges(forward, backward, 5)) == [slice(1, 3), slice(5, 6)]
     assert list(_exchanges(forward, forward, 5)) == []
+
+
+def test_labels_that_change_together_are_one_event():
+    forward = np.array([[0, 1, 2, 3], [0, 1, 2, 3], [0, 1, -1, 3], [0, 1, 2, 3]])
+    backward = np.array([[1, 0, 2, 3], [1, 0, 2, -1], [0, 1, 2, 3], [1, 0, 2, 3]])
+    events = _events_of(forward, backward)
+    assert [*zip(events.rows, events.columns, strict=True)] == [
+        (0, 0), (0, 1), (1, 0), (1, 1), (1, 3), (2, 2), (3, 0), (3, 1)
+    ]  # fmt: skip
+    exchange, later = events.numbers[0], events.numbers[-1]
+    assert (events.numbers[:4] == exchange).all() and (events.numbers[-2:] == later).all()
+    assert len({exchange, events.numbers[4], events.numbers[5], later}) == 4
+
+
+def test_directions_that_agree_have_no_event():
+    assert not len(_events_of(np.zeros((3, 1), dtype=int), np.zeros((3, 1), dtype=int)).numbers)
