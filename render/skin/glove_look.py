@@ -13,7 +13,7 @@ from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise, smooth
 from render.skin.forearm import Forearm
 from render.skin.relief import normal_map
-from render.skin.texels import REFERENCE, skin_texels
+from render.skin.texels import REFERENCE, behind_wrist, skin_texels
 from render.skin.texture import SkinTexture, lab_to_srgb
 
 if TYPE_CHECKING:
@@ -69,8 +69,7 @@ def glove_texture(
     """
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size
-    length = REFERENCE.length if forearm is None else forearm.length
-    behind = -texels.positions[:, 0] * length / REFERENCE.length
+    behind = behind_wrist(REFERENCE if forearm is None else forearm)
     lab = cv2.cvtColor(np.array([[look.color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
     cloth = noise(texels.positions, (0.02, 0.006, 0.0025), rng=rng)
     hem = bump(behind - look.cuff + 0.004, 0.0015)
