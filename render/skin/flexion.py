@@ -21,6 +21,7 @@ from handsim.space.transforms import MIRROR
 from render.skin.fields import bump, smooth
 
 _REFERENCE: Final = 0.0118  # radius of an average finger at its knuckle, for which the lengths below are [m]
+_NEAR: Final = 0.018  # [m] from a thumb's axis that only its own skin is
 _FINGERS: Final = ("index", "middle", "ring", "little")
 
 
@@ -119,6 +120,13 @@ class _Skin(NamedTuple):
         result: NDArray[np.float64] = size * height * hill
         return result
 
+    def girth(self, bone: int, height: float, at: float, along: float) -> NDArray[np.float64]:
+        """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
+        place, facing = self.local(bone)
+        near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
+        result: NDArray[np.float64] = self.scale * height * near * bump(place[:, 0] - at, self.scale * along)
+        return result * smooth(-facing, -0.8, -0.2)
+
     def ball(
         self, center: tuple[float, float], height: float, width: float, *, back: bool
     ) -> NDArray[np.float64]:
@@ -169,9 +177,12 @@ def _valleys(skin: _Skin) -> Iterator[_Hill]:
 
 
 def _thumb(skin: _Skin) -> Iterator[_Hill]:
-    """Its knuckles, and the muscle that lies between it and the index when they close."""
+    """Its knuckles, its waist and pad, and the muscle that lies between it and the index when they close."""
     yield _Hill(_joint("thumb_MCP_flexion"), 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
     yield _Hill(_joint("thumb_IP_flexion"), 5.0, 70.0, skin.knob(3, 0.0020, 0.0060, 0.0065))
+    middle = 0.5 * float(np.linalg.norm(skin.frames[3, :3, 3] - skin.frames[2, :3, 3]))
+    yield _Hill(-1, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
+    yield _Hill(-1, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * skin.scale, 0.0075))
     muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
     yield _Hill(_joint("thumb_CMC_abduction"), 15.0, -25.0, muscle)
 
