@@ -124,8 +124,9 @@ class _Skin(NamedTuple):
         """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
         place, facing = self.local(bone)
         near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
-        result: NDArray[np.float64] = self.scale * height * near * bump(place[:, 0] - at, self.scale * along)
-        return result * smooth(-facing, -0.8, -0.2)
+        hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
+        result: NDArray[np.float64] = self.scale * height * hill
+        return result
 
     def ball(
         self, center: tuple[float, float], height: float, width: float, *, back: bool
