@@ -18,7 +18,7 @@ from render.scenery.backgrounds import Backdrop
 from render.scenery.lights import Lighting
 
 _TEXELS: Final = (
-    640  # along a side; hands and forearms are half a meter across, a finger's edge a millimeter soft
+    256  # along a side; hands and forearms are half a meter across, edges a few millimeters soft as in rooms
 )
 _EDGE: Final = 3.0  # [texels] that reads of neighbors may go beyond what is drawn
 _COARSE: Final = 4  # pixels of the picture a pixel of the shadow's mask: its edges are soft

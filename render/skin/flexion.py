@@ -21,6 +21,7 @@ from handsim.space.transforms import MIRROR
 from render.skin.fields import bump, smooth
 
 _REFERENCE: Final = 0.0118  # radius of an average finger at its knuckle, for which the lengths below are [m]
+_NEAR: Final = 0.018  # [m] from a thumb's axis that only its own skin is
 _FINGERS: Final = ("index", "middle", "ring", "little")
 
 
@@ -99,6 +100,14 @@ class _Skin(NamedTuple):
         frame = self.frames[bone]
         return (self.points - frame[:3, 3]) @ frame[:3, :3], self.normals @ frame[:3, 2]
 
+    def beside(
+        self, start: NDArray[np.float64], end: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How far along a segment of the wrist's x and y [m] points are, 0 to 1, and how far from it [m]."""
+        way = end - start
+        along = np.clip((self.points[:, :2] - start) @ way / (way @ way), 0.0, 1.0)
+        return along, np.linalg.norm(self.points[:, :2] - start - along[:, None] * way, axis=1)
+
     def knob(
         self, bone: int, height: float, along: float, aside: float, *, at: tuple[float, float] = (0.0, 0.0)
     ) -> NDArray[np.float64]:
@@ -108,6 +117,14 @@ class _Skin(NamedTuple):
         hill = bump(place[:, 0] - size * at[0], size * along) * bump(place[:, 1] - size * at[1], size * aside)
         hill *= smooth(facing, -0.1, 0.5) * (place[:, 2] > -0.004)
         result: NDArray[np.float64] = size * height * hill
+        return result
+
+    def girth(self, bone: int, height: float, at: float, along: float) -> NDArray[np.float64]:
+        """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
+        place, facing = self.local(bone)
+        near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
+        hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
+        result: NDArray[np.float64] = self.scale * height * hill
         return result
 
     def ball(
@@ -129,35 +146,43 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
     """Three knuckles of a finger, its tendon, and the pad that its bending pushes out."""
     first = 1 + 3 * number
     bent, straight = _joint(f"{digit}_MCP_flexion"), (15.0, -22.0)
-    yield _Hill(bent, 5.0, 85.0, skin.knob(first, 0.0054 * wide, 0.0072, 0.0058, at=(-0.001, 0.0)))
-    yield _Hill(_joint(f"{digit}_PIP_flexion"), 5.0, 95.0, skin.knob(first + 1, 0.0030, 0.0052, 0.0056))
+    yield _Hill(bent, 5.0, 85.0, skin.knob(first, 0.0042 * wide, 0.0075, 0.0062, at=(-0.001, 0.0)))
+    yield _Hill(_joint(f"{digit}_PIP_flexion"), 5.0, 95.0, skin.knob(first + 1, 0.0019, 0.0058, 0.0056))
     yield _Hill(_joint(f"{digit}_DIP_flexion"), 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
-    way = knuckle - root
-    along = np.clip((skin.points[:, :2] - root) @ way / (way @ way), 0.0, 1.0)
-    aside = np.linalg.norm(skin.points[:, :2] - root - along[:, None] * way, axis=1)
+    along, aside = skin.beside(root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
     yield _Hill(bent, *straight, skin.scale * ridge)
     place, facing = skin.local(first)
     middle = 0.5 * np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])
+    shaft = skin.knob(first, -0.0018 * wide, 0.0095, 0.0075, at=(float(middle) / skin.scale, 0.0))
+    yield _Hill(bent, 10.0, 85.0, shaft)
+    neck = skin.knob(first, -0.0014 * wide, 0.0090, 0.0085, at=(-0.021, 0.0))
+    yield _Hill(bent, 10.0, 85.0, neck)
     pad = 0.0018 * bump(place[:, 0] - middle, 0.009) * bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7)
     yield _Hill(_joint(f"{digit}_PIP_flexion"), 20.0, 100.0, skin.scale * pad * (place[:, 2] < 0.004))
 
 
 def _valleys(skin: _Skin) -> Iterator[_Hill]:
-    """Hollows between the knuckles of a fist."""
+    """Hollows between the knuckles of a fist, down to where the fingers part."""
     for number in (1, 2, 3):
-        here, there = skin.frames[1 + 3 * number, :2, 3], skin.frames[4 + 3 * number, :2, 3]
-        x, y = 0.5 * (here + there) / skin.scale + [0.003, 0.0]
-        hollow = skin.ball((float(x), float(y)), -0.0042, 0.0052, back=True)
-        yield _Hill(_joint(f"{_FINGERS[number]}_MCP_flexion"), 10.0, 85.0, hollow)
+        first, second = 1 + 3 * number, 4 + 3 * number
+        here = 0.5 * (skin.frames[first, :2, 3] + skin.frames[second, :2, 3])
+        parted = here + 0.45 * (0.5 * (skin.frames[first + 1, :2, 3] + skin.frames[second + 1, :2, 3]) - here)
+        along, aside = skin.beside(here, parted)
+        hollow = -0.0042 * bump(aside, skin.scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
+        hollow *= 1.0 - 0.4 * along
+        yield _Hill(_joint(f"{_FINGERS[number]}_MCP_flexion"), 10.0, 85.0, skin.scale * hollow)
 
 
 def _thumb(skin: _Skin) -> Iterator[_Hill]:
-    """Its knuckles, and the muscle that lies between it and the index when they close."""
+    """Its knuckles, its waist and pad, and the muscle that lies between it and the index when they close."""
     yield _Hill(_joint("thumb_MCP_flexion"), 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
     yield _Hill(_joint("thumb_IP_flexion"), 5.0, 70.0, skin.knob(3, 0.0020, 0.0060, 0.0065))
+    middle = 0.5 * float(np.linalg.norm(skin.frames[3, :3, 3] - skin.frames[2, :3, 3]))
+    yield _Hill(-1, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
+    yield _Hill(-1, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * skin.scale, 0.0075))
     muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
     yield _Hill(_joint("thumb_CMC_abduction"), 15.0, -25.0, muscle)
 

@@ -33,7 +33,9 @@ _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths there [hand breadths]."""
-_CUFF: Final = 0.012  # [m] of the arm along which a sleeve becomes wider than it
+CUFF: Final = 0.0004
+"""Length of the arm along which a sleeve becomes wider than it: a step, between two rings [m]."""
+_HEM: Final = 0.004  # [m] between the rings of the step and the next ones, so that shading does not round it
 _SQUARE: Final = 0.8
 """Power of the cosine and sine of an arm's section: wrists are squarer than an ellipse, of power 1,"""
 _LONGER: Final = 1.04  # and longer around at the same width
@@ -117,14 +119,13 @@ def forearm_rings(
     center = right.mean(axis=0)
     section = (right - center)[:, 1:]
     lean = right[:, 0] - center[0]  # the wrist's ring is not quite planar
-    # Rings lie closer together near the wrist, where all the bending is.
-    behind = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.7
+    behind = arm_places(forearm, rings)[1:]
     width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
     axes_of = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if forearm.sleeve < forearm.length:
-        loose = 1.0 + (forearm.looseness - 1.0) * smooth((behind - forearm.sleeve) / _CUFF + 0.5, 0.0, 1.0)
+        loose = np.where(behind > forearm.sleeve + 0.5 * CUFF, forearm.looseness, 1.0)
         width, depth = loose * width, loose * depth
     round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
     share = smooth(behind, 0.0, _BLEND * shape.length)[:, None, None]
@@ -133,6 +134,24 @@ def forearm_rings(
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
     points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
     return points @ mirror
+
+
+def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
+    """Places of the wrist's ring and those behind it along the arm [m].
+
+    Rings lie closer together near the wrist, where all the bending is, and two pairs at the edge of a sleeve.
+    """
+    places: NDArray[np.float64] = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
+    if forearm.sleeve < forearm.length:
+        edge = forearm.sleeve + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
+        first = int(np.clip(np.abs(places - forearm.sleeve).argmin() - 1, 1, rings - 4))
+        places[: first + 1] *= edge[0] / places[first]
+        last = first + len(edge) - 1
+        places[last:] = np.interp(
+            places[last:], [places[last], forearm.length], [edge[-1], max(forearm.length, edge[-1] + _HEM)]
+        )
+        places[first : last + 1] = edge
+    return places
 
 
 def bent_rings(

@@ -11,9 +11,9 @@ import numpy as np
 from handsim.errors import HandSimError
 from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise, smooth
-from render.skin.forearm import Forearm
+from render.skin.forearm import CUFF, Forearm
 from render.skin.relief import normal_map
-from render.skin.texels import REFERENCE, skin_texels
+from render.skin.texels import REFERENCE, behind_wrist, skin_texels
 from render.skin.texture import SkinTexture, lab_to_srgb
 
 if TYPE_CHECKING:
@@ -69,14 +69,16 @@ def glove_texture(
     """
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size
-    length = REFERENCE.length if forearm is None else forearm.length
-    behind = -texels.positions[:, 0] * length / REFERENCE.length
+    arm = REFERENCE if forearm is None else forearm
+    behind = behind_wrist(arm)
     lab = cv2.cvtColor(np.array([[look.color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
     cloth = noise(texels.positions, (0.02, 0.006, 0.0025), rng=rng)
     hem = bump(behind - look.cuff + 0.004, 0.0015)
     painted = lab + (look.wear * 2.0 * cloth - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     height = look.wear * 1.2e-4 * cloth - 4e-4 * hem
-    cloth_share = 1.0 - smooth(behind, look.cuff - 0.004, look.cuff + 0.004).reshape(rows, width, 1)
+    cloth_share = 1.0 - smooth(behind, look.cuff - 0.004, look.cuff + 0.004)
+    cloth_share *= 1.0 - smooth(behind, arm.sleeve, arm.sleeve + CUFF)  # a sleeve lies over the cuff
+    cloth_share = cloth_share.reshape(rows, width, 1)
     covered = cloth_share > 0.5
     cloth_color = lab_to_srgb(painted.reshape(rows, width, 3)).astype(np.float64)
     rough = np.uint8(round(255.0 * look.roughness))

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import skin_frames, vertex_normals
-from handsim.hand.topology import NUM_BONES, PALM
+from handsim.hand.topology import BONES, DIGITS, NUM_BONES, PALM
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import quaternion_matrix
 from render.skin.atlas import RINGS, skin_atlas
 from render.skin.flexion import Flexion
 from render.skin.forearm import ELBOW, FOREARM, Forearm, bent_rings, forearm_rings
 
+_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's
 _DARKEST: Final = 0.12  # even the deepest folds receive some light
 
 
@@ -77,7 +78,7 @@ class PosableSkin:
             for faces in (atlas.corner_faces, atlas.coarse_faces)
         )
         self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
-        self._rest_occluded = self._rest_occlusion(model.rest_transforms[None], self.rest, self.faces)
+        self._rest_occluded = self._rest_occlusion()
 
     def forearm_line(
         self, qpos: Float[np.ndarray, "27"]
@@ -133,18 +134,29 @@ class PosableSkin:
         )[0]
         return points
 
-    def _rest_occlusion(
-        self, transforms: NDArray[np.float64], points: NDArray[np.float64], faces: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """Occlusion by neighboring capsules in the flat hand, where they are the same flesh."""
-        return self._occluded(transforms, points, vertex_normals(points, faces))
+    def _rest_occlusion(self) -> NDArray[np.float32]:
+        """Occlusion in the flat hand by capsules of the same flesh: a digit's other neighbors do shade it."""
+        normals = vertex_normals(self.rest, self.faces)
+        occluded = self._occluded(self.model.rest_transforms[None], self.rest, normals)
+        capsules, digits = self.model.capsules, np.array([bone.digit for bone in BONES])
+        segments = capsules.posed(self.model.rest_transforms[None])[0]
+        of_digit = digits[self._bones]
+        for digit in range(len(DIGITS)):
+            share = (self._weights * (of_digit == digit)).sum(axis=1)
+            mine = np.flatnonzero(share > 0.0)
+            near = np.isin(digits[capsules.bones], (digit, digits[PALM]))
+            own = _occluded_share(
+                self.rest[mine], normals[mine], segments[near], capsules.radii[near] * _FLESH
+            )
+            occluded[mine] += share[mine].astype(np.float32) * (own - occluded[mine])
+        return occluded
 
     def _occluded(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         capsules = self.model.capsules
         occluded: NDArray[np.float32] = _occluded_share(
-            points, normals, capsules.posed(transforms)[0], capsules.radii * 1.2
+            points, normals, capsules.posed(transforms)[0], capsules.radii * _FLESH
         )
         return occluded
 

@@ -19,7 +19,7 @@ from handsim.hand.topology import DIGITS, NUM_BONES
 from handsim.kernels.kernel import kernel
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import bump, smooth
-from render.skin.forearm import Forearm
+from render.skin.forearm import Forearm, arm_places
 from render.skin.mesh import PosableSkin
 
 REFERENCE: Final = Forearm(length=0.5)
@@ -133,6 +133,15 @@ def _digit_texels(
     angle = np.arctan2(local[:, 1], local[:, 2])
     lengths = model.shape.bone_lengths[digit]
     return DigitTexels(texels, local[:, 0], angle, share[texels], lengths, float(model.shape.radii[digit, 3]))
+
+
+def behind_wrist(forearm: Forearm) -> NDArray[np.float64]:
+    """How far behind the wrist each texel (N,) is along this forearm [m]; negative on the hand."""
+    width, _ = skin_atlas().size
+    behind = -skin_texels().positions[:, 0]
+    along = _between(RINGS + 1, ARM_ROWS) @ arm_places(forearm, RINGS)
+    behind[-ARM_ROWS * width :] = np.repeat(along, width)
+    return behind
 
 
 @functools.cache

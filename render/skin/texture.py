@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 
 from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise, smooth
-from render.skin.forearm import Forearm
+from render.skin.forearm import CUFF, Forearm
 from render.skin.look import SkinLook
 from render.skin.relief import normal_map, relief
-from render.skin.texels import REFERENCE, line_depth, skin_texels
+from render.skin.texels import behind_wrist, line_depth, skin_texels
 
 if TYPE_CHECKING:
     from handsim.hand.topology import Side
 
 
-_HEM: Final = 0.004  # [m] that a hem is soft: a texel of the arm is 5 mm long, and less shows its corners
+_SHADED: Final = 0.006  # [m] of skin before a sleeve that lie in its shadow
+_SHADE: Final = 0.4  # of the lightness that is missing in it
+_FOLD: Final = 0.002  # [m] high folds of a sleeve
 _CREASE: Final = (-0.012, 0.035)  # [m] behind the wrist, where the palm's skin ends
 _VEIN: Final = 0.0017  # [m] half as wide as a vein
 _UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
@@ -228,14 +230,14 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     """Cloth from some way behind the wrist on, with folds as darker and lighter bands."""
-    positions = skin_texels().positions
-    behind = -positions[:, 0] * forearm.length / REFERENCE.length
-    cloth = smooth(behind, forearm.sleeve - _HEM, forearm.sleeve + _HEM)
+    behind = behind_wrist(forearm).astype(np.float32) - np.float32(forearm.sleeve)
+    cloth = smooth(behind, 0.0, CUFF)
     color = cv2.cvtColor(np.array([[forearm.sleeve_color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
-    folds = noise(positions * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
-    hem = bump(behind - forearm.sleeve, _HEM)
+    folds = noise(skin_texels().positions * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
     for channel in range(3):
-        painted = color[channel] + (4.0 * folds - 9.0 * hem if channel == 0 else 0.0)
+        painted = color[channel] + (4.0 * folds if channel == 0 else 0.0)
         paint.lab[:, channel] += cloth * (painted - paint.lab[:, channel])
+    inside = smooth(behind, -_SHADED, 0.0) * (1.0 - smooth(behind, 0.5 * CUFF, CUFF))
+    paint.lab[:, 0] *= 1.0 - np.float32(_SHADE) * inside
     paint.roughness[:] += cloth * (0.9 - paint.roughness)
-    paint.height[:] += cloth * (0.0008 * folds + 0.001 * hem - paint.height)
+    paint.height[:] += cloth * (np.float32(_FOLD) * folds - paint.height)

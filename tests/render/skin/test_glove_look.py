@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
-from render.skin.forearm import Forearm
+from render.skin.forearm import CUFF, Forearm
 from render.skin.glove_look import GloveLook, glove_texture, sample_glove_look
 from render.skin.look import SkinLook
-from render.skin.texels import REFERENCE, skin_texels
+from render.skin.texels import REFERENCE, behind_wrist, skin_texels
 from render.skin.texture import skin_texture
 
 
@@ -22,6 +22,16 @@ def test_a_glove_covers_the_hand_up_to_its_cuff() -> None:
         flat = (-1, *ours.shape[2:])
         assert (ours.reshape(flat)[behind] == theirs.reshape(flat)[behind]).all()
         assert ours.dtype == np.uint8
+
+
+def test_a_sleeve_lies_over_the_cuff() -> None:
+    forearm = Forearm(length=0.6, sleeve=0.04, sleeve_color=(0.9, 0.9, 0.9))
+    skin = skin_texture(SkinLook(), forearm)
+    gloved = glove_texture(GloveLook(cuff=0.07), skin, forearm)
+    behind = behind_wrist(forearm)
+    colors, sleeve = gloved.color.reshape(-1, 3), behind > forearm.sleeve + CUFF
+    np.testing.assert_array_equal(colors[sleeve], skin.color.reshape(-1, 3)[sleeve])
+    assert colors[behind < forearm.sleeve].max() < 120
 
 
 def test_gloves_repeat_and_are_dark(rng: np.random.Generator) -> None:

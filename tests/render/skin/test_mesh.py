@@ -11,8 +11,8 @@ from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, SIDES, Side
 from handsim.space.transforms import MIRROR
 from poses.shapes.library import gesture
-from render.skin.atlas import skin_atlas
-from render.skin.forearm import FOREARM, REACH, Forearm, sample_forearm
+from render.skin.atlas import RINGS, skin_atlas
+from render.skin.forearm import CUFF, FOREARM, REACH, Forearm, arm_places, sample_forearm
 from render.skin.mesh import PosableSkin, face_parts
 
 
@@ -88,11 +88,21 @@ def test_folds_are_darker_than_what_lies_open(model: HandModel) -> None:
     flat, fist = (mesh.posed(join_qpos(gesture(name)[None])[0]) for name in ("spread", "fist"))
     assert flat.shade.min() >= 0.0
     assert fist.shade.max() <= 1.0
-    assert flat.shade.mean() > 0.97
+    assert flat.shade.mean() > 0.96
     for bone in (5, 8, 11):  # middle phalanges: their pads lie on the palm
         corners = np.unique(fist.faces[parts == bone])
         assert fist.shade[corners].min() < 0.5
     assert fist.shade[np.unique(fist.faces[parts == FOREARM])].mean() > 0.9
+
+
+def test_fingers_side_by_side_shade_each_other(model: HandModel) -> None:
+    mesh, parts = PosableSkin(model), face_parts()
+    middle = np.unique(mesh.posed(join_qpos(gesture("flat")[None])[0]).faces[parts == 8])
+    shades = {}
+    for name in ("flat", "spread"):
+        skin = mesh.posed(join_qpos(gesture(name)[None])[0])
+        shades[name] = skin.shade[middle][np.abs(skin.normals[middle, 1]) > 0.8].mean()
+    assert shades["flat"] < shades["spread"] - 0.05
 
 
 def test_a_bent_wrist_has_the_arm_come_from_the_palms_side() -> None:
@@ -159,13 +169,18 @@ def test_texture_places_lie_on_texels_of_their_own_tile() -> None:
     assert spans[on_hand].max() < 4.5
 
 
-def test_a_sleeve_is_wider_than_the_arm_in_it() -> None:
+@pytest.mark.parametrize("sleeve", [0.005, 0.035, 0.1, 0.5])
+def test_a_sleeve_is_wider_than_the_arm_in_it_from_its_edge_on(sleeve: float) -> None:
     atlas, model = skin_atlas(), HandModel.named("M")
-    bare, worn = (
-        PosableSkin(model, Forearm(length=0.6, sleeve=sleeve, looseness=1.3)).rest[atlas.num_hand : -1]
-        for sleeve in (1.0, 0.1)
-    )
-    across = [np.ptp(arm.reshape(-1, len(atlas.wrist), 3)[..., 1], axis=1) for arm in (bare, worn)]
-    behind = -bare.reshape(-1, len(atlas.wrist), 3)[..., 0].mean(axis=1)
-    wider = across[1] / across[0]
-    assert np.allclose(wider[behind < 0.09], 1.0) and np.allclose(wider[behind > 0.14], 1.3, atol=0.01)
+    around: list[np.ndarray] = []
+    for looseness in (1.0, 1.3):
+        forearm = Forearm(length=0.6, sleeve=sleeve, looseness=looseness)
+        arm = PosableSkin(model, forearm).rest[atlas.num_hand : -1].reshape(RINGS, -1, 3)
+        around.append(np.linalg.norm(arm - arm.mean(axis=1, keepdims=True), axis=-1).mean(axis=1))
+    places = arm_places(forearm, RINGS)[1:]
+    assert (np.diff(places) > 0.0).all() and places[-1] == pytest.approx(0.6, abs=0.01)
+    wider, sleeved = around[1] / around[0], places > sleeve
+    assert np.isclose(places[sleeved][0], sleeve + CUFF)
+    np.testing.assert_allclose(wider[~sleeved], 1.0)
+    blended = places < 0.05  # the hand's own section
+    np.testing.assert_allclose(wider[sleeved & ~blended], 1.3, atol=0.01)
