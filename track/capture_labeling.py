@@ -6,6 +6,7 @@ Frames that follow from each other are labeled by tracking them in both directio
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
+from handsim.errors import HandSimWarning
 from handsim.hand.topology import NUM_QPOS
 from track.association.initialization import FEWEST_POINTS
 from track.association.point_linking import change_of_distances
@@ -27,6 +29,7 @@ from track.hand_check import check_hands
 from track.hand_size import sample_frames
 from track.setup import AnyHands, choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
+from track.take_summary import no_points
 from train.glove_labeler import load_labeler
 
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
@@ -64,6 +67,9 @@ def label_capture(
         CaptureError: The capture cannot be read, or most of its points are far from any room.
         LayoutError: The glove is unknown.
         WeightsError: The labeler is unknown, or knows other markers.
+
+    Warns:
+        HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
     """
     layout = load_layout(glove)
     network = load_labeler(layout, labeler)
@@ -89,12 +95,17 @@ def label_capture(
         settings=settings,
     )
     if _is_continuous(frames):
-        return label_both_ways(take, frames, user, network, told)
-    labels, confidence = take.labels.copy(), take.confidence.copy()
-    found = label_alone([frame.points for frame in frames], user.hands, network, told)
-    for row, sure, there, one in zip(labels, confidence, present, found, strict=True):
-        row[there], sure[there] = one
-    return dataclasses.replace(take, labels=labels, confidence=confidence)
+        labeled = label_both_ways(take, frames, user, network, told)
+    else:
+        labels, confidence = take.labels.copy(), take.confidence.copy()
+        found = label_alone([frame.points for frame in frames], user.hands, network, told)
+        for row, sure, there, one in zip(labels, confidence, present, found, strict=True):
+            row[there], sure[there] = one
+        labeled = dataclasses.replace(take, labels=labels, confidence=confidence)
+    if (labeled.labels < 0).all():
+        none = f"no hand found, expected hands in glove '{settings['glove']}' (--glove names another)"
+        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
+    return labeled
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:

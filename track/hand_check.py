@@ -67,6 +67,8 @@ class _Fit(NamedTuple):
 class _Other(NamedTuple):
     """What may fit better."""
 
+    name: str
+    """Of its glove, or the path of the glove's file."""
     layout: MarkerLayout
     scale: float
     """Factor that makes the points ones in meters."""
@@ -118,8 +120,8 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
     remedy = [] if set(there) <= {hand.side for hand in hands} else [f"--hands {' '.join(there)}"]
     named = "two hands" if len(there) == 2 else f"a {there[0]} hand"
     if best.layout != glove:
-        named += f" in glove '{best.layout.name}'"
-        remedy.append(f"--glove {best.layout.name}")
+        named += f" in glove '{best.name}'"
+        remedy.append(f"--glove {best.name}")
     if remedy:
         shares = f"{fit.shown} of {len(some)} frames, what is asked for {asked.shown}"
         warnings.warn(
@@ -131,18 +133,18 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:
     """Hands of both sides in the glove that is asked for, in other gloves, and at other scales."""
-    others = [_Other(glove, 1.0, _measured_fit(frames, glove, labeler))]
+    others = [_Other(glove.name, glove, 1.0, _measured_fit(frames, glove, labeler))]
     if others[0].fit.is_good:
         return others
-    for layout in _gloves():
+    for name, layout in _gloves():
         if layout != glove:
-            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
+            others.append(_Other(name, layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
         if others[-1].fit.is_good and others[-1].fit.is_whole:
             return others
     if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
         for scale in _scales():
             scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
-            others.append(_Other(glove, scale, _measured_fit(scaled, glove, labeler)))
+            others.append(_Other(glove.name, glove, scale, _measured_fit(scaled, glove, labeler)))
     return others
 
 
@@ -182,13 +184,13 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
     return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
 
 
-def _gloves() -> list[MarkerLayout]:
-    """The shipped gloves and those in the working folder, those with more markers before parts of them."""
-    found = [load_layout(name) for name in list_layouts()]
+def _gloves() -> list[tuple[str, MarkerLayout]]:
+    """The shipped gloves and those in the working folder, by name or path; those with more markers first."""
+    found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
         with contextlib.suppress(HandSimError):  # a file of another kind
-            found.append(load_layout(path))
-    return sorted(found, key=lambda layout: -layout.num_markers)
+            found.append((str(path), load_layout(path)))
+    return sorted(found, key=lambda one: -one[1].num_markers)
 
 
 def _scales() -> list[float]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
-
-from handsim.errors import HandSimWarning
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
@@ -41,7 +38,6 @@ def label(
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
     from track.capture_labeling import label_capture
-    from track.take_summary import no_points
     from train.threads import label_on
 
     label_on(threads)
@@ -62,9 +58,6 @@ def label(
         f"{out}: {take.num_frames} frames, {labeled.sum()} of {points.sum()} points labeled{sure}; "
         f"{_counts(right, left)}"
     )
-    if not labeled.any():
-        told = f"no hand in {capture}, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(told if points.any() else no_points(take), HandSimWarning, stacklevel=2)
 
 
 def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:

@@ -47,7 +47,7 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
     own.save(tmp_path / "mine.toml")
     monkeypatch.chdir(tmp_path)
     worn = simulate_take("free", glove=own, num_frames=FRAMES, hands="left", seed=4).capture()
-    with pytest.warns(HandSimWarning, match="a left hand in glove 'mine' better"):
+    with pytest.warns(HandSimWarning, match="a left hand in glove 'mine.toml' better"):
         track_capture(worn, "sparse13")
 
 
