@@ -110,7 +110,9 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
     if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    best = max(_others(some, glove, labeler), key=lambda other: other.fit.log_odds)
+    others = _others(some, glove, labeler)  # of these a glove of few markers fits anything somehow
+    likely = [other for other in others if other.layout == glove or other.fit.is_good]
+    best = max(likely, key=lambda other: other.fit.log_odds)
     fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
     if fit.shown < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
         return

@@ -96,13 +96,13 @@ def fit_size(
 
     Args:
         frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
-        is_quick: Whether hands are looked for as adults' alone, and not a second time by weaker evidence.
+        is_quick: Whether hands are looked for as adults' and by the weaker evidence alone.
 
     Returns:
         The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
     usual = TrackerConfig()
-    for config in (usual,) if is_quick else (usual, _LENIENT):
+    for config in (_LENIENT,) if is_quick else (usual, _LENIENT):
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is not None and (config is usual or _is_found(fit, frames, sides, labeler)):
