@@ -4,7 +4,8 @@
 takes one frame of points at a time and gives a `TrackedFrame`; `measure_hands` measures whom it follows, and
 `calibrate` fits hands and gloves to them as a `User`. `open_source` opens a live stream, `ReplayServer` plays
 a capture as one, `open_sinks` takes hands to other programs, and a `Recorder` writes the take. `solve_pose`
-is the inverse kinematics alone: poses from labeled markers. `doubts_of` and `write_take_page` tell of a take.
+is the inverse kinematics alone: poses from labeled markers. `doubts_of` and `write_take_page` tell of a take,
+`score_glove` of a glove that nobody has worn.
 """
 
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from track.capture_labeling import label_capture
     from track.capture_tracking import track_capture
     from track.config import TrackerConfig
+    from track.glove_advice.scoring import score_glove
     from track.kinematics.pose_solver import solve_pose
     from track.recorder import Recorder
     from track.reports.take_page import write_take_page
@@ -49,6 +51,7 @@ __getattr__, __dir__ = lazy_exports(
         "measure_hands": "track.setup",
         "open_sinks": "track.sinks.addresses",
         "open_source": "track.streams.addresses",
+        "score_glove": "track.glove_advice.scoring",
         "solve_pose": "track.kinematics.pose_solver",
         "track_capture": "track.capture_tracking",
         "write_take_page": "track.reports.take_page",
@@ -72,6 +75,7 @@ __all__ = [
     "measure_hands",
     "open_sinks",
     "open_source",
+    "score_glove",
     "solve_pose",
     "track_capture",
     "write_take_page",

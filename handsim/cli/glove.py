@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,10 +32,8 @@ from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
-    from handsim.space.cameras import CameraRig
     from track.glove_advice.improvement import Worth
     from track.glove_advice.layout_score import LayoutScore
-    from track.glove_advice.observed_hands import ObservedHand
     from track.glove_advice.trials import Trial
 
 
@@ -158,17 +155,13 @@ def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
         raise LayoutError(f"on a hand of size {size}: {error}") from error
 
 
-POSES: Final = "poses"
-TWINS: Final = "twins"
-_TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
-_FEWEST_FRAMES: Final = 100
 _FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one
 
 
 def score_glove(
     glove: Annotated[str, tyro.conf.Positional],
     rig: str = "figure5",
-    motion: str = POSES,
+    motion: str = "poses",
     out: Path | None = None,
     frames: int = 1500,
     labeler: str | None = None,
@@ -192,63 +185,32 @@ def score_glove(
         captures: Captures of each kind of work that are tried, of different people; 0 for none.
         seed: Seed of people, poses and cameras' losses; captures have their own.
     """
-    from handsim.space.cameras import load_rig
-
-    layout, cameras = load_layout(glove), load_rig(rig)
     page = Path(glove).with_suffix(".html") if out is None else out
     check_ending(page, ".html")
-    check_count("--frames", frames, _FEWEST_FRAMES)
-    check_count("--captures", captures, 0)
     check_outputs([glove, rig, motion], [page])
-    from track.glove_advice.advice import advice
-    from track.glove_advice.layout_score import score_layout
+    from track.glove_advice import scoring
     from track.glove_advice.score_page import write_score_page
-    from track.glove_advice.trials import try_layout
-    from train.any_layout.learned_gloves import learned_labeler
-    from train.glove_labeler import load_labeler
 
-    rng = np.random.default_rng(seed)
-    with named_steps("simulating hands") as step:
-        hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-        step("learning the layout, about a minute the first time")
-        known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
-        step("labeling")
-        score = score_layout(layout, hands, known, rng=rng)
-        told = functools.partial(_told_capture, step, "trying captures")
-        trials = try_layout(layout, cameras, known, count=captures, told=told)
-        score = dataclasses.replace(score, trials=trials)
+    with named_steps("getting ready") as step:
+        score = scoring.score_glove(
+            glove,
+            rig,
+            motion=motion,
+            labeler=labeler,
+            frames=frames,
+            captures=captures,
+            seed=seed,
+            progress=step,
+        )
     _tell(score)
-    for number, sentence in enumerate(advice(score), 1):
+    for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
-    write_score_page(page, score, seen_by=f"{seen}, seen by rig {cameras.name}", trained=labeler is not None)
+    write_score_page(page, score, trained=labeler is not None)
     print_line(f"{page}: the hand with its confusions, markers and joints")
 
 
 def _told_capture(step: Callable[[str], None], what: str, words: str) -> None:
     step(f"{what}: {words}")
-
-
-def _hands(
-    motion: str, layout: MarkerLayout, rig: CameraRig, frames: int, seed: int, rng: np.random.Generator
-) -> tuple[list[ObservedHand], str]:
-    """Hands in the motion that was asked for, and its name."""
-    from gloves.takes.take import load_take
-    from track.glove_advice.observed_hands import observe_motion, observe_poses
-    from train.simulation.takes import simulate_take
-
-    if motion == POSES:
-        return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
-    if motion == TWINS:
-        hands = []
-        for kind in ("single-hand", "hand-hand", "hand-pen"):
-            take = simulate_take(kind, num_frames=_TWIN_FRAMES, seed=seed)
-            hands += observe_motion(take, layout, rig, frames // 6, rng=rng)
-        return hands, "simulated motion of one hand and of two"
-    if not motion.endswith(".npz"):
-        raise ArgumentError(f"--motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
-    return observe_motion(
-        load_take(Path(motion)), layout, rig, frames, rng=rng
-    ), f"the take {Path(motion).name}"
 
 
 def _tell(score: LayoutScore) -> None:

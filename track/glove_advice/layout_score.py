@@ -49,6 +49,10 @@ class LayoutScore:
     """Share of the frames in which left and right are told apart by the labeled markers."""
     trials: Mapping[str, Trial] = field(default_factory=dict)
     """What became of simulated captures of each kind of work; empty where none was tried."""
+    seen_by: str = ""
+    """Whose motion was seen by which rig, in words."""
+    advice: tuple[str, ...] = ()
+    """What to move, add or drop, in sentences, the most important first."""
 
 
 def score_layout(

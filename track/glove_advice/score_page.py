@@ -14,7 +14,6 @@ from jaxtyping import Float
 from gloves.layout import MarkerLayout
 from handsim.app.page import Section, write_page
 from handsim.hand.topology import DIGITS, JOINTS
-from track.glove_advice.advice import advice
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
 from track.glove_advice.trials import METHODS, Trial
@@ -35,12 +34,8 @@ _DOT: Final = 15.0  # [points]
 _MARKER: Final = 5.0
 
 
-def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: bool = False) -> None:
-    """Write the page: one HTML file with its pictures inside.
-
-    Args:
-        seen_by: Whose motion was seen by which rig, in words.
-    """
+def write_score_page(path: Path, score: LayoutScore, *, trained: bool = False) -> None:
+    """Write the page: one HTML file with its pictures inside."""
     layout, frames = score.layout, score.observed.num_frames
     sections = [
         _advice_section(score),
@@ -55,14 +50,15 @@ def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: b
         else "the network for any layout, after a minute of learning this one"
     )
     lead = (
-        f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {frames:,} frames of {seen_by}. "
+        f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {frames:,} frames of "
+        f"{score.seen_by}. "
         f"Points were labeled by {network}."
     )
     write_page(path, sections, title=f"Layout {layout.name}", lead=lead)
 
 
 def _advice_section(score: LayoutScore) -> Section:
-    sentences = advice(score)
+    sentences = score.advice
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     text = f"<ol>{items}</ol>" if sentences else "Nothing stands out: no marker is in anybody's way."
     return Section("What to do", text)

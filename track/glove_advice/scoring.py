@@ -1,0 +1,106 @@
+"""How well a layout can be labeled and what it tells of each joint, before anybody wears it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gloves.layout import MarkerLayout, load_layout
+from gloves.takes.take import Take, load_take
+from handsim._checks import check_count, check_type
+from handsim.errors import ArgumentError
+from handsim.space.cameras import CameraRig, as_rig
+from track.given import AnyGlove, AnyLabeler
+from track.glove_advice.advice import advice
+from track.glove_advice.layout_score import LayoutScore, score_layout
+from track.glove_advice.observed_hands import ObservedHand, observe_motion, observe_poses
+from track.glove_advice.trials import CAPTURES, try_layout
+from train.any_layout.learned_gloves import learned_labeler
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
+
+POSES: Final = "poses"
+TWINS: Final = "twins"
+FEWEST_FRAMES: Final = 100
+_TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
+
+
+def score_glove(
+    glove: AnyGlove,
+    rig: CameraRig | str | Path = "figure5",
+    *,
+    motion: Take | str | Path = POSES,
+    labeler: AnyLabeler = None,
+    frames: int = 1500,
+    captures: int = CAPTURES,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda step: None,
+) -> LayoutScore:
+    """Score a layout as `handsim glove score` does; nothing is trained.
+
+    Args:
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        rig: The cameras, or the name or path of a rig.
+        motion: What hands do: `poses` (random people and poses), `twins` (simulated motion of one hand and of
+            two), or a take or the path of one (.npz).
+        labeler: A labeler trained on the layout, or what `load_labeler` reads; the network for any layout
+            when not given.
+        frames: Frames of hands, of a take those of each hand.
+        captures: Simulated captures of each kind of work that are labeled and tracked with nothing
+            calibrated, of different people; 0 for none.
+        seed: Seed of people, poses and cameras' losses; captures have their own.
+        progress: Called with the name of each step.
+
+    Returns:
+        Shares of labels that are right, standard deviations of joints [rad], what became of the captures, and
+        advice in sentences.
+
+    Raises:
+        ArgumentError: A number is out of range, or `motion` is something else.
+        CaptureError: The take cannot be read, or its hands are never there together.
+        LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
+    """
+    layout, cameras = load_layout(glove), as_rig(rig)
+    check_count("frames", frames, FEWEST_FRAMES)
+    check_count("captures", captures, 0)
+    rng = np.random.default_rng(seed)
+    progress("simulating hands")
+    hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
+    progress("learning the layout, about a minute the first time")
+    known = learned_labeler(layout, cameras) if labeler is None else load_labeler(layout, labeler)
+    progress("labeling")
+    score = score_layout(layout, hands, known, rng=rng)
+    trials = try_layout(
+        layout, cameras, known, count=captures, told=lambda words: progress(f"trying captures: {words}")
+    )
+    score = dataclasses.replace(score, trials=trials, seen_by=f"{seen}, seen by rig {cameras.name}")
+    return dataclasses.replace(score, advice=tuple(advice(score)))
+
+
+def _hands(
+    motion: Take | str | Path,
+    layout: MarkerLayout,
+    rig: CameraRig,
+    frames: int,
+    seed: int,
+    rng: np.random.Generator,
+) -> tuple[list[ObservedHand], str]:
+    """Hands in the motion that was asked for, and its name."""
+    check_type("motion", motion, (Take, str, Path), "a Take, or the path of one", (POSES, TWINS))
+    if motion == POSES:
+        return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
+    if motion == TWINS:
+        hands = []
+        for kind in ("single-hand", "hand-hand", "hand-pen"):
+            take = simulate_take(kind, num_frames=_TWIN_FRAMES, seed=seed)
+            hands += observe_motion(take, layout, rig, frames // 6, rng=rng)
+        return hands, "simulated motion of one hand and of two"
+    if isinstance(motion, Take):
+        return observe_motion(motion, layout, rig, frames, rng=rng), "a take"
+    if not str(motion).endswith(".npz"):
+        raise ArgumentError(f"motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
+    return observe_motion(load_take(motion), layout, rig, frames, rng=rng), f"the take {Path(motion).name}"
