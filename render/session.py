@@ -25,6 +25,7 @@ from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
+from handsim.space.rig_file import check_names
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured
 from render.formats.annotations.common import centered_K, without_colors
@@ -110,7 +111,7 @@ def render_take(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
-    _check_lenses(formats, drawing)
+    _check_cameras(formats, drawing)
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
@@ -255,11 +256,12 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
 
 
-def _check_lenses(formats: Sequence[str], drawing: Drawing) -> None:
-    """Refuse cameras that a format has no place for, before a folder is begun."""
-    if {"freihand", "interhand"} & set(formats):
-        for camera in drawing.viewpoints.cameras(0):
-            centered_K(camera)
+def _check_cameras(formats: Sequence[str], drawing: Drawing) -> None:
+    """Refuse cameras that a format or a file's name has no place for, before a folder is begun."""
+    cameras = drawing.viewpoints.cameras(0)
+    check_names("cameras", cameras)
+    for camera in cameras if {"freihand", "interhand"} & set(formats) else ():
+        centered_K(camera)
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:

@@ -97,13 +97,13 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
             return load_stored_labeler(name)
     from train.any_layout.learned_gloves import is_learned, learned_labeler  # torch
 
-    is_shipped = layout.name in list_layouts() and load_layout(layout.name) == layout
-    shown = layout.name if is_shipped else "GLOVE.toml" if isinstance(glove, MarkerLayout) else glove
+    own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
+    name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
     how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
     warnings.warn(
-        f"no labeler was trained on glove '{layout.name}', so that the one for any layout labels it, which "
-        f"{how}; a better one takes handsim generate --glove {shown} --out SET && handsim train SET --out "
-        "RUN, and --labeler RUN",
+        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
+        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
+        "train SET --out RUN, and --labeler RUN",
         HandSimWarning,
         stacklevel=3,
     )

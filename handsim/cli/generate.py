@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final
 
+import numpy as np
 import tyro
 
 from gloves.layout import load_layout
@@ -12,14 +13,14 @@ from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
 from handsim.app.progress import named_steps, print_above, progress_bar
-from handsim.errors import ArgumentError
 from handsim.hand.topology import SIDES
+from handsim.space.cameras import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
 from train.simulation.room_settings import SimulatedKind
-from train.simulation.takes import simulate_take
+from train.simulation.takes import WRIST_VOLUME, simulate_take
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
@@ -63,8 +64,8 @@ def _report(config: DatasetConfig, out: Path) -> Path:
         kind: SimulatedKind = (
             "hand-hand" if len(load_layout(config.glove).sides) == len(SIDES) else "single-hand"
         )
-        try:
-            take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
-        except ArgumentError:  # a small rig stands where hands of captures move, which no set needs
-            return write_report(Dataset(out))
+        rig = as_rig(config.rig)
+        if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
+            return write_report(Dataset(out))  # a small rig stands where hands of captures move
+        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=rig)
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

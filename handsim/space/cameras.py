@@ -226,15 +226,22 @@ def check_outside(
             )
 
 
+def distances_to_volume(
+    rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float
+) -> Float[np.ndarray, "C"]:
+    """How far each camera is from a cube [m]."""
+    middle = np.asarray(center, dtype=np.float64)
+    nearest = np.clip(rig.positions, middle - half_side, middle + half_side)
+    return np.asarray(np.linalg.norm(nearest - rig.positions, axis=1))
+
+
 def check_outside_volume(rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float) -> None:
     """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
 
     Raises:
         ArgumentError: A camera is nearer to the cube than hands reach.
     """
-    middle = np.asarray(center, dtype=np.float64)
-    nearest = np.clip(rig.positions, middle - half_side, middle + half_side)
-    distances = np.linalg.norm(nearest - rig.positions, axis=1)
+    distances = distances_to_volume(rig, center, half_side)
     if distances.min() < HAND_REACH:
         raise ArgumentError(
             f"camera {distances.argmin() + 1} of rig '{rig.name}' is {distances.min():.2g} m from the space "

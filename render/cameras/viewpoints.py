@@ -21,7 +21,6 @@ from handsim.errors import ArgumentError, HandSimWarning, RigError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.cameras import load_rig
-from handsim.space.rig_file import check_names
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.framing import Framing, looking, poses_at
@@ -88,8 +87,6 @@ class ViewConfig:
                 f"the cameras are those of {self.own_cameras}; leave out the placement, the camera and the "
                 "views"
             )
-        if isinstance(self.cameras, tuple):
-            check_names("cameras", self.cameras)
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
         check_choice(self.placement, PLACEMENTS, noun="placement")

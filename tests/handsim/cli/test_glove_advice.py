@@ -49,9 +49,9 @@ def test_an_improved_layout_is_written(mine, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["score", "GLOVE", "--motion", "dance"], "--motion is 'dance', expected poses, twins or a take"),
-        (["score", "GLOVE", "--captures", "-1"], "--captures is -1, expected 0 or more"),
-        (["score", "GLOVE", "--frames", "1"], "--frames is 1, expected at least 100"),
+        (["score", "GLOVE", "--motion", "dance"], "motion is 'dance', expected poses, twins or a take"),
+        (["score", "GLOVE", "--captures", "-1"], "captures is -1, expected 0 or more"),
+        (["score", "GLOVE", "--frames", "1"], "frames is 1, expected at least 100"),
         (
             ["score", "GLOVE", "--out", "page.pdf"],
             "--out is page.pdf, expected a file name that ends in .html",
