@@ -11,6 +11,7 @@ The rigs are written into the folder, for `python -m benchmarks.paper cameras --
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import tempfile
 from pathlib import Path
 
@@ -91,7 +92,12 @@ def rigs() -> list[CameraRig]:
         plan(count, FRAME, ("truss",), layout, CENTER, SIDES, CAMERA, name=f"planned{count}").rig
         for count in (4, 8, 12)
     ]
-    row = [CAMERA.at(look_at(np.array([x, -1.5, 1.8]), CENTER)) for x in (-0.75, -0.25, 0.25, 0.75)]
+    row = [
+        dataclasses.replace(
+            CAMERA, name=f"camera{number}", T_world_camera=look_at(np.array([x, -1.5, 1.8]), CENTER)
+        )
+        for number, x in enumerate((-0.75, -0.25, 0.25, 0.75), 1)
+    ]
     return [
         *(named_rig(name) for name in list_rigs()),
         *planned,
