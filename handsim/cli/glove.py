@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -294,7 +295,7 @@ def improve_glove(
         search.search(60.0 * minutes, lambda worth: step(_worth_line(worth)))
         step("dropping one marker at a time, to compare")
         fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
-        found, trials = search.layout, {}
+        found, trials = dataclasses.replace(search.layout, name=out.stem), {}
         for name, tried in (("before", layout), ("after", found)) if captures else ():
             step(f"learning the layout {name}, about a minute")
             known = learned_labeler(tried, cameras)
