@@ -139,7 +139,7 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and "leave out the corruption (--occlude" in said
     assert main(["evaluate", str(truth), str(truth)]) == 0
-    assert "240 frames" in capsys.readouterr().out
+    assert "240 hands in frames" in capsys.readouterr().out
 
 
 def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
