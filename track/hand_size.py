@@ -6,6 +6,7 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -35,6 +36,7 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longe
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] from the length that the labels were found with
 _PRECISION: Final = 0.001  # [m] of length
+_GOLDEN, _SQRT_EPSILON = 0.5 * (3.0 - math.sqrt(5.0)), math.sqrt(2.2e-16)  # of the search
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
 _MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
@@ -242,11 +244,44 @@ class _Search:
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """The argument between two bounds [m] with the least value of a function."""
-    from scipy.optimize import minimize_scalar  # takes longer to load than to search
+    """The argument between two bounds [m] with the least value of a function, by Brent's method (1973).
 
-    options = {"xatol": _PRECISION}
-    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
+    The same steps as scipy's, which takes longer to load than to search.
+    """
+    best = second = third = low + _GOLDEN * (high - low)  # arguments with the least values so far
+    values = {best: function(best)}
+    step = before = 0.0  # the last step and the one before it
+    while True:
+        middle, least = 0.5 * (low + high), _SQRT_EPSILON * abs(best) + _PRECISION / 3.0
+        if abs(best - middle) <= 2.0 * least - 0.5 * (high - low):
+            return best
+        first = (best - second) * (values[best] - values[third])
+        other = (best - third) * (values[best] - values[second])
+        over = (best - third) * other - (best - second) * first
+        under = 2.0 * (other - first)
+        over, under = (-over if under > 0.0 else over), abs(under)
+        if (
+            abs(before) > least
+            and abs(over) < abs(0.5 * under * before)
+            and under * (low - best) < over < under * (high - best)
+        ):  # the lowest point of a parabola through all three
+            before, step = step, over / under
+            if min(best + step - low, high - best - step) < 2.0 * least:
+                step = math.copysign(least, middle - best)
+        else:
+            before = low - best if best >= middle else high - best
+            step = _GOLDEN * before
+        tried = best + math.copysign(max(abs(step), least), step)
+        values[tried] = function(tried)
+        if values[tried] <= values[best]:
+            low, high = (best, high) if tried >= best else (low, best)
+            best, second, third = tried, best, second
+        else:
+            low, high = (tried, high) if tried < best else (low, tried)
+            if values[tried] <= values[second] or second == best:
+                second, third = tried, second
+            elif values[tried] <= values[third] or third in (best, second):
+                third = tried
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
