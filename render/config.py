@@ -84,6 +84,8 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         check_type("passes", self.passes, (str, tuple, list), "names of passes", PASSES)
+        if isinstance(self.passes, str):
+            object.__setattr__(self, "passes", (self.passes,))
         check_type("tones", self.tones, (str, tuple, list), "names of skin tones", map(hyphened, TONES))
         if isinstance(self.background, str | tuple | list):
             object.__setattr__(self, "background", BackgroundConfig.of_kinds(self.background))
@@ -92,8 +94,6 @@ class RenderConfig:
         if any(isinstance(tone, str) for tone in tones):
             object.__setattr__(self, "tones", named_tones(tones))  # type: ignore[arg-type]  # names
         check_tones(self.tones)
-        if isinstance(self.passes, str):
-            object.__setattr__(self, "passes", (self.passes,))
         for name in self.passes:
             check_choice(name, PASSES, noun="pass")
         if not self.passes or self.every < 1 or self.frames_per_shard < 1:

@@ -23,6 +23,7 @@ from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning
+from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from handsim.space.rig_file import check_names
@@ -115,8 +116,8 @@ def render_take(
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
+    settings = _settings(drawing, kept) | {"formats": list(formats)}
     with open_output(place) as output:
-        settings = _settings(drawing) | {"formats": list(formats)}
         output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
         drew = _draw_shards(output, formats, make, counts, workers, progress)
@@ -212,10 +213,11 @@ class _Telling:
                 self._progress(count, self._total)
 
 
-def _settings(drawing: Drawing) -> dict[str, Any]:
+def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     """What decides the pictures, as JSON; files count by their contents, photographs by names and sizes."""
     subject = drawing.subject
-    settings: dict[str, Any] = {"take": subject.name, "frames": subject.take.num_frames}
+    name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
+    settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
     if drawing.config.background.photo > 0.0:
         files, _ = photo_files(Path(str(drawing.config.background.photos)))

@@ -70,7 +70,7 @@ class Subject:
     take: Take
     """Poses, NaN where a hand is not there; rigid bodies; points of the optical system."""
     name: str
-    """What a rendering's settings call it: its file with its digest, or the digest of what is in memory."""
+    """What a rendering's settings call it: its file, or the digest of what is in memory."""
     cast: Cast | None = None
     """Who is in each frame; None: those whose hands these are."""
     is_motion: bool = True
@@ -166,7 +166,7 @@ def load_subject(source: Source, *, seed: int) -> Subject:
         return _load_poses(source, seed)
     take = load_take(source)
     try:
-        return Subject(take, f"{source.name}, sha256:{checksum(source)}")
+        return Subject(take, source.name)
     except ArgumentError as error:
         raise CaptureError(f"{source}: {error}") from error
 

@@ -23,9 +23,9 @@ from train.any_layout.learned_gloves import learned_labeler
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
 
-POSES: Final = "poses"
-TWINS: Final = "twins"
-FEWEST_FRAMES: Final = 100
+_POSES: Final = "poses"
+_TWINS: Final = "twins"
+_FEWEST_FRAMES: Final = 100
 _TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
 
 
@@ -33,7 +33,7 @@ def score_glove(
     glove: AnyGlove,
     rig: CameraRig | str | Path = "figure5",
     *,
-    motion: Take | str | Path = POSES,
+    motion: Take | str | Path = _POSES,
     labeler: AnyLabeler = None,
     frames: int = 1500,
     captures: int = CAPTURES,
@@ -65,7 +65,7 @@ def score_glove(
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     layout, cameras = load_layout(glove), as_rig(rig)
-    check_count("frames", frames, FEWEST_FRAMES)
+    check_count("frames", frames, _FEWEST_FRAMES)
     check_count("captures", captures, 0)
     rng = np.random.default_rng(seed)
     progress("simulating hands")
@@ -90,10 +90,10 @@ def _hands(
     rng: np.random.Generator,
 ) -> tuple[list[ObservedHand], str]:
     """Hands in the motion that was asked for, and its name."""
-    check_type("motion", motion, (Take, str, Path), "a Take, or the path of one", (POSES, TWINS))
-    if motion == POSES:
+    check_type("motion", motion, (Take, str, Path), "a Take, or the path of one", (_POSES, _TWINS))
+    if motion == _POSES:
         return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
-    if motion == TWINS:
+    if motion == _TWINS:
         hands = []
         for kind in ("single-hand", "hand-hand", "hand-pen"):
             take = simulate_take(kind, num_frames=_TWIN_FRAMES, seed=seed)
@@ -102,5 +102,5 @@ def _hands(
     if isinstance(motion, Take):
         return observe_motion(motion, layout, rig, frames, rng=rng), "a take"
     if not str(motion).endswith(".npz"):
-        raise ArgumentError(f"motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
+        raise ArgumentError(f"motion is '{motion}', expected {_POSES}, {_TWINS} or a take (.npz)")
     return observe_motion(load_take(motion), layout, rig, frames, rng=rng), f"the take {Path(motion).name}"

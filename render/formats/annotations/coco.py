@@ -24,6 +24,7 @@ from render.formats.annotations.common import (
     rounded,
     run_lengths,
     shape_record,
+    shifted_K,
 )
 from render.frames import HandTruth, RenderedFrame
 from render.skin.look import SkinLook, tone_name
@@ -45,9 +46,6 @@ CATEGORY: Final[dict[str, Any]] = {
 def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
     """The picture and its hands, still without COCO's numbers."""
     camera = frame.camera
-    K = camera.K.copy()
-    K[:2, 2] -= CENTER
-    rows: list[list[float]] = K.tolist()
     image = {
         "file_name": file_name,
         "width": camera.size[0],
@@ -55,7 +53,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
         "frame": frame.number,
         "time": frame.time,
         "camera": camera.name,
-        "K": rows,
+        "K": shifted_K(camera).tolist(),
         "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
         "T_world_camera": camera.T_world_camera.tolist(),
         "choices": frame.choices,

@@ -27,16 +27,21 @@ CENTER: Final = 0.5
 """Where our count of pixels has the first one's center [px]."""
 
 
+def shifted_K(camera: Camera) -> NDArray[np.float64]:
+    """K for pixels that are counted from the first one's center; a lens is left to its coefficients."""
+    K = camera.K.copy()
+    K[:2, 2] -= CENTER
+    return K
+
+
 def centered_K(camera: Camera) -> NDArray[np.float64]:
-    """Camera matrix for pixels that are counted from the first one's center."""
+    """`shifted_K` of a pinhole, which alone projects points; other lenses are refused."""
     if camera.lens.kind != "pinhole":
         raise HandSimError(
             f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
             "expected a pinhole camera, or the format webdataset, coco, yolo, exr or png"
         )
-    K = camera.K.copy()
-    K[:2, 2] -= CENTER
-    return K
+    return shifted_K(camera)
 
 
 def as_sensed(frame: RenderedFrame) -> Pictures:
