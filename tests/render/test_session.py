@@ -20,6 +20,7 @@ from handsim.space.camera import look_at, pinhole, preset
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import Drawing, draw
+from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import TONES
@@ -270,3 +271,31 @@ def test_a_camera_inside_a_hand_is_refused(path):
     pose[:3, 3] = take.hands[0].model.skin(take.qpos[:1, 0])[0, 100] + 0.002
     with pytest.raises(HandSimError, match="mm from a hand or object in frame 0"):
         list(draw(path, config=PLAIN, frames=[0], camera=preset("vga").at(pose)))
+
+
+def test_another_take_under_the_same_name_is_refused(path, tmp_path):
+    file, out = tmp_path / "take.npz", tmp_path / "pics"
+    config = RenderConfig(passes=("depth",), depth_sensor=None, every=24)
+    take = load_take(path)
+    take.save(file)
+    assert render_take(file, out, "png", config, workers=1) == render_take(file, out, "png", config) == 2
+    qpos = take.qpos.copy()
+    qpos[..., 7:] *= 0.5
+    dataclasses.replace(take, qpos=qpos).save(file)
+    with pytest.raises(HandSimError, match="begun with other settings"):
+        render_take(file, out, "png", config, workers=1)
+
+
+def test_another_photograph_is_another_rendering(path, tmp_path):
+    folder, out = tmp_path / "photos", tmp_path / "pics"
+    folder.mkdir()
+    photograph = np.full((48, 64, 3), 90, dtype=np.uint8)
+    cv2.imwrite(str(folder / "one.png"), photograph)
+    config = RenderConfig(
+        passes=("rgb",), background={"photo": 1.0, "photos": str(folder)}, color_sensor=None, every=48
+    )
+    assert render_take(path, out, "png", config, workers=1) == 1
+    cv2.imwrite(str(folder / "two.png"), photograph)
+    photo_files.cache_clear()  # as in another process
+    with pytest.raises(HandSimError, match="begun with other settings"):
+        render_take(path, out, "png", config, workers=1)
