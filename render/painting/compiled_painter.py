@@ -163,7 +163,7 @@ def _add_surface(
 
     `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
     all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9)
-    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (N, 4) of the covered pixels is
+    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (N, 4) of covered pixels is
     added to.
     """
     width, end = first.shape[1] // 2, begin + len(faces)

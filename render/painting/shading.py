@@ -33,7 +33,9 @@ _EDGE: Final = np.float32(0.001)  # cosine of the flattest view that is told apa
 _LEVELS: Final = 2048
 _PARTS: Final = np.float32(8.0)
 _SRGB = np.arange(255 * int(_PARTS) + 1) / (255.0 * _PARTS)
-TO_LINEAR: Final = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(np.float32)
+TO_LINEAR: Final = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
+    np.float32
+)
 """Linear light of sRGB values from 0 to 255 in eighths."""
 TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** (2.0 / GAMMA)).astype(
     np.float32

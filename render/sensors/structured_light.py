@@ -102,7 +102,11 @@ def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
     """Clear what is `shadowed` of `kept` (H, W)."""
     height, width = disparity.shape
-    most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0) if disparity.size else np.float32(1.0)
+    most = (
+        np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
+        if disparity.size
+        else np.float32(1.0)
+    )
     first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
     for row in range(height):
         first[:] = 0.0
