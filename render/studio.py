@@ -33,6 +33,7 @@ from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
+from render.sensors.time_of_flight import TimeOfFlight
 from render.skin.forearm import upper_arms
 from render.skin.look import SkinLook
 
@@ -287,7 +288,9 @@ class Studio:
             truth, **{name: None if picture is None else picture[part] for name, picture in cut.items()}
         )
         assert inner.depth is not None
-        light = self._infrared(inner, None if rgb is None else rgb[part], present)
+        light = None
+        if isinstance(sensor, TimeOfFlight):  # others need none
+            light = self._infrared(inner, None if rgb is None else rgb[part], present)
         noisy[part] = apply_depth_noise(
             inner.depth,
             inner.normals,

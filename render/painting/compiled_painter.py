@@ -22,14 +22,13 @@ from render.painting.shading import (
     COLOR,
     NORMAL,
     POSITION,
-    ROUGH,
+    ROUGHEST,
     SPOT,
     TANGENT,
     TINT,
     TO_DISPLAY,
     TO_LINEAR,
     display,
-    read_texels,
     shade,
 )
 from render.painting.shadows import shadow_map
@@ -37,12 +36,11 @@ from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
 _SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
-_ROUGHEST: Final = np.float32(0.04)  # that a mirror can be
 _BLOCK: Final = (
     1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
 )
 
-_NO_TEXELS: Final = np.empty((0, 0, 8), dtype=np.uint8)
+_NO_TEXELS: Final = np.empty((0, 0, 2), dtype=np.uint32)
 
 
 class _Mesh(NamedTuple):
@@ -55,8 +53,8 @@ class _Mesh(NamedTuple):
     """Of `rasterizer.project` (V, 3) at twice the picture's size."""
     rows: NDArray[np.float32]
     """Position [m], normal, tint and texture coordinates of each vertex (V, 11)."""
-    texels: NDArray[np.uint8]
-    """Empty where there is no texture."""
+    texels: NDArray[np.uint32]
+    """Two words a texel (h, w, 2); empty where there is no texture."""
     finish: NDArray[np.float64]
     """Color, roughness, glow and scatter."""
 
@@ -77,21 +75,21 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
         inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
     points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
     shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
-    sums = np.zeros((height, width, 4), dtype=np.float32)
     covered = _covered(first)
+    sums = np.zeros((len(covered), 4), dtype=np.float32)
     for mesh in meshes:
         _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
     painted = np.zeros((height, width, 4), dtype=np.uint8)
-    _as_bytes(sums.reshape(-1, 4), covered, painted.reshape(-1, 4))
+    _as_bytes(sums, covered, painted.reshape(-1, 4))
     return painted
 
 
 @kernel
 def _as_bytes(sums: NDArray[np.float32], covered: NDArray[np.int32], painted: NDArray[np.uint8]) -> None:
-    """Write the bytes of covered pixels (P, 4), of sums over four samples (P, 4)."""
-    for pixel in covered:
+    """Write the bytes of covered pixels into a picture (P, 4), of their sums over four samples (N, 4)."""
+    for place, pixel in enumerate(covered):
         for channel in range(4):
-            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[pixel, channel]))
+            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[place, channel]))
 
 
 def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
@@ -106,7 +104,7 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
         rows[:, 6:9] = one.colors[:, :3]
         if one.uv is not None:
             rows[:, 9:] = one.uv
-        texels = _NO_TEXELS if material.texels is None else material.texels
+        texels = _NO_TEXELS if material.texels is None else material.texels.view(np.uint32)
         faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
         finish = np.array([*material.color, material.roughness, material.glow, *material.scatter])
         meshes.append(_Mesh(begin, faces, project(local, doubled), rows, texels, finish))
@@ -150,7 +148,7 @@ def _add_surface(
     faces: NDArray[np.int64],
     corners: NDArray[np.float64],
     rows: NDArray[np.float32],
-    texels: NDArray[np.uint8],
+    texels: NDArray[np.uint32],
     finish: NDArray[np.float64],
     to_linear: NDArray[np.float32],
     lamps: NDArray[np.float64],
@@ -165,22 +163,23 @@ def _add_surface(
 
     `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
     all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9)
-    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (H, W, 4) is added to.
+    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (N, 4) of covered pixels is
+    added to.
     """
     width, end = first.shape[1] // 2, begin + len(faces)
-    flat = sums.reshape(-1, 4)
     block = np.empty((SPOT, _BLOCK), np.float32)
-    pixels, shares = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.float32)
+    places, shares = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.float32)
     spot = row = start = 0
     for place in range(len(covered) + 1):
         if spot > _BLOCK - 4 or place == len(covered):
             spots = np.ascontiguousarray(block[:, :spot])
-            light = shade(spots, len(texels) > 0, finish, lamps, ambient, to_map, nearest, bias)
+            light = shade(spots, texels, finish, to_linear, lamps, ambient, to_map, nearest, bias)
+            for k in range(3):
+                display(light[k], spots[TINT + k], to_display)
             for n in range(spot):
-                pixel, share = pixels[n], shares[n]
                 for k in range(3):
-                    flat[pixel, k] += share * display(spots[TINT + k, n] * light[k, n], to_display)
-                flat[pixel, 3] += share
+                    sums[places[n], k] += shares[n] * light[k, n]
+                sums[places[n], 3] += shares[n]
             spot = 0
         if place == len(covered):
             break
@@ -208,11 +207,10 @@ def _add_surface(
                     2 * row + y,
                     texels,
                     finish,
-                    to_linear,
                     block,
                     spot,
                 )
-                pixels[spot], shares[spot] = pixel, 4.0 if smooth else 1.0
+                places[spot], shares[spot] = place, 4.0 if smooth else 1.0
                 spot += 1
 
 
@@ -240,9 +238,8 @@ def _write_spot(
     c: int,
     x: float,
     y: float,
-    texels: NDArray[np.uint8],
+    texels: NDArray[np.uint32],
     finish: NDArray[np.float64],
-    to_linear: NDArray[np.float32],
     spots: NDArray[np.float32],
     spot: int,
 ) -> None:
@@ -253,10 +250,10 @@ def _write_spot(
     ax, ay = corners[a, 0], corners[a, 1]
     bx, by = corners[b, 0] - ax, corners[b, 1] - ay
     cx, cy = corners[c, 0] - ax, corners[c, 1] - ay
-    scale = 1.0 / (bx * cy - by * cx)
-    second = max(((x - ax) * cy - (y - ay) * cx) * scale, 0.0)
-    third = max(((y - ay) * bx - (x - ax) * by) * scale, 0.0)
-    first = max(1.0 - second - third, 0.0) * corners[a, 2]
+    whole = by * cx - bx * cy  # positive, as of all faces that are drawn
+    second = max((y - ay) * cx - (x - ax) * cy, 0.0)
+    third = max((x - ax) * by - (y - ay) * bx, 0.0)
+    first = max(whole - second - third, 0.0) * corners[a, 2]
     second, third = second * corners[b, 2], third * corners[c, 2]
     scale = 1.0 / (first + second + third)
     first, second, third = (
@@ -271,18 +268,9 @@ def _write_spot(
     for i in range(3):
         spots[NORMAL + i, spot] = first * rows[a, 3 + i] + second * rows[b, 3 + i] + third * rows[c, 3 + i]
         spots[TINT + i, spot] = first * rows[a, 6 + i] + second * rows[b, 6 + i] + third * rows[c, 6 + i]
-    red, green, blue, rough = (
-        np.float32(finish[0]),
-        np.float32(finish[1]),
-        np.float32(finish[2]),
-        np.float32(finish[3]),
-    )
     if len(texels):
-        u = first * rows[a, 9] + second * rows[b, 9] + third * rows[c, 9]
-        v = first * rows[a, 10] + second * rows[b, 10] + third * rows[c, 10]
-        r, g, b_, shine, across, up, out = read_texels(texels, to_linear, u, v)
-        red, green, blue, rough = red * r, green * g, blue * b_, rough * shine
-        spots[BUMP, spot], spots[BUMP + 1, spot], spots[BUMP + 2, spot] = across, up, out
+        for i in range(2):
+            spots[BUMP + i, spot] = first * rows[a, 9 + i] + second * rows[b, 9 + i] + third * rows[c, 9 + i]
         bu, bv = rows[b, 9] - rows[a, 9], rows[b, 10] - rows[a, 10]
         cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
         sign = np.float32(1.0 if bu * cv - cu * bv >= 0.0 else -1.0)
@@ -290,5 +278,6 @@ def _write_spot(
             spots[TANGENT + i, spot] = sign * (
                 cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
             )
-    spots[COLOR, spot], spots[COLOR + 1, spot], spots[COLOR + 2, spot] = red, green, blue
-    spots[ROUGH, spot] = rough if rough > _ROUGHEST else _ROUGHEST
+    else:
+        for i in range(4):  # no mirror is perfect
+            spots[COLOR + i, spot] = np.float32(finish[i] if i < 3 else max(finish[i], ROUGHEST))

@@ -6,6 +6,7 @@ import functools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
@@ -64,5 +65,7 @@ def skin_material(texture: SkinTexture) -> Material:
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
     """Vertex colors for `DrawnSkin.shade`: red light passes through flesh into the folds."""
     colors = np.ones((len(shade), 4), dtype=np.float32)
-    colors[:, :3] = (1.0 - _FOLDS * (1.0 - shade))[:, None] ** np.array([0.8, 1.0, 1.05], dtype=np.float32)
+    lit = 1.0 - _FOLDS * (1.0 - shade)
+    for channel, power in enumerate((0.8, 1.0, 1.05)):
+        colors[:, channel] = cv2.pow(lit, power).reshape(-1)
     return colors

@@ -20,7 +20,7 @@ from render.scenery.lights import Lighting
 
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
-_WHITE: Final = 255.0
+_WHITE: Final = np.float32(255.0)
 _STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL reallocate its buffers
 
 
@@ -56,19 +56,30 @@ def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]
     width, height = camera.size
     if not drawn:
         return 0, 0, 0, 0
-    local = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
-    x, y, depth = np.ascontiguousarray(local.T)  # rows, whose extremes are found ten times as fast
-    if depth.min() < NEAR:
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for one in drawn:
+        _widen(camera.local(one.triangles.vertices), camera.K, low, high)
+    if low[2] < NEAR:
         return 0, 0, width, height
-    pixels = np.stack(
-        [x / depth * camera.K[0, 0] + camera.K[0, 2], y / depth * camera.K[1, 1] + camera.K[1, 2]]
-    )
-    low, high = np.floor(pixels.min(axis=1) - 1.0), np.ceil(pixels.max(axis=1) + 1.0)
+    low, high = np.floor(low[:2] - 1.0), np.ceil(high[:2] + 1.0)
     left, top = (np.clip(low, 0, camera.size) // _STEP * _STEP).astype(int)
     right, bottom = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size).astype(
         int
     )
     return int(left), int(top), int(right), int(bottom)
+
+
+@kernel
+def _widen(
+    local: NDArray[np.float64], K: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> None:
+    """Widen a range (3,) of columns, rows [px] and depths [m] to points in the camera's axes (V, 3)."""
+    for point in range(len(local)):
+        depth = local[point, 2]
+        low[2], high[2] = min(low[2], depth), max(high[2], depth)
+        for axis in range(2):
+            place = local[point, axis] / depth * K[axis, axis] + K[axis, 2]
+            low[axis], high[axis] = min(low[axis], place), max(high[axis], place)
 
 
 def put_before(
@@ -88,9 +99,12 @@ def put_before(
 @kernel
 def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
     """Write painted colors with coverage (P, 4) over a background; see `put_before`."""
+    behind, bare = background.reshape(-1), mixed.reshape(-1)
+    for n in range(len(bare)):
+        bare[n] = np.int32(behind[n] if behind[n] < _WHITE else _WHITE)
     for pixel in range(len(mixed)):
-        clear = 1.0 - painted[pixel, 3] / _WHITE
-        for channel in range(3):
-            mixed[pixel, channel] = int(
-                min(painted[pixel, channel] + clear * background[pixel, channel], _WHITE)
-            )
+        if painted[pixel, 3]:
+            clear = 1.0 - painted[pixel, 3] / 255.0
+            for channel in range(3):
+                value = painted[pixel, channel] + clear * background[pixel, channel]
+                mixed[pixel, channel] = int(min(value, 255.0))

@@ -27,14 +27,19 @@ _ONE: Final = np.float32(1.0)
 _HALF: Final = np.float32(0.5)
 _TINY: Final = np.float32(1e-12)
 _LEAST: Final = np.float32(1e-30)
+ROUGHEST: Final = np.float32(0.04)
+"""Roughness of the smoothest mirror."""
 _EDGE: Final = np.float32(0.001)  # cosine of the flattest view that is told apart
 _LEVELS: Final = 2048
-_BYTES = np.arange(256) / 255.0
-TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4).astype(
+_PARTS: Final = np.float32(8.0)
+_SRGB = np.arange(255 * int(_PARTS) + 1) / (255.0 * _PARTS)
+TO_LINEAR: Final = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
     np.float32
 )
-"""Linear light of sRGB bytes."""
-TO_DISPLAY: Final = (np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)).astype(np.float32)
+"""Linear light of sRGB values from 0 to 255 in eighths."""
+TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** (2.0 / GAMMA)).astype(
+    np.float32
+)
 """Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
 
 SPOT: Final = 23
@@ -46,45 +51,85 @@ finds: unit vector to the camera (3) and its cosine with the normal."""
 POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 12, 13, 16, 19, 22
 
 
-@kernel(inline=True)
-def display(light: float, table: NDArray[np.float32]) -> float:
-    """The display value of linear light, clipped to [0, 1]; `table` is `TO_DISPLAY` (2048,)."""
-    root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
-    low = min(int(root), _LEVELS - 2)
-    value: float = table[low] + (root - low) * (table[low + 1] - table[low])
-    return value
+@kernel
+def display(light: NDArray[np.float32], tint: NDArray[np.float32], table: NDArray[np.float32]) -> None:
+    """Turn linear light (N,) of this tint (N,) into display values in [0, 1]; `table` is `TO_DISPLAY`."""
+    for n in range(len(light)):
+        value = tint[n] * light[n]
+        value = value if value > _ZERO else _ZERO
+        light[n] = np.sqrt(value if value < _ONE else _ONE) * np.float32(_LEVELS - 1)
+    for n in range(len(light)):
+        low = np.int32(light[n])
+        light[n] = table[low] + (light[n] - np.float32(low)) * (table[low + 1] - table[low])
 
 
-@kernel(inline=True)
-def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float, v: float) -> Any:
-    """Linear color (3), roughness and normal (3) of a texture (h, w, 8) at u, right, and v, up; bilinear.
-
-    See `Material.texels`; the table is `TO_LINEAR` (256,).
-    """
+@kernel
+def _read_texels(
+    spots: NDArray[np.float32],
+    texels: NDArray[np.uint32],
+    finish: NDArray[np.float64],
+    table: NDArray[np.float32],
+) -> None:
+    """Write color, roughness and relief of surface points, bilinear between texels; see `shade`."""
     rows, columns = texels.shape[:2]
-    across = min(max(u * columns - 0.5, 0.0), columns - 1.001)
-    down = min(max((1.0 - v) * rows - 0.5, 0.0), rows - 1.001)
-    column, row = int(across), int(down)
-    right, below = np.float32(across - column), np.float32(down - row)
-    red = green = blue = rough = x = y = z = _ZERO
-    for i in range(2):
-        for j in range(2):
-            share = (below if i else _ONE - below) * (right if j else _ONE - right)
-            red += share * table[texels[row + i, column + j, 0]]
-            green += share * table[texels[row + i, column + j, 1]]
-            blue += share * table[texels[row + i, column + j, 2]]
-            rough += share * np.float32(texels[row + i, column + j, 3])
-            x += share * np.float32(texels[row + i, column + j, 4])
-            y += share * np.float32(texels[row + i, column + j, 5])
-            z += share * np.float32(texels[row + i, column + j, 6])
-    return red, green, blue, rough / 255.0, x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
+    flat, count = texels.reshape(-1), spots.shape[1]
+    right, below = np.empty(count, np.float32), np.empty(count, np.float32)
+    at = np.empty(count, np.int64)
+    wide, high, u, v = np.float32(columns), np.float32(rows), spots[BUMP], spots[BUMP + 1]
+    last, lowest = np.float32(columns - 1.001), np.float32(rows - 1.001)
+    for n in range(count):
+        across, down = u[n] * wide - _HALF, (_ONE - v[n]) * high - _HALF
+        across, down = across if across > _ZERO else _ZERO, down if down > _ZERO else _ZERO
+        across, down = across if across < last else last, down if down < lowest else lowest
+        column, row = np.int32(across), np.int32(down)
+        right[n], below[n] = across - np.float32(column), down - np.float32(row)
+        at[n] = 2 * (row * columns + column)
+    near = np.empty((4, count), np.uint32)
+    for half in range(2):
+        for n in range(count):
+            first = np.uint64(at[n] + half)
+            second = np.uint64(at[n] + half + 2 * columns)
+            near[0, n], near[1, n] = flat[first], flat[first + np.uint64(2)]
+            near[2, n], near[3, n] = flat[second], flat[second + np.uint64(2)]
+        for k in range(4 - half):
+            _mix_bytes(near, np.uint32(8 * k), right, below, spots[(BUMP if half else COLOR) + k])
+    for k in range(3):
+        color, relief, factor = spots[COLOR + k], spots[BUMP + k], np.float32(finish[k])
+        for n in range(count):
+            color[n] = factor * table[np.uint32(_PARTS * color[n] + _HALF)]
+        for n in range(count):
+            relief[n] = relief[n] * np.float32(1.0 / 127.5) - _ONE
+    rough, factor = spots[ROUGH], np.float32(finish[3] / 255.0)
+    for n in range(count):
+        value = factor * rough[n]
+        rough[n] = value if value > ROUGHEST else ROUGHEST
+
+
+@kernel
+def _mix_bytes(
+    near: NDArray[np.uint32],
+    bits: np.uint32,
+    right: NDArray[np.float32],
+    below: NDArray[np.float32],
+    mixed: NDArray[np.float32],
+) -> None:
+    """Write the means (N,) of one byte of four texels (4, N), left and right of above and below."""
+    a, b, c, d = near[0], near[1], near[2], near[3]
+    low = np.uint32(255)
+    for n in range(len(mixed)):
+        first, second = np.float32(np.int32((a[n] >> bits) & low)), np.float32(np.int32((b[n] >> bits) & low))
+        third, fourth = np.float32(np.int32((c[n] >> bits) & low)), np.float32(np.int32((d[n] >> bits) & low))
+        first += right[n] * (second - first)
+        third += right[n] * (fourth - third)
+        mixed[n] = first + below[n] * (third - first)
 
 
 @kernel
 def shade(
     spots: NDArray[np.float32],
-    mapped: bool,
+    texels: NDArray[np.uint32],
     finish: NDArray[np.float64],
+    table: NDArray[np.float32],
     lamps: NDArray[np.float64],
     ambient: NDArray[np.float64],
     to_map: NDArray[np.float64],
@@ -106,7 +151,8 @@ def shade(
     count = spots.shape[1]
     normals, views = spots[NORMAL : NORMAL + 3], spots[VIEW : VIEW + 3]
     _normalize(normals)
-    if mapped:
+    if len(texels):
+        _read_texels(spots, texels, finish, table)
         _map_normals(normals, spots[TANGENT : TANGENT + 3], spots[BUMP : BUMP + 3])
     views[:] = -spots[POSITION : POSITION + 3]
     _normalize(views)

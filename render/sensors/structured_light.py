@@ -10,11 +10,11 @@ import functools
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from render.sensors.random_images import normal_numbers, quantiles, random_words
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
@@ -63,25 +63,28 @@ def measure(
     Cosines are of the angles between normals and the rays that come back (None: all surfaces face), `focal`
     is the camera's horizontal focal length [px].
     """
-    scale = np.float32(noise.baseline * focal)
+    scale, height, width = np.float32(noise.baseline * focal), *depth.shape
     with np.errstate(divide="ignore"):
         ideal = np.where(depth > 0.0, scale / depth, np.float32(0.0))
     kept = (depth >= noise.nearest) & (depth <= noise.farthest)
     if cosines is not None:
         kept &= cosines >= np.cos(noise.steepest)
     if noise.support > 0.0:
-        kept &= _supported(ideal, noise, rng=rng)
+        coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
+        needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
+        _keep_supported(ideal, needed.astype(np.int64), int(noise.agreement * _FIXED), kept)
     if noise.shadow:
-        kept &= ~shadowed(ideal)
-    disparity = _shifted(ideal, noise.shift, rng=rng) if noise.shift > 0.0 else ideal
-    if noise.disparity_noise > 0.0:
-        disparity = disparity + np.float32(noise.disparity_noise) * normal_numbers(depth.shape, rng=rng)
-    if noise.step > 0.0:
-        disparity = np.rint(disparity / np.float32(noise.step)) * np.float32(noise.step)
-    elif disparity is ideal:  # nothing to round and nothing to add: the depth itself
+        _keep_lit(ideal, kept)
+    if max(noise.shift, noise.disparity_noise, noise.step) <= 0.0:
         return np.where(kept, depth, np.float32(0.0))
-    kept &= disparity > 0.5 * scale / noise.farthest
-    return np.where(kept, scale / np.maximum(disparity, np.float32(1e-6)), np.float32(0.0))
+    moved, wavering = noise.shift > 0.0, noise.disparity_noise > 0.0
+    shifts = random_words((2, height, width) if moved else (2, 0, 0), rng=rng)
+    words = random_words((height, width) if wavering else (0, 0), rng=rng)
+    measured = np.zeros_like(depth)
+    table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
+    step = np.float32(noise.step)
+    _match(ideal, kept, shifts, _whole_shifts(noise.shift), words, table, step, least, scale, measured)
+    return measured
 
 
 def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
@@ -90,55 +93,95 @@ def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     A pixel of disparity d is d columns further left in the projector's picture. Where several pixels fall on
     one of its columns, the nearest one is visible to it.
     """
+    lit = np.ones(disparity.shape, np.bool_)
+    _keep_lit(disparity, lit)
+    return ~lit
+
+
+@kernel
+def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
+    """Clear what is `shadowed` of `kept` (H, W)."""
     height, width = disparity.shape
-    most = int(np.ceil(disparity.max(initial=0.0))) + 1
-    columns = np.arange(width, dtype=np.float32) - disparity + np.float32(most)
-    cells = np.rint(columns).astype(np.intp)
-    cells += np.arange(height)[:, None] * (width + most)
-    first = np.zeros((height, width + most), np.float32)
-    np.maximum.at(first.ravel(), cells.ravel(), disparity.ravel())
-    first = cv2.dilate(first, np.ones((1, 3), np.uint8))  # close what rounding left open
-    hidden: NDArray[np.bool_] = first.ravel().take(cells) > disparity + np.float32(_SHADOW_SLACK)
-    return hidden
+    most = (
+        np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
+        if disparity.size
+        else np.float32(1.0)
+    )
+    first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
+    for row in range(height):
+        first[:] = 0.0
+        for column in range(width):
+            near = disparity[row, column]
+            cells[column] = 1 + int(np.rint(np.float32(column) - near + most))
+            first[cells[column]] = max(first[cells[column]], near)
+        for column in range(width):
+            if kept[row, column]:  # neighbors close what rounding left open
+                cell = cells[column]
+                nearest = max(first[cell - 1], first[cell], first[cell + 1])
+                kept[row, column] = nearest <= disparity[row, column] + np.float32(_SHADOW_SLACK)
 
 
-def _supported(
-    disparity: NDArray[np.float32], noise: StructuredLight, *, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Where enough of the window's dots agree with its middle."""
+@kernel
+def _keep_supported(
+    disparity: NDArray[np.float32], needed: NDArray[np.int64], most: int, kept: NDArray[np.bool_]
+) -> None:
+    """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
+
+    `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
+    """
     height, width = disparity.shape
-    fixed = np.minimum(disparity * np.float32(_FIXED), np.float32(32767.0)).astype(np.int16)
-    wide = cv2.copyMakeBorder(fixed, 3, 3, 3, 3, cv2.BORDER_REPLICATE)
-    most = np.int16(noise.agreement * _FIXED)
-    agreed = np.zeros((height, width), np.uint8)
-    for down in _DOTS:
-        for right in _DOTS:
-            if down or right:
-                other = wide[3 + down : 3 + down + height, 3 + right : 3 + right + width]
-                agreed += cv2.absdiff(fixed, other) <= most
-    coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
-    needed = 8.0 * (noise.support + noise.wavering * coarse)
-    most_needed = np.clip(np.ceil(needed), 0, 8).astype(np.uint8)  # where all agree, nothing is lost
-    patches = cv2.resize(most_needed, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
-    enough: NDArray[np.bool_] = agreed >= patches[:height, :width]
-    return enough
+    fixed = np.empty((height, width), np.int16)
+    for row in range(height):
+        for column in range(width):
+            fixed[row, column] = int(min(disparity[row, column] * np.float32(_FIXED), np.float32(32767.0)))
+    for row in range(height):
+        for column in range(width):
+            if not kept[row, column]:
+                continue
+            middle, agreed = fixed[row, column], -1
+            for down in _DOTS:
+                for right in _DOTS:
+                    i, j = min(max(row + down, 0), height - 1), min(max(column + right, 0), width - 1)
+                    agreed += abs(fixed[i, j] - middle) <= most
+            # Where all agree, nothing is lost.
+            kept[row, column] = agreed >= min(needed[row // 3, column // 3], len(_DOTS) ** 2 - 1)
 
 
-def _shifted(
-    picture: NDArray[np.float32], deviation: float, *, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Each pixel taken from some whole pixels away: no value is made up between near and far."""
-    height, width = picture.shape
-    offsets = _whole_shifts(deviation)
-    words = random_words((2, height, width), rng=rng)
-    rows = np.arange(height, dtype=np.int32)[:, None] + offsets.take(words[0], mode="clip")
-    columns = np.arange(width, dtype=np.int32) + offsets.take(words[1], mode="clip")
-    np.clip(rows, 0, height - 1, out=rows)
-    np.clip(columns, 0, width - 1, out=columns)
-    rows *= width
-    rows += columns
-    moved: NDArray[np.float32] = picture.ravel().take(rows)
-    return moved
+@kernel
+def _match(
+    disparity: NDArray[np.float32],
+    kept: NDArray[np.bool_],
+    shifts: NDArray[np.uint16],
+    offsets: NDArray[np.int32],
+    words: NDArray[np.uint16],
+    noise: NDArray[np.float32],
+    step: np.float32,
+    least: np.float32,
+    scale: np.float32,
+    depth: NDArray[np.float32],
+) -> None:
+    """Write the depth [m] of the pixels that are kept.
+
+    Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
+    then come noise and rounding. Random words pick offsets (65536,) [px] and noise (65536,) [px]; those of
+    shape 0 pick none. Less than the `least` disparity is nothing.
+    """
+    height, width = disparity.shape
+    for row in range(height):
+        for column in range(width):
+            if not kept[row, column]:
+                continue
+            i, j = row, column
+            if shifts.shape[1]:
+                i = min(max(row + offsets[shifts[0, row, column]], 0), height - 1)
+                j = min(max(column + offsets[shifts[1, row, column]], 0), width - 1)
+            value = disparity[i, j]
+            if len(words):
+                value += noise[words[row, column]]
+            if step > 0.0:
+                value = np.rint(value / step) * step
+            if value > least:
+                depth[row, column] = scale / max(value, np.float32(1e-6))
 
 
 @functools.lru_cache(maxsize=16)

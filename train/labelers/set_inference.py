@@ -296,21 +296,21 @@ def _exchange(
     normed = _layer_norm(features, rounds.norm, one)
     ends = _dense(normed, rounds.ends, one)  # receivers, then senders
     gate = np.dot(rounds.distance_gate[one], bumps)
-    for g in range(num_gates):
-        for i in range(count):
-            for j in range(count):
-                gate[g, i * count + j] += ends[i, g] + ends[j, num_gates + g]
+    for g in range(num_gates):  # bumps are alike both ways: receivers lie next to one another
+        for j in range(count):
+            for i in range(count):
+                gate[g, j * count + i] += ends[i, g] + ends[j, num_gates + g]
     _sigmoid(gate.ravel(), bits, scale)
     values = _dense(normed, rounds.values, one)
-    received, per_gate = np.zeros((count, width), dtype=np.float32), width // num_gates
-    for g in range(num_gates):
-        first = g * per_gate
+    sums, received = np.zeros((width, count), dtype=np.float32), np.empty((count, width), dtype=np.float32)
+    for column in range(width):
+        g = column * num_gates // width
+        for j in range(count):
+            value = values[j, column]
+            for i in range(count):
+                sums[column, i] += gate[g, j * count + i] * value
         for i in range(count):
-            for j in range(count):
-                weight = gate[g, i * count + j]
-                for column in range(first, first + per_gate):
-                    received[i, column] += weight * values[j, column]
-    received /= _MESSAGES
+            received[i, column] = sums[column, i] / _MESSAGES
     features += _dense(received, rounds.mix, one)
 
 
