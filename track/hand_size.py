@@ -27,7 +27,7 @@ from track.calibration.solver import levenberg_marquardt, shared_covariance, use
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status
+from track.tracked_frame import Status, TrackedHand
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 
@@ -44,6 +44,8 @@ _INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do r
 _FRAMES: Final = 8  # of each hand with which length and breadth are searched
 _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
 _MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
+_SOME_FRAMES: Final = 0.1  # the same of hands that fit well; hands that touch seldom begin a track
+_FITS_WELL: Final = 0.00175  # [m] median RMS distance; where points that are no hand's are found, it is more
 _FEWEST: Final = 3  # frames with which a size is trusted
 _MISSING: Final = 0.2  # share of the markers at most in such a frame
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
@@ -136,15 +138,29 @@ def _fit_from(
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
-    """Whether hands that were measured by weak evidence are found by the usual one in most frames."""
-    tracker = Tracker(fit.hands(sides), labeler)
-    least = (1.0 - _MISSING) * fit.hand.layout.num_markers
-    tracked = [
-        any(hand.has_pose for hand in tracker.step(frame.points, frame.ids, frame.time).hands)
-        for frame in frames
-        if len(frame.points) >= least
-    ]
-    return bool(np.mean(tracked) >= _MOST_FRAMES) if tracked else False
+    """Whether hands that were measured by weak evidence are found by the usual one.
+
+    In most frames; or in some of them, where most of their markers are there and fit well.
+    """
+    tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
+    enough = [frame for frame in frames if _are_enough(frame, count)]
+    tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
+    if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _MOST_FRAMES * len(enough)):
+        return True
+    shown = [[hand.rms for hand in hands if _is_shown(hand, count)] for hands in tracked]
+    rms = [one for row in shown for one in row]
+    some = sum(map(bool, shown)) >= max(1.0, _SOME_FRAMES * len(enough))
+    return some and float(np.median(rms)) <= _FITS_WELL
+
+
+def _are_enough(frame: StreamedFrame, count: int) -> bool:
+    """Whether a frame has points for most of the markers of a hand."""
+    return len(frame.points) >= (1.0 - _MISSING) * count
+
+
+def _is_shown(hand: TrackedHand, count: int) -> bool:
+    """Whether most of the markers of a hand are there."""
+    return hand.status in _FITTED and len(hand.filled) <= _MISSING * count
 
 
 def usual_breadth(length: float) -> float:
@@ -177,9 +193,9 @@ def _label(
     for frame in frames:
         if in_vain == _PATIENCE and not any(found):
             break
-        in_vain += len(frame.points) >= (1.0 - _MISSING) * count
+        in_vain += _are_enough(frame, count)
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
-            if seen.status in _FITTED and len(seen.filled) <= _MISSING * count:
+            if _is_shown(seen, count):
                 markers = seen.markers.copy()
                 markers[seen.filled] = np.nan
                 some.append(markers)

@@ -46,7 +46,8 @@ def load_labeler(
         WeightsError: The labeler is unknown, damaged, or knows other markers.
 
     Warns:
-        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout.
+        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout; or such a
+            glove is nearly its own mirror image.
     """
     if labeler is None:
         return _of_layout(load_layout(glove), glove) if _is_layout(glove) else _of(glove)  # type: ignore[arg-type]
@@ -96,6 +97,7 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
         if load_layout(name) == layout:
             return load_stored_labeler(name)
     from train.any_layout.learned_gloves import is_learned, learned_labeler  # torch
+    from train.labelers.side import is_mirror_like  # kernels
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
@@ -107,6 +109,13 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
         HandSimWarning,
         stacklevel=3,
     )
+    if is_mirror_like(layout):
+        warnings.warn(
+            f"glove '{name}' is nearly its own mirror image, so that right and left may be exchanged for a "
+            "whole capture; put a marker on the thumb, or move those on the back away from any symmetry",
+            HandSimWarning,
+            stacklevel=3,
+        )
     return learned_labeler(layout)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -12,7 +14,15 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from handsim.hand.topology import DIGITS
 from poses.motion.motions import sample_motion
-from track.hand_size import _PRECISION, _least, fit_size, sample_frames, usual_breadth
+from track.hand_size import (
+    _PRECISION,
+    SizeFit,
+    _is_found,
+    _least,
+    fit_size,
+    sample_frames,
+    usual_breadth,
+)
 from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
@@ -127,3 +137,34 @@ def test_hands_of_few_markers_are_measured_though_no_usual_hand_fits_them():
     assert found is not None
     true = take.hands[0].shape.length
     assert abs(found.hand.shape.length - true) < 3.0 * found.spread and "unsure" in str(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_hands_of_eight_markers_that_touch_all_the_time_are_measured(mirror):
+    """Few of the frames begin a track, but in these the measured hands fit."""
+    layout = load_layout("tips8")
+    take = simulate_take("hand-hand", glove=layout, num_frames=600, rig="figure5", seed=53)
+    capture = take.capture()
+    mirrored = dataclasses.replace(capture, positions=capture.positions * [mirror, 1.0, 1.0])
+    found = fit_size(sample_frames(checked_frames(mirrored)), layout, ("right", "left"), load_labeler(layout))
+    assert found is not None
+    assert abs(found.hand.shape.length - take.hands[0].shape.length) < 3.0 * found.spread
+
+
+@pytest.mark.parametrize(
+    ("share", "off", "is_found"),
+    [(1.0, 0.015, True), (0.2, 0.0, True), (0.2, 0.015, False), (0.05, 0.0, False)],
+)
+def test_measured_hands_are_found_in_most_frames_or_in_some_that_fit_well(share, off, is_found):
+    """Hands that are there in a share of the frames, measured too long by `off` [m]."""
+    shape, count = shape_from_measures(0.187, 0.085), 120
+    frames, rng = frames_of([shape], seed=1, noise=0.0005), np.random.default_rng(0)
+    strays = [
+        StreamedFrame(one.number, one.time, rng.uniform(-1.0, 1.0, one.points.shape), one.ids + 100)
+        for one in frames
+    ]
+    shown = [*frames[: round(share * count)], *strays[round(share * count) : count]]
+    measured = shape_from_measures(0.187 + off, 0.085)
+    fit = SizeFit(attach(load_layout("dense19"), HandModel(measured)), 0.001, 0.003)
+    assert _is_found(fit, shown, ("right",), load_labeler("dense19")) is is_found

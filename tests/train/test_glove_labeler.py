@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import ArgumentError, HandSimWarning, LayoutError, WeightsError
+from handsim.hand.topology import DIGITS
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import OwnLabeler
@@ -44,6 +45,17 @@ def test_any_other_layout_is_learned_and_that_is_told(given, quickly_learned, tm
     assert isinstance(found, LayoutLabeler) and found.marker_names == layout.names
     labeling = found.label_frames([np.random.default_rng(0).normal(0, 0.05, (6, 3))])[0]
     assert labeling.labels.shape == (6,)
+
+
+def test_a_glove_like_its_own_mirror_image_is_told(quickly_learned):
+    fingers = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS[1:]]
+    places = [(along, across) for along in (0.3, 0.7) for across in (0.2, -0.2)]
+    back = [MarkerPlace(f"{place}", "palm", place[0], 0.0, place[1]) for place in places]
+    with pytest.warns(HandSimWarning, match="glove 'even' is nearly its own mirror image"):
+        load_labeler(MarkerLayout("even", (*fingers, *back), 0.0032))
+    with pytest.warns(HandSimWarning) as told:
+        load_labeler("tips8")
+    assert not any("mirror image" in str(one.message) for one in told)
 
 
 def test_a_layout_of_the_same_name_and_other_places_is_another(quickly_learned):

@@ -23,6 +23,7 @@ from poses.shapes.validity import sample_valid_angles
 
 _MAX_FOURS: Final = 3000
 _POSES: Final = 100  # of each size
+_TOLD: Final = 0.98  # share of whole hands whose side is told in a layout unlike its mirror image; mostly all
 _SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
@@ -57,6 +58,19 @@ class SideClassifier:
         markers[labels[labels >= 0]] = points[labels >= 0]
         vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
+
+
+def is_mirror_like(layout: MarkerLayout) -> bool:
+    """Whether a layout is nearly its own mirror image, so that the side of a whole hand is not always told.
+
+    That is by its true labels; where they are unknown, sides are exchanged more often.
+    """
+    if any(one.bone.startswith("thumb") for one in layout.markers):
+        return False  # a thumb tells, without a third of a second
+    rng, labels = np.random.default_rng(0), np.arange(layout.num_markers)
+    classifier = SideClassifier(layout, rng=rng)
+    sides = [classifier.classify(hand, labels)[0] for hand in _right_hands(layout, "M", rng)]
+    return bool(np.mean([side == "right" for side in sides]) < _TOLD)
 
 
 def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:

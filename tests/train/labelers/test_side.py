@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gloves.attachment import attach_markers
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout
 from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import DIGITS
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes.validity import sample_valid_angles
-from train.labelers.side import SideClassifier
+from train.labelers.side import SideClassifier, is_mirror_like
 
 
 @pytest.fixture(scope="module", params=["dense19", "sparse13"])
@@ -55,3 +58,21 @@ def test_too_few_points_say_nothing(classifier, rng):
     for labels in ([0, 1, 2, -1, -1], [-1] * 5):
         assert tells.classify(points, np.array(labels)) == ("right", 0.0)
     assert tells.classify(np.zeros((0, 3)), np.zeros(0, dtype=int)) == ("right", 0.0)
+
+
+@pytest.mark.parametrize("name", list_layouts())
+def test_no_shipped_layout_is_like_its_mirror_image(name):
+    assert not is_mirror_like(load_layout(name))
+
+
+def test_a_symmetric_layout_without_a_thumb_is_like_its_mirror_image():
+    tips = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS[1:]]
+    back = [
+        MarkerPlace(f"back{along}{across}", "palm", along, 0.0, across)
+        for along in (0.3, 0.7)
+        for across in (0.2, -0.2)
+    ]
+    layout = MarkerLayout("symmetric", (*tips, *back), 0.0032)
+    assert is_mirror_like(layout)
+    thumb = MarkerPlace("thumb", "thumb_distal", 0.7, 0.0)
+    assert not is_mirror_like(dataclasses.replace(layout, markers=(*tips, *back, thumb)))
