@@ -118,6 +118,7 @@ class HandInitializer:
         self._prior = resting_prior()
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
+        self._spreads: list[float | None] = [None] * len(states)
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
@@ -131,6 +132,7 @@ class HandInitializer:
             hands: Indices of the hands that are looked for.
         """
         search = self._searches.pop(tuple(hands), _Search())
+        self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
         cut = False
         for group in self._groups(points, hands):
@@ -410,12 +412,12 @@ class HandInitializer:
     def _scored(self, index: int, fit: PoseFit, labels: NDArray[np.int64]) -> InitializedHand:
         """A fit with its score; a hand that was seen lately must fit as well as then."""
         known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
-        spread = self._states[index].spread if known else None
+        spread = self._spreads[index] if known else None
         count, rms = int((labels >= 0).sum()), float(fit.rms[0])
         offset = fit.qpos[0, 7:] - self._prior.angles
         unusual = float(offset @ self._prior.precision @ offset) - NUM_JOINTS
-        penalty = np.clip(_POSE_WEIGHT * unusual, 0.0, _MOST_POSE_PENALTY)
-        return InitializedHand(index, fit, labels, self.score(count, rms, spread) - float(penalty))
+        penalty = min(max(_POSE_WEIGHT * unusual, 0.0), _MOST_POSE_PENALTY)
+        return InitializedHand(index, fit, labels, self.score(count, rms, spread) - penalty)
 
 
 def _likelier(

@@ -7,6 +7,7 @@ exact for a normal distribution. Points are turned and moved onto each mean hand
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Final
@@ -103,7 +104,7 @@ class PosePrior:
             among: The components to choose from; all when not given.
         """
         chosen = np.arange(len(self.means)) if among is None else among
-        table = means_by_marker(self.means, chosen)
+        table = table_of(self) if among is None else means_by_marker(self.means, chosen)
         errors = procrustes_errors(seen_as_right(points, mirrored), labels, table)
         return chosen[np.argsort(errors)[:count]]
 
@@ -118,6 +119,13 @@ class PosePrior:
         if set(tensors) != {field.name for field in fields(cls)}:
             raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
+
+
+@functools.lru_cache(maxsize=8)
+def table_of(prior: PosePrior) -> FloatArray:
+    """See `means_by_marker`, of all components; kept, because every cloud is compared with them."""
+    table: FloatArray = means_by_marker(prior.means, np.arange(len(prior.means)))
+    return table
 
 
 @kernel

@@ -33,6 +33,7 @@ from train.matching.pose_prior import (
     products_with_means,
     residual_of,
     seen_as_right,
+    table_of,
 )
 
 _SURE: Final = 0.95  # a pair of this probability is not taken back
@@ -98,7 +99,7 @@ def match_scores(
         or len(points) > 2 * num_labels  # more than a hand: somebody has to divide them first
     ):
         return labels, confidence
-    tables = prior.means, prior.directions, prior.spreads, prior.log_weights
+    tables = table_of(prior), prior.means, prior.directions, prior.spreads, prior.log_weights
     return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, *tables)
 
 
@@ -106,6 +107,7 @@ def match_scores(
 def _verify(
     points: Float[np.ndarray, "N 3"],
     probabilities: Float[np.ndarray, "N+1 M+1"],
+    table: Float[np.ndarray, "M 3 K"],
     means: Float32[np.ndarray, "K M 3"],
     directions: Float32[np.ndarray, "K M 3 R"],
     spreads: Float32[np.ndarray, "K"],
@@ -114,7 +116,7 @@ def _verify(
     """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label."""
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
-    near, mirrored = _near_components(points, labels, means, directions, spreads, log_weights)
+    near, mirrored = _near_components(points, labels, table, means, directions, spreads, log_weights)
     table = means_by_marker(means, near)
     found = np.empty((_MOST, len(points)), dtype=np.int64)
     scores, densities = np.empty(_MOST), np.empty(_MOST)
@@ -200,6 +202,7 @@ def _log_density_of_near(
 def _near_components(
     points: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
+    table: Float[np.ndarray, "M 3 K"],
     means: Float32[np.ndarray, "K M 3"],
     directions: Float32[np.ndarray, "K M 3 R"],
     spreads: Float32[np.ndarray, "K"],
@@ -207,7 +210,7 @@ def _near_components(
 ) -> tuple[NDArray[np.int64], bool]:
     """The components (C,) near to labeled points as those of the likelier side, and whether it is left."""
     known = np.flatnonzero(labels >= 0)
-    known_labels, table = labels[known], means_by_marker(means, np.arange(len(means)))
+    known_labels = labels[known]
     best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
     products, squares = products_with_means(seen_as_right(points[known], False), known_labels, table)
     for mirrored in (False, True):
