@@ -52,14 +52,11 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the rigs are written; a temporary one by default")
     options = parser.parse_args()
     print(describe("numpy", "numba"))
-    if options.folder is not None:
-        options.folder.mkdir(parents=True, exist_ok=True)
-        compare(options.folder, options.frames)
-        compare_placements(options.folder, options.frames)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        compare(Path(folder), options.frames)
-        compare_placements(Path(folder), options.frames)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        compare(folder, options.frames)
+        compare_placements(folder, options.frames)
 
 
 def compare(folder: Path, frames: int) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
+from handsim.hand.topology import Side
 from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
@@ -105,13 +106,12 @@ def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.ra
     """Share of the frames whose side is recognized from the markers that are seen, by the true labels."""
     classifier, right, count = SideClassifier(layout, rng=rng), 0, 0
     for hand in _some(hands, _SIDE_FRAMES):
-        for observed in hand.frames.observed:
-            labels = np.flatnonzero(np.isfinite(observed[:, 0]))
-            for points, side in ((observed, hand.fit.side), (observed @ MIRROR, _other(hand.fit.side))):
-                right += classifier.classify(points[labels], labels)[0] == side
-                count += 1
+        observed, side = hand.frames.observed, hand.fit.side
+        for markers, one in ((observed, side), (observed @ MIRROR, _other(side))):
+            right += int(classifier.recognized(markers, one).sum())
+            count += len(markers)
     return right / max(1, count)
 
 
-def _other(side: str) -> str:
+def _other(side: Side) -> Side:
     return "left" if side == "right" else "right"

@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.attachment import attach_markers
@@ -59,6 +59,11 @@ class SideClassifier:
         vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
 
+    def recognized(self, hands: Float[np.ndarray, "T M 3"], side: Side) -> Bool[np.ndarray, "T"]:
+        """Whether each hand of a side is classified as one of it, by its true labels; NaN where missing."""
+        labels = np.arange(self._num_markers)
+        return np.array([self.classify(hand, labels)[0] == side for hand in hands], dtype=np.bool_)
+
 
 def is_mirror_like(layout: MarkerLayout) -> bool:
     """Whether a layout is nearly its own mirror image, so that the side of a whole hand is not always told.
@@ -67,10 +72,9 @@ def is_mirror_like(layout: MarkerLayout) -> bool:
     """
     if any(one.bone.startswith("thumb") for one in layout.markers):
         return False  # a thumb tells, without a third of a second
-    rng, labels = np.random.default_rng(0), np.arange(layout.num_markers)
+    rng = np.random.default_rng(0)
     classifier = SideClassifier(layout, rng=rng)
-    sides = [classifier.classify(hand, labels)[0] for hand in _right_hands(layout, "M", rng)]
-    return bool(np.mean([side == "right" for side in sides]) < _TOLD)
+    return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _TOLD)
 
 
 def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -117,7 +117,7 @@ def _verify(
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
     near, mirrored = _near_components(points, labels, table, means, directions, spreads, log_weights)
-    table = means_by_marker(means, near)
+    near_table = means_by_marker(means, near)
     found = np.empty((_MOST, len(points)), dtype=np.int64)
     scores, densities = np.empty(_MOST), np.empty(_MOST)
     taken = np.full((_MOST, _ROUNDS), -1)  # points whose pairs were taken back for a labeling
@@ -144,7 +144,7 @@ def _verify(
                 if len(known) >= _LEAST:
                     cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
                     density = _log_density_of_near(
-                        cloud, known_labels, near, table, means, directions, spreads, log_weights,
+                        cloud, known_labels, near, near_table, means, directions, spreads, log_weights,
                         sets, stored, factors, counts,
                     )  # fmt: skip
                 found[num_found] = fresh
