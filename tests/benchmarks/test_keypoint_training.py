@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks import keypoint_training as training
 
@@ -48,3 +49,13 @@ def test_batches_have_a_quarter_of_labeled_photographs(photos):
     flat = images.std(dim=(1, 2, 3)) < 0.5
     assert points.shape == (400, 21, 2)
     assert 0.18 < flat.float().mean() < 0.32
+
+
+def test_a_map_with_two_peaks_has_its_keypoint_at_the_higher_one():
+    network = training.KeypointNetwork(width=1)
+    far = torch.cdist(network.places, torch.tensor([[0.3, 0.5], [0.7, 0.5]]))
+    near = torch.exp(-((far / training.SPREAD) ** 2) / 2)
+    heat = torch.log(0.55 * near[:, 0] + 0.45 * near[:, 1] + 1e-9).expand(1, 21, -1)
+    network.heat = lambda x: heat
+    found = network(torch.zeros(1, 3, training.SIZE, training.SIZE))
+    np.testing.assert_allclose(found[0, 0], [0.3, 0.5], atol=0.01)
