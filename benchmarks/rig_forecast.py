@@ -25,7 +25,7 @@ from gloves.layout import load_layout
 from handsim.space.camera import look_at
 from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.rig_advice.forecast import Forecast, forecast, light_work
-from train.rig_advice.planning import plan
+from train.rig_advice.planning import plan_rig
 from train.rig_advice.work import sample_work
 from train.simulation.room_settings import SimulatedKind
 from train.simulation.takes import simulate_take
@@ -107,7 +107,8 @@ def rigs() -> list[CameraRig]:
 def planned_rig(count: int) -> CameraRig:
     """So many cameras on the truss, where `handsim rig plan` has them."""
     name = f"planned{count}"
-    return plan(count, FRAME, ("truss",), load_layout(GLOVE), CENTER, SIDES, CAMERA, name=name).rig
+    options = {"mounts": ("truss",), "volume": SIDES, "center": CENTER, "camera": CAMERA, "glove": GLOVE}
+    return plan_rig(count, FRAME, name=name, **options).rig
 
 
 def hung_rig(count: int) -> CameraRig:

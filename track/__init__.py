@@ -5,7 +5,7 @@ takes one frame of points at a time and gives a `TrackedFrame`; `measure_hands` 
 `calibrate` fits hands and gloves to them as a `User`. `open_source` opens a live stream, `ReplayServer` plays
 a capture as one, `open_sinks` takes hands to other programs, and a `Recorder` writes the take. `solve_pose`
 is the inverse kinematics alone: poses from labeled markers. `doubts_of` and `write_take_page` tell of a take,
-`score_glove` of a glove that nobody has worn.
+`score_glove` and `improve_glove` of a glove that nobody has worn.
 """
 
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from track.capture_labeling import label_capture
     from track.capture_tracking import track_capture
     from track.config import TrackerConfig
+    from track.glove_advice.improving import improve_glove
     from track.glove_advice.scoring import score_glove
     from track.kinematics.pose_solver import solve_pose
     from track.recorder import Recorder
@@ -46,6 +47,7 @@ __getattr__, __dir__ = lazy_exports(
         "User": "track.user",
         "calibrate": "track.capture_calibration",
         "doubts_of": "track.take_summary",
+        "improve_glove": "track.glove_advice.improving",
         "label_capture": "track.capture_labeling",
         "load_user": "track.user",
         "measure_hands": "track.setup",
@@ -70,6 +72,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "doubts_of",
+    "improve_glove",
     "label_capture",
     "load_user",
     "measure_hands",

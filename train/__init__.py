@@ -2,7 +2,7 @@
 
 `generate_dataset` writes a training set, `train_labeler` trains a network on it, `load_labeler` reads a
 shipped or trained one, `evaluate_labeler` counts its errors. `simulate_take` simulates a capture with its
-truth.
+truth. `score_rig` and `plan_rig` tell of cameras before they hang.
 """
 
 import os
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from train.labeler_evaluation import Report
     from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
+    from train.rig_advice.planning import RigPlan, plan_rig
+    from train.rig_advice.rig_score import RigScore
+    from train.rig_advice.scoring import score_rig
     from train.simulation.generation import generate_dataset
     from train.simulation.takes import simulate_take
 
@@ -36,11 +39,15 @@ __getattr__, __dir__ = lazy_exports(
         "Corruption": "train.data.augmentation",
         "Dataset": "train.data.shards",
         "Labeler": "train.labelers.protocol",
+        "RigPlan": "train.rig_advice.planning",
+        "RigScore": "train.rig_advice.rig_score",
         "TrainConfig": "train.config",
         "corrupt": "train.data.augmentation",
         "evaluate_labeler": "train.evaluate",
         "generate_dataset": "train.simulation.generation",
         "load_labeler": "train.glove_labeler",
+        "plan_rig": "train.rig_advice.planning",
+        "score_rig": "train.rig_advice.scoring",
         "simulate_take": "train.simulation.takes",
         "train_labeler": "train.loop",
     },
@@ -55,12 +62,16 @@ __all__ = [
     "Labeling",
     "OwnCorruption",
     "Report",
+    "RigPlan",
+    "RigScore",
     "TrainConfig",
     "__version__",
     "corrupt",
     "evaluate_labeler",
     "generate_dataset",
     "load_labeler",
+    "plan_rig",
+    "score_rig",
     "simulate_take",
     "train_labeler",
 ]

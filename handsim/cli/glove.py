@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -15,8 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 from gloves.layout import (
-    FEWEST_MARKERS,
-    MOST_MARKERS,
     MarkerLayout,
     MarkerPlace,
     list_layouts,
@@ -24,16 +20,14 @@ from gloves.layout import (
     shipped_layout,
     starter_layout,
 )
-from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
-from handsim.errors import ArgumentError, LayoutError
+from handsim.errors import LayoutError
 from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
-    from track.glove_advice.improvement import Worth
     from track.glove_advice.layout_score import LayoutScore
     from track.glove_advice.trials import Trial
 
@@ -156,9 +150,6 @@ def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
         raise LayoutError(f"on a hand of size {size}: {error}") from error
 
 
-_FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one
-
-
 def score_glove(
     glove: Annotated[str, tyro.conf.Positional],
     rig: str = "figure5",
@@ -208,10 +199,6 @@ def score_glove(
         print_line(f"{number}. {sentence}")
     write_score_page(page, score, trained=labeler is not None)
     print_line(f"{page}: the hand with its confusions, markers and joints")
-
-
-def _told_capture(step: Callable[[str], None], what: str, words: str) -> None:
-    step(f"{what}: {words}")
 
 
 def _tell(score: LayoutScore) -> None:
@@ -274,43 +261,33 @@ def improve_glove(
         captures: Captures of each kind of work on which both layouts are tried at the end; 0 for none.
         seed: Seed of people, poses and tries.
     """
-    from handsim.space.cameras import load_rig
-
-    layout, cameras = load_layout(glove), load_rig(rig)
-    count = layout.num_markers if markers is None else markers
-    check_count("--markers", count, FEWEST_MARKERS, MOST_MARKERS)
-    check_count("--captures", captures, 0)
-    if not 0.0 <= minutes < np.inf:
-        raise ArgumentError(f"--minutes is {minutes:g}, expected 0 or more")
     check_ending(out, ".toml")
     check_outputs([glove, rig], [out])
-    from track.glove_advice.improvement import Improvement
-    from track.glove_advice.trials import try_layout, verdict
-    from train.any_layout.learned_gloves import learned_labeler
+    from track.glove_advice import improving
 
-    with named_steps("putting the glove on") as step:
-        search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
-        before = search.worth
-        search.resize(count)
-        search.search(60.0 * minutes, lambda worth: step(_worth_line(worth)))
-        step("dropping one marker at a time, to compare")
-        fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
-        found, trials = dataclasses.replace(search.layout, name=out.stem), {}
-        for name, tried in (("before", layout), ("after", found)) if captures else ():
-            step(f"learning the layout {name}, about a minute")
-            known = learned_labeler(tried, cameras)
-            told = functools.partial(_told_capture, step, f"trying captures {name}")
-            trials[name] = try_layout(tried, cameras, known, count=captures, told=told)
+    with named_steps("getting ready") as step:
+        improved = improving.improve_glove(
+            glove,
+            rig,
+            markers=markers,
+            keep=keep,
+            minutes=minutes,
+            captures=captures,
+            name=out.stem,
+            seed=seed,
+            progress=step,
+        )
+    layout, found = improved.start, improved.layout
     found.save(out)
-    print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}, {_palm_line(layout)}")
-    print_line(f"after:  {count} markers, {_worth_line(search.worth)}, {_palm_line(found)}")
-    for name, tried in (("before", layout), ("after", found)) if captures else ():
+    print_line(f"before: {layout.num_markers} markers, {improved.before}, {_palm_line(layout)}")
+    print_line(f"after:  {found.num_markers} markers, {improved.after}, {_palm_line(found)}")
+    for name, trials in improved.trials.items():
         print_line(f"{name}, on people that the search did not see:")
-        _tell_trials(trials[name], tried)
-    if captures:
-        print_line(verdict(trials["before"], trials["after"]))
-    for fewer_count, worth in fewer:
-        print_line(f"        {fewer_count} markers, {_worth_line(worth)}")
+        _tell_trials(trials, layout if name == "before" else found)
+    if improved.verdict is not None:
+        print_line(improved.verdict)
+    for fewer_count, worth in improved.fewer:
+        print_line(f"        {fewer_count} markers, {worth}")
     old = {marker.name: marker for marker in layout.markers}
     for marker in found.markers:
         if old.get(marker.name) != marker:
@@ -319,13 +296,6 @@ def improve_glove(
     for name in sorted(set(old) - set(found.names)):
         print_line(f"drop {name}")
     print_line(f"{out}: run `handsim glove check {out}` and `handsim glove score {out}`")
-
-
-def _worth_line(worth: Worth) -> str:
-    return (
-        f"{100.0 * worth.slots:.1f} % of the slots right with losses and ghosts, joints to "
-        f"{np.rad2deg(worth.joints):.1f} deg"
-    )
 
 
 def _palm_line(layout: MarkerLayout) -> str:

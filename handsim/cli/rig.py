@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gloves.layout import load_layout
-from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
-from handsim.errors import ArgumentError, RigError
+from handsim.errors import RigError
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_ending, check_outputs, write_starter
-from handsim.space.camera import Camera, focal_of_angle, pinhole
 from handsim.space.cameras import (
-    FEWEST_CAMERAS,
-    MAX_CAMERAS,
     ROOM_CENTER,
     CameraRig,
     list_rigs,
@@ -36,7 +30,6 @@ from train.rig_advice.mounts import MOUNTS, Mount
 
 if TYPE_CHECKING:
     from train.rig_advice.forecast import Forecast
-    from train.simulation.motion import SceneMotion
 
 _STARTER: Final = """\
 # A camera rig (docs/rigs.md): lengths in meters, z up, the origin on the floor. Edit it, then run
@@ -164,10 +157,7 @@ def import_rig(
     print_line(f"{out}: {len(rig.cameras)} cameras of {rig.pictures()}")
 
 
-_GLOVE: Final = "dense19"
 _VOLUME: Final = (0.6, 0.6, 0.6)
-_PEOPLE: Final = 2  # of each kind of work
-_FEWEST_FRAMES: Final = 60
 
 _Sides = tuple[float, float, float]
 
@@ -198,30 +188,27 @@ def score_rig_file(
         frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
     """
-    cameras = load_rig(rig)
-    page = Path(f"{cameras.name}.html" if not rig.endswith(".toml") else Path(rig).with_suffix(".html"))
-    page = page if out is None else out
+    named = rig if rig.endswith(".toml") else f"{load_rig(rig).name}.toml"
+    page = Path(named).with_suffix(".html") if out is None else out
     check_ending(page, ".html")
-    check_count("--frames", frames, _FEWEST_FRAMES)
-    sides = _checked_sides("--volume", volume)
     check_outputs([rig, take, glove], [page, json])
+    from train.rig_advice import scoring
     from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
-    from train.rig_advice.rig_score import score_rig, sentences
 
-    with named_steps("simulating hands") as step:
-        work, middle, told = _work(take, glove, center, sides, frames, seed)
-        step("forecasting")
-        score = score_rig(cameras, work, middle, sides, seed=seed)
+    with named_steps("getting ready") as step:
+        score = scoring.score_rig(
+            rig, volume=volume, center=center, take=take, glove=glove, frames=frames, seed=seed, progress=step
+        )
     _print(work_table(score))
     _print(camera_table(score))
     print_line(COLUMNS_TOLD)
     axes = " x ".join(f"{1e3 * axis:.3f}" for axis in score.whole.error.axes)
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
-    for number, sentence in enumerate(sentences(score), 1):
+    for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
     if json is not None:
-        save_json(json, {"work": told, "seed": seed, **score.record()})
-    write_rig_page(page, score, work=told)
+        save_json(json, score.record())
+    write_rig_page(page, score)
     print_line(f"{page}: what to do, the cameras' worth, a map of the volume")
 
 
@@ -235,7 +222,7 @@ def plan_rig(
     keep: str | None = None,
     size: tuple[int, int] = (1280, 1280),
     field_of_view: float = 60.0,
-    glove: str = _GLOVE,
+    glove: str = "dense19",
     seed: int = 0,
 ) -> None:
     """Look for the best places of a number of cameras, for hands at work in a volume.
@@ -257,19 +244,23 @@ def plan_rig(
         seed: Seed of people and motion.
     """
     check_ending(out, ".toml")
-    hung = None if keep is None else load_rig(keep)
-    fewest = FEWEST_CAMERAS if hung is None else len(hung.cameras) + 1
-    check_count("--cameras", cameras, fewest, MAX_CAMERAS)
-    sides, middle = _checked_sides("--volume", volume), _checked_center(center)
     check_outputs([keep, glove], [out])
-    from train.rig_advice.planning import plan
+    from train.rig_advice import planning
 
-    camera = _camera(size, field_of_view) if hung is None else hung.cameras[0]
-    with named_steps("simulating hands") as step:
-        planned = plan(
-            cameras, _checked_sides("--room", room), mounts, load_layout(glove), middle, sides,
-            camera, hung, name=out.stem, told=step, seed=seed,
-        )  # fmt: skip
+    with named_steps("getting ready") as step:
+        planned = planning.plan_rig(
+            cameras,
+            room,
+            mounts=mounts,
+            volume=volume,
+            center=center,
+            camera=planning.plain_camera(size, field_of_view) if keep is None else None,
+            keep=keep,
+            glove=glove,
+            name=out.stem,
+            seed=seed,
+            progress=step,
+        )
     table = Table("camera", box=None, pad_edge=False)
     table.add_column(Text("position [m]"), justify="right")
     table.add_column(Text("looks at [m]"), justify="right")
@@ -285,61 +276,12 @@ def plan_rig(
     print_line(f"{out}: run `handsim rig score {out}`")
 
 
-def _camera(size: tuple[int, int], field_of_view: float) -> Camera:
-    """A camera without distortion, at the world's origin."""
-    if not 1.0 <= field_of_view <= 170.0:
-        raise ArgumentError(f"--field-of-view is {field_of_view:g} degrees, expected 1 to 170")
-    return pinhole("camera", size, focal_of_angle(min(size), np.deg2rad(field_of_view)))
-
-
 def _forecast_line(one: Forecast) -> str:
     return (
         f"two cameras see {100 * one.seen_by_two:.1f} % of the marker-frames of other people, three "
         f"{100 * one.seen_by_three:.1f} %; {100 * one.missing:.1f} % missing, error "
         f"{1e3 * one.error.mean:.3f} mm"
     )
-
-
-def _work(
-    take: Path | None,
-    glove: str | None,
-    center: _Sides | None,
-    sides: NDArray[np.float64],
-    frames: int,
-    seed: int,
-) -> tuple[dict[str, list[SceneMotion]], NDArray[np.float64], str]:
-    """Hands at work, the middle of where they are [m], and what they do, in words."""
-    from gloves.takes.take import load_take
-    from train.rig_advice.work import sample_work, work_of_take
-
-    middle = _checked_center(ROOM_CENTER if center is None else center)
-    if take is None:
-        layout = load_layout(_GLOVE if glove is None else glove)
-        rng = np.random.default_rng(seed)
-        work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=rng)
-        return work, middle, f"simulated people in the glove {layout.name}"
-    work = work_of_take(load_take(take), None if glove is None else load_layout(glove), frames)
-    if center is None:
-        wrists = [hand.qpos[:, :3] for scenes in work.values() for one in scenes for hand in one.hands]
-        middle = np.concatenate(wrists).mean(axis=0)
-    return work, middle, f"the take {take.name}"
-
-
-def _checked_center(center: Sequence[float]) -> NDArray[np.float64]:
-    array = np.array(center, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ArgumentError(f"--center is {' '.join(map(str, array))}, expected three finite numbers")
-    return array
-
-
-def _checked_sides(option: str, sides: Sequence[float]) -> NDArray[np.float64]:
-    array = np.array(sides)
-    if not (array > 0.0).all() or not (array < 50.0).all():
-        raise ArgumentError(
-            f"{option} is {' '.join(f'{one:g}' for one in array)}, expected three lengths in meters, each "
-            "above 0 and below 50"
-        )
-    return array
 
 
 def _print(rows: list[list[str]]) -> None:

@@ -269,6 +269,13 @@ class Worth(NamedTuple):
         """What a better layout has less of: wrong slots [%] and, weighted, the spread of the joints [deg]."""
         return 100.0 * (1.0 - self.slots) + _OF_JOINTS * float(np.rad2deg(self.joints))
 
+    def __str__(self) -> str:
+        """Both shares in words."""
+        return (
+            f"{100.0 * self.slots:.1f} % of the slots right with losses and ghosts, joints to "
+            f"{np.rad2deg(self.joints):.1f} deg"
+        )
+
 
 def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
     """Label a layout with the network for any layout, without verification by a pose, and count.

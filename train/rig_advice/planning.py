@@ -9,20 +9,22 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.blobs import MARKER_RADIUS
+from handsim._checks import check_choice, check_count
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
-from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, CameraRig
+from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, CameraRig, as_rig
 from train.rig_advice.forecast import OPTICS, Forecast, forecast, light_work
-from train.rig_advice.mounts import Mount, places
-from train.rig_advice.work import sample_work
+from train.rig_advice.mounts import MOUNTS, Mount, places
+from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
@@ -225,7 +227,7 @@ def _packed(views: NDArray[np.bool_]) -> NDArray[np.uint64]:
     return np.packbits(padded, axis=1).view(np.uint64)
 
 
-class Plan(NamedTuple):
+class RigPlan(NamedTuple):
     """A rig, and the forecast of it."""
 
     rig: CameraRig
@@ -236,59 +238,89 @@ class Plan(NamedTuple):
     after: Forecast
 
 
-def plan(
-    num_cameras: int,
-    room: Float[np.ndarray, "3"],
-    mounts: Sequence[Mount],
-    layout: MarkerLayout,
-    center: Float[np.ndarray, "3"],
-    sides: Float[np.ndarray, "3"],
-    camera: Camera,
-    kept: CameraRig | None = None,
+def plan_rig(
+    cameras: int,
+    room: Sequence[float],
     *,
-    name: str,
-    told: Callable[[str], None] = lambda line: None,
+    mounts: Sequence[Mount] = MOUNTS,
+    volume: Sequence[float] = VOLUME,
+    center: Sequence[float] = ROOM_CENTER,
+    camera: Camera | None = None,
+    keep: CameraRig | str | Path | None = None,
+    glove: MarkerLayout | str | Path = GLOVE,
+    name: str = "planned",
     seed: int = 0,
-) -> Plan:
-    """Look for the best places of cameras.
+    progress: Callable[[str], None] = lambda step: None,
+) -> RigPlan:
+    """Look for the best places of cameras, as `handsim rig plan` does.
 
     Args:
-        num_cameras: Cameras of the rig, with those that are kept.
-        room: Width, depth and height of the room or truss [m].
-        center: Middle of the volume that hands work in [m].
-        camera: What every new camera is, but for its pose.
-        kept: Cameras that stay.
-        seed: Of people and motion.
+        cameras: Cameras of the rig, with those that are kept.
+        room: Width along x, depth along y and height of the room or truss (3,) [m]; it stands on the floor,
+            its middle below that of the volume.
+        mounts: What cameras can hang on: walls, truss, tripods.
+        volume: Sides of the space that hands work in (3,) [m].
+        center: Its middle (3,) [m].
+        camera: What every new camera is, but for its pose; when not given, the first of those that are kept,
+            or one of 1280 x 1280 pixels and 60 degrees.
+        keep: The rig, its name or path, whose cameras stay where they are.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        name: Name of the rig.
+        seed: Seed of people and motion.
+        progress: Called with the name of each step.
 
     Raises:
-        ArgumentError: There is no room for so many cameras.
+        ArgumentError: A number is out of range, or there is no room for so many cameras.
+        LayoutError, RigError: The glove or the rig is unknown.
     """
-    free = places(room, mounts, center, sides)
+    kept, layout = None if keep is None else as_rig(keep), load_layout(glove)
     old = () if kept is None else tuple(kept.cameras)
-    candidates = [*old, *(camera.at(pose) for pose in free.T_world_camera)]
+    check_count("cameras", cameras, len(old) + 1 if old else FEWEST_CAMERAS, MAX_CAMERAS)
+    for mount in mounts or ("none",):
+        check_choice(mount, MOUNTS, noun="mount")
+    sides, middle = checked_sides("volume", volume), checked_center(center)
+    one_of_new = camera or (old[0] if old else plain_camera())
+    free = places(checked_sides("room", room), mounts, middle, sides)
+    candidates = [*old, *(one_of_new.at(pose) for pose in free.T_world_camera)]
     ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
     targets = np.array([*ahead, *free.targets])
+    progress("simulating hands")
     rng = np.random.default_rng(seed)
-    work = sample_work(layout, center, sides, _FRAMES, _PEOPLE, rng=rng)
+    work = sample_work(layout, middle, sides, _FRAMES, _PEOPLE, rng=rng)
     scenes = [one.faster(_SKIPPED) for part in work.values() for one in part]
-    told(f"what cameras at {len(free.targets)} places would see")
+    progress(f"what cameras at {len(free.targets)} places would see")
     views = view_candidates(scenes, candidates, rng=rng)
     positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
     search = Planning(views, positions, range(len(old)))
-    search.grow(num_cameras)
-    search.exchange(lambda value: told(f"moving cameras: {value:.4f}"))
+    search.grow(cameras)
+    search.exchange(lambda value: progress(f"moving cameras: {value:.4f}"))
     chosen = [candidates[number] for number in search.chosen]
     new = [
         dataclasses.replace(one, name=f"camera{number}")
         for number, one in enumerate(chosen[len(old) :], len(old) + 1)
     ]
     rig = CameraRig(name, [*old, *new])
-    told("forecasting")
-    fresh = sample_work(layout, center, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
+    progress("forecasting")
+    fresh = sample_work(layout, middle, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
     before = None if kept is None else _forecast(fresh, kept, seed)
-    return Plan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
+    return RigPlan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
 
 
 def _forecast(work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, seed: int) -> Forecast:
     lit = light_work(work, rig, rng=np.random.default_rng(seed))
     return forecast([one for scenes in lit.values() for one in scenes], rig, seed=seed)
+
+
+def plain_camera(size: tuple[int, int] = (1280, 1280), field_of_view: float = 60.0) -> Camera:
+    """A camera without distortion, at the world's origin.
+
+    Args:
+        size: Width and height of its pictures [px].
+        field_of_view: Full opening across the shorter side of these [deg].
+
+    Raises:
+        ArgumentError: The opening is none.
+    """
+    if not 1.0 <= field_of_view <= 170.0:
+        raise ArgumentError(f"field of view is {field_of_view:g} degrees, expected 1 to 170")
+    return pinhole("camera", size, focal_of_angle(min(size), np.deg2rad(field_of_view)))

@@ -13,7 +13,7 @@ from handsim.app.page import Section, write_page
 from handsim.space.cameras import CameraRig
 from train.reports.plot_style import BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
 from train.rig_advice.forecast import CameraLoss, Forecast
-from train.rig_advice.rig_score import GRID, RigScore, VolumeMap, sentences
+from train.rig_advice.rig_score import GRID, RigScore, VolumeMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,16 +44,12 @@ COLUMNS_TOLD: Final = (
 """What the columns of both tables are."""
 
 
-def write_rig_page(path: Path, score: RigScore, *, work: str) -> None:
-    """Write the page: one HTML file with its pictures inside.
-
-    Args:
-        work: Whose hands did what, in words.
-    """
+def write_rig_page(path: Path, score: RigScore) -> None:
+    """Write the page: one HTML file with its pictures inside."""
     rig = score.rig
-    seen = f"{score.whole.marker_frames:,} marker-frames of {work}"
+    seen = f"{score.whole.marker_frames:,} marker-frames of {score.work}"
     lead = f"{len(rig.cameras)} cameras of {rig.pictures()}; {seen}."
-    items = "".join(f"<li>{escape(one)}</li>" for one in sentences(score))
+    items = "".join(f"<li>{escape(one)}</li>" for one in score.advice)
     sections = [
         Section("What to do", f"<ol>{items}</ol>"),
         Section("Hands at work", COLUMNS_TOLD, table=work_table(score), notes=[_error_note(score.whole)]),

@@ -53,7 +53,7 @@ class RigScore:
 
     rig: CameraRig
     whole: Forecast
-    """Of all work together."""
+    """Of all work together: shares of the marker-frames, gaps [s], error of points [m]."""
     kinds: dict[str, Forecast]
     """Of each kind of work."""
     losses: list[CameraLoss]
@@ -61,10 +61,23 @@ class RigScore:
     volume: VolumeMap
     faults: list[str]
     """What is suspicious about the rig itself, see `train.rig_advice.rig_faults`."""
+    work: str
+    """Whose hands did what, in words."""
+    seed: int
+    """Of what is random in seeing and losing."""
+
+    @property
+    def advice(self) -> list[str]:
+        """What to do with the rig; what is most wrong comes first."""
+        parts = (_suspicious, _missing, _corner, _needed, _dispensable, _error, _ghosts)
+        found = [one for part in parts for one in part(self)]
+        return found or ["Nothing stands out: hands at work are seen well, and no camera is idle."]
 
     def record(self) -> dict[str, Any]:
         """All figures as JSON, in meters and seconds; what does not exist is null."""
         return {
+            "work": self.work,
+            "seed": self.seed,
             "rig": self.rig.name,
             "cameras": len(self.rig.cameras),
             "all": _figures(self.whole),
@@ -82,12 +95,13 @@ class RigScore:
         }
 
 
-def score_rig(
+def score_work(
     rig: CameraRig,
     work: Mapping[str, Sequence[SceneMotion]],
     center: Float[np.ndarray, "3"],
     sides: Float[np.ndarray, "3"],
     *,
+    told: str,
     seed: int = 0,
 ) -> RigScore:
     """Forecast what a rig makes of hands at work, without each of its cameras too.
@@ -95,6 +109,7 @@ def score_rig(
     Args:
         work: Scenes of each kind of work.
         center: Middle of the volume that is mapped [m].
+        told: Whose hands do what, in words.
         seed: Of what is random in seeing and losing.
 
     Raises:
@@ -110,14 +125,9 @@ def score_rig(
         camera_losses(everything, rig, seed=seed),
         map_volume([one.scene for one in everything], rig, center, sides, rng=rng),
         faults(rig),
+        told,
+        seed,
     )
-
-
-def sentences(score: RigScore) -> list[str]:
-    """What to do with a rig; what is most wrong comes first."""
-    parts = (_suspicious, _missing, _corner, _needed, _dispensable, _error, _ghosts)
-    found = [one for part in parts for one in part(score)]
-    return found or ["Nothing stands out: hands at work are seen well, and no camera is idle."]
 
 
 def _suspicious(score: RigScore) -> Iterator[str]:

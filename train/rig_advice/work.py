@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, cast
 
 import numpy as np
@@ -15,7 +15,8 @@ from gloves.captures.capture import runs_of
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim.errors import CaptureError, PoseError
+from handsim._checks import check_array
+from handsim.errors import ArgumentError, CaptureError, PoseError
 from handsim.hand.motion import BodyMotion
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import pose_matrices
@@ -25,6 +26,10 @@ from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room_settings import KINDS, SIMULATED_KINDS, RoomConfig, SimulatedKind, usual_room
 from train.simulation.takes import sample_scene
 
+GLOVE: Final = "dense19"
+VOLUME: Final = (0.6, 0.6, 0.6)
+"""Sides of the space that hands work in [m]."""
+_LONGEST: Final = 50.0  # sides of a volume or a room [m]
 _REAL_LIKE: Final = "real-like"
 _MAX_PEOPLE: Final = 10
 _FEWEST: Final = 12  # frames of a stretch of a take without a break
@@ -148,3 +153,27 @@ def _walk(
     reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
     turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND + rng.random(3)
     return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))
+
+
+def checked_center(center: Sequence[float]) -> NDArray[np.float64]:
+    """The middle of a volume (3,) [m].
+
+    Raises:
+        ArgumentError: It is not three finite numbers.
+    """
+    return check_array("center", center, (3,))
+
+
+def checked_sides(name: str, sides: Sequence[float]) -> NDArray[np.float64]:
+    """The sides of a volume or a room (3,) [m].
+
+    Raises:
+        ArgumentError: They are not three lengths.
+    """
+    found = check_array(name, sides, (3,))
+    if not ((found > 0.0) & (found < _LONGEST)).all():
+        raise ArgumentError(
+            f"{name} is {' '.join(f'{one:g}' for one in found)}, expected three lengths in meters, each "
+            f"above 0 and below {_LONGEST:g}"
+        )
+    return found

@@ -57,7 +57,7 @@ def test_an_improved_layout_is_written(mine, tmp_path, capsys):
             "--out is page.pdf, expected a file name that ends in .html",
         ),
         (["improve", "GLOVE", "--out", "GLOVE"], "is the input"),
-        (["improve", "GLOVE", "--out", "new.toml", "--markers", "3"], "--markers is 3, expected 5 to 60"),
+        (["improve", "GLOVE", "--out", "new.toml", "--markers", "3"], "markers is 3, expected 5 to 60"),
         (["improve", "GLOVE", "--out", "new.toml", "--keep", "Tail"], "to be kept are Tail"),
     ],
 )

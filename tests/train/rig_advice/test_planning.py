@@ -7,12 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
+from handsim.space.cameras import CameraRig, named_rig
 from train.rig_advice.forecast import light
-from train.rig_advice.planning import Planning, plan, view_candidates
+from train.rig_advice.planning import Planning, plan_rig, view_candidates
 from train.simulation.room_settings import RoomConfig
 
 
@@ -86,9 +85,8 @@ def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
 def test_a_plan_beats_cameras_in_a_row():
     old = CameraRig("row", named_rig("figure5").cameras[:2])
     wide = pinhole("wide", (1664, 1088), 1188.0)
-    found = plan(
-        4, np.array([2.4, 1.8, 2.2]), ("truss",), load_layout("tips8"), np.array(ROOM_CENTER),
-        np.full(3, 0.6), wide, old, name="new",
+    found = plan_rig(
+        4, (2.4, 1.8, 2.2), mounts=("truss",), camera=wide, keep=old, glove="tips8", name="new"
     )  # fmt: skip
     assert found.rig.cameras[:2] == old.cameras
     assert [(one.name, one.size) for one in found.rig.cameras[2:]] == [

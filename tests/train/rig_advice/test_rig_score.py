@@ -10,12 +10,13 @@ import pytest
 from handsim.space.cameras import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import CameraLoss
 from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
-from train.rig_advice.rig_score import GRID, map_volume, score_rig, sentences
+from train.rig_advice.rig_score import GRID, map_volume, score_work
 
 
 @pytest.fixture(scope="module")
 def score(work):
-    return score_rig(named_rig("six"), {"all kinds": work}, np.array(ROOM_CENTER), np.full(3, 0.6))
+    middle, sides = np.array(ROOM_CENTER), np.full(3, 0.6)
+    return score_work(named_rig("six"), {"all kinds": work}, middle, sides, told="a <test>")
 
 
 def with_missing(one, missing, **more):
@@ -32,7 +33,7 @@ def good(score):
 
 
 def test_of_a_good_rig_only_the_camera_that_matters_most_is_told(good):
-    assert sentences(good) == [
+    assert good.advice == [
         "Camera 6 matters most: without it 15.0 % of the marker-frames are missing, not 1.0 %."
     ]
 
@@ -42,7 +43,7 @@ def test_idle_cameras_can_go(good):
     losses[2] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.0104))
     losses[4] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.0102))
     losses[0] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.02))
-    sentence = sentences(dataclasses.replace(good, losses=losses))[1]
+    sentence = dataclasses.replace(good, losses=losses).advice[1]
     assert sentence.startswith("Camera 5 can go: it sees 0.1 % of the marker-frames that no two others see")
     assert "So can any one of 3;" in sentence
 
@@ -53,7 +54,7 @@ def test_missing_markers_bad_corners_and_ghosts_are_told(good):
     shares[7] = 0.3
     volume = good.volume._replace(seen_by_two=shares)
     kinds = {"a": good.whole, "b": whole}
-    told = sentences(dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds))
+    told = dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds).advice
     assert told[0].startswith("20.0 % of the marker-frames will be missing, most with b (20 %)")
     assert "two cameras see 30 % of a hand's markers, 98 % at the best place" in told[1]
     assert told[-1].startswith("1.5 points a frame will be no marker, most with b (1.5)")
@@ -63,20 +64,20 @@ def test_a_long_error_names_its_axis(good):
     error = good.whole.error._replace(
         axes=np.array([0.002, 0.0005, 0.0004]), directions=np.array([[0.1, 0.99, 0.0], [1, 0, 0], [0, 0, 1]])
     )
-    told = sentences(dataclasses.replace(good, whole=dataclasses.replace(good.whole, error=error)))
+    told = dataclasses.replace(good, whole=dataclasses.replace(good.whole, error=error)).advice
     assert told[-1].startswith("Points are least certain along y, 2.00 mm against 0.40 mm")
 
 
 def test_two_cameras_are_both_needed(good):
     losses = [CameraLoss(0.9, 0.9, None)] * 2
-    told = sentences(dataclasses.replace(good, losses=losses))
+    told = dataclasses.replace(good, losses=losses).advice
     assert told == ["Without either camera there are no points at all: a third would forgive a loss."]
     assert camera_table(dataclasses.replace(good, losses=losses))[1][3] == "-"
 
 
 def test_the_page_has_tables_and_pictures_and_the_record_every_figure(score, tmp_path):
     path = tmp_path / "page.html"
-    write_rig_page(path, score, work="a <test>")
+    write_rig_page(path, score)
     page = path.read_text("utf-8")
     assert page.count("data:image/svg+xml") == 2 and "a &lt;test&gt;" in page
     assert len(work_table(score)) == 2 and len(camera_table(score)) == 7
