@@ -4,7 +4,7 @@ PCK@0.1 is the share of keypoints that are found within a tenth of the longer si
 
 MediaPipe's keypoints are not ours: they lie a share of the way from each of ours to the one before it in its
 finger, and from our wrist to the middle finger's knuckle. `SHARES` has the medians of what MediaPipe finds on
-215 drawn hands; no photograph was used.
+215 drawn hands, those of the fingers together; no photograph was used.
 """
 
 from __future__ import annotations
