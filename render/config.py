@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from handsim._checks import check_choice, check_type, fill_settings
+from handsim._checks import check_choice, check_count, check_type, fill_settings
 from handsim.errors import ArgumentError
 from render.cameras.viewpoints import ViewConfig
 from render.frames import PASSES
@@ -96,11 +96,11 @@ class RenderConfig:
         check_tones(self.tones)
         for name in self.passes:
             check_choice(name, PASSES, noun="pass")
-        if not self.passes or self.every < 1 or self.frames_per_shard < 1:
-            raise ArgumentError(
-                f"passes are {self.passes}, every is {self.every}, frames_per_shard is "
-                f"{self.frames_per_shard}, expected at least one pass, and numbers of at least 1"
-            )
+        if not self.passes:
+            raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
+        check_count("every", self.every, 1)
+        check_count("frames_per_shard", self.frames_per_shard, 1)
+        check_count("seed", self.seed, 0)
 
     @property
     def chosen_depth_sensor(self) -> DepthNoiseConfig | None:

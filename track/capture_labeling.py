@@ -80,7 +80,7 @@ def label_capture(
     sample = sample_frames(frames)
     if is_measured:
         user = found_user(sample, layout, user.sides, network) or user
-    check_hands(sample, user, network)
+    check_hands(sample, user, network, options=("--glove",))
     told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
     present = np.isfinite(source.positions[..., 0])
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -86,7 +86,13 @@ class _AtOnce:
         return labeler_at_once(self._layout).label_frames(frames)
 
 
-def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
+def check_hands(
+    frames: Sequence[StreamedFrame],
+    hands: Sequence[GloveFit],
+    labeler: Labeler,
+    *,
+    options: Collection[str] = ("--hands", "--glove"),
+) -> None:
     """Tell of hands that do not fit, where another side, glove or unit fits clearly better.
 
     That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
@@ -94,6 +100,7 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
 
     Args:
         frames: Frames of unlabeled points [m], as `sample_frames` gives.
+        options: Those by which the user can name what fits better.
 
     Raises:
         ArgumentError: The points fit hands at another scale alone.
@@ -126,11 +133,9 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
         remedy.append(f"--glove {best.name}")
     if remedy:
         shares = f"{fit.shown} of {len(some)} frames, what is asked for {asked.shown}"
-        warnings.warn(
-            f"the points fit {named} better ({shares}); name it ({' '.join(remedy)})",
-            HandSimWarning,
-            stacklevel=3,
-        )
+        known = [one for one in remedy if one.split()[0] in options]
+        how = f"; name it ({' '.join(known)})" if known else ""
+        warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)
 
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:

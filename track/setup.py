@@ -92,7 +92,9 @@ class TrackerSetup:
             ArgumentError: See `check_hands`, which warns of hands that do not fit.
         """
         if not self.is_measured:
-            check_hands(frames, self.user, self.labeler)
+            named = self.user.notes in get_args(Size)
+            options = ("--hands", "--glove") if named else ()
+            check_hands(frames, self.user, self.labeler, options=options)
             return self
         user = measured_user(frames, self.user.layout, self.user.sides, self.labeler)
         check_hands(frames, user, self.labeler)
@@ -147,8 +149,7 @@ def measured_user(
         HandSimWarning,
         stacklevel=3,
     )
-    usual = nominal_user(layout, USUAL_SIZE, sides)
-    return User(usual.hands, f"{MEASURED}{USUAL_SIZE}")
+    return nominal_user(layout, USUAL_SIZE, sides)
 
 
 def found_user(

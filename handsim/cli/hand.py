@@ -60,8 +60,6 @@ def hand(
             raise ArgumentError(
                 f"given {option} and --out {out}, expected an --out that ends in {wanted} with it"
             )
-    if mesh is not None and mesh.resolve() == out.resolve():
-        raise ArgumentError(f"--out and --mesh are both {out}, expected two files")
     check_outputs([glove, shape, take], (out, mesh))
     chosen, words = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen

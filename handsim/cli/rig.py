@@ -191,6 +191,8 @@ def score_rig_file(
     named = rig if rig.endswith(".toml") else f"{load_rig(rig).name}.toml"
     page = Path(named).with_suffix(".html") if out is None else out
     check_ending(page, ".html")
+    if json is not None:
+        check_ending(json, ".json", option="--json")
     check_outputs([rig, take, glove], [page, json])
     from train.rig_advice import scoring
     from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
@@ -246,6 +248,7 @@ def plan_rig(
     check_ending(out, ".toml")
     check_outputs([keep, glove], [out])
     from train.rig_advice import planning
+    from train.rig_advice.rig_faults import faults
 
     with named_steps("getting ready") as step:
         planned = planning.plan_rig(
@@ -272,6 +275,8 @@ def plan_rig(
     if planned.before is not None:
         print_line(f"before: {_forecast_line(planned.before)}")
     print_line(f"after:  {_forecast_line(planned.after)}")
+    for sentence in faults(planned.rig):
+        print_line(f"Suspicious: {sentence}.")
     planned.rig.save(out)
     print_line(f"{out}: run `handsim rig score {out}`")
 

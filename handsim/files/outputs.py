@@ -15,14 +15,17 @@ _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
-    """Refuse an output that names an input, also through a link or in another spelling, or has no place.
+    """Refuse an output that names an input or another one, in whatever spelling, or has no place.
 
     Args:
         inputs: Files and folders that a command reads, and names that may be none; objects are no files.
         outputs: What it writes; None where not given.
     """
-    read = [Path(name) for name in inputs if isinstance(name, str | Path)]
+    read, written = [Path(name) for name in inputs if isinstance(name, str | Path)], set()
     for output in (path for path in outputs if path is not None):
+        if output.resolve() in written:
+            raise ArgumentError(f"two outputs are {output}, expected two files")
+        written.add(output.resolve())
         there = next((path for path in output.absolute().parents if path.exists()), None)
         if there is not None and not there.is_dir():
             raise ArgumentError(

@@ -46,7 +46,7 @@ def improve_glove(
     rig: CameraRig | str | Path = "figure5",
     *,
     markers: int | None = None,
-    keep: Collection[str] = (),
+    keep: str | Collection[str] = (),
     minutes: float = 3.0,
     captures: int = CAPTURES,
     name: str = "improved",
@@ -73,17 +73,19 @@ def improve_glove(
             name to keep is none of the layout's.
     """
     layout, cameras = load_layout(glove), as_rig(rig)
+    kept = (keep,) if isinstance(keep, str) else tuple(keep)
     count = layout.num_markers if markers is None else markers
     check_count("markers", count, FEWEST_MARKERS, MOST_MARKERS)
     check_count("captures", captures, 0)
     check_number("minutes", minutes, 0.0)
+    check_count("seed", seed, 0)
     progress("putting the glove on")
-    search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
+    search = Improvement(layout, cameras, kept, rng=np.random.default_rng(seed))
     before = search.worth
     search.resize(count)
     search.search(60.0 * minutes, lambda worth: progress(str(worth)))
     progress("dropping one marker at a time, to compare")
-    fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
+    fewer = search.smaller(max(FEWEST_MARKERS, len(kept), count - _FEWER))
     found = dataclasses.replace(search.layout, name=name)
     trials = {
         when: _tried(tried, cameras, captures, when, progress)

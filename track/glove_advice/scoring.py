@@ -67,6 +67,7 @@ def score_glove(
     layout, cameras = load_layout(glove), as_rig(rig)
     check_count("frames", frames, _FEWEST_FRAMES)
     check_count("captures", captures, 0)
+    check_count("seed", seed, 0)
     rng = np.random.default_rng(seed)
     progress("simulating hands")
     hands, seen = _hands(motion, layout, cameras, frames, seed, rng)

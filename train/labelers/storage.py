@@ -18,7 +18,6 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
-from gloves.layout import list_layouts
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
@@ -107,7 +106,7 @@ def _files(name_or_path: str | Path) -> tuple[Path, Path]:
         return _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
     weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
     if not weights.is_file() or not card.is_file():
-        unknown = choices(str(name_or_path), list_layouts(), noun="labeler or glove")
+        unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
         raise WeightsError(
             f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
             "module:name"

@@ -242,7 +242,7 @@ def plan_rig(
     cameras: int,
     room: Sequence[float],
     *,
-    mounts: Sequence[Mount] = MOUNTS,
+    mounts: Mount | Sequence[Mount] = MOUNTS,
     volume: Sequence[float] = VOLUME,
     center: Sequence[float] = ROOM_CENTER,
     camera: Camera | None = None,
@@ -276,11 +276,15 @@ def plan_rig(
     kept, layout = None if keep is None else as_rig(keep), load_layout(glove)
     old = () if kept is None else tuple(kept.cameras)
     check_count("cameras", cameras, len(old) + 1 if old else FEWEST_CAMERAS, MAX_CAMERAS)
-    for mount in mounts or ("none",):
+    check_count("seed", seed, 0)
+    hung_on = (mounts,) if isinstance(mounts, str) else tuple(mounts)
+    for mount in hung_on:
         check_choice(mount, MOUNTS, noun="mount")
+    if not hung_on:
+        raise ArgumentError(f"mounts is empty, expected some of {', '.join(MOUNTS)}")
     sides, middle = checked_sides("volume", volume), checked_center(center)
     one_of_new = camera or (old[0] if old else plain_camera())
-    free = places(checked_sides("room", room), mounts, middle, sides)
+    free = places(checked_sides("room", room), hung_on, middle, sides)
     candidates = [*old, *(one_of_new.at(pose) for pose in free.T_world_camera)]
     ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
     targets = np.array([*ahead, *free.targets])

@@ -69,6 +69,8 @@ class RigScore:
     @property
     def advice(self) -> list[str]:
         """What to do with the rig; what is most wrong comes first."""
+        if self.whole.missing >= 1.0:
+            return [*_suspicious(self), "No point is seen: hands work where no two cameras look."]
         parts = (_suspicious, _missing, _corner, _needed, _dispensable, _error, _ghosts)
         found = [one for part in parts for one in part(self)]
         return found or ["Nothing stands out: hands at work are seen well, and no camera is idle."]

@@ -57,6 +57,7 @@ def score_rig(
     """
     cameras = as_rig(rig)
     check_count("frames", frames, _FEWEST_FRAMES)
+    check_count("seed", seed, 0)
     sides = checked_sides("volume", volume)
     middle = None if center is None else checked_center(center)
     progress("simulating hands")

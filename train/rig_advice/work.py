@@ -159,9 +159,14 @@ def checked_center(center: Sequence[float]) -> NDArray[np.float64]:
     """The middle of a volume (3,) [m].
 
     Raises:
-        ArgumentError: It is not three finite numbers.
+        ArgumentError: It is not three numbers, or far from where hands and cameras are.
     """
-    return check_array("center", center, (3,))
+    found = check_array("center", center, (3,))
+    if (np.abs(found) >= _LONGEST).any():
+        raise ArgumentError(
+            f"center is {' '.join(f'{one:g}' for one in found)}, expected meters, each below {_LONGEST:g}"
+        )
+    return found
 
 
 def checked_sides(name: str, sides: Sequence[float]) -> NDArray[np.float64]:

@@ -35,6 +35,9 @@ def test_hands_of_a_take_are_scored_where_they_are(tmp_path, capsys):
         (["--frames", "1"], "frames is 1, expected at least 60"),
         (["--volume", "1", "0", "1"], "volume is 1 0 1, expected three lengths in meters"),
         (["--center", "nan", "0", "1"], "center holds NaN or infinite values, expected finite numbers"),
+        (["--center", "0", "0", "1100"], "center is 0 0 1100, expected meters, each below 50"),
+        (["--seed", "-1"], "seed is -1, expected 0 or more"),
+        (["--json", "figures.html"], "--json is figures.html, expected a file name that ends in .json"),
     ],
 )
 def test_mistakes_are_told(options, sentence, tmp_path, monkeypatch, capsys):
