@@ -36,7 +36,8 @@ _LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
 FEWEST_POINTS: Final = 4
 """Least number of labeled points of a hand; a pose needs as many."""
 SPARE_POINTS: Final = 6
-"""Points beyond a hand's markers from which on a group may be two hands that touch."""
+"""Points beyond a hand's markers from which on a group may be two hands that touch, at most."""
+_SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few markers mislead the labeler
 _CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
@@ -271,7 +272,8 @@ class HandInitializer:
 
     def _cuts_of(self, points: NDArray[np.float64], hands: Sequence[int]) -> NDArray[np.int64]:
         """Directions along which a group is cut if it has points of more than one hand, the longest first."""
-        if len(points) <= max(self._states[index].num_markers for index in hands) + SPARE_POINTS:
+        most = max(self._states[index].num_markers for index in hands)
+        if len(points) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
         count = _CUTS if self._at_once else _CUTS_OF_SEARCH
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
