@@ -60,6 +60,7 @@ _SUPPOSED: Final = 6.0  # coordinates that this spread counts for
 _MOST_MARKERS: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker after which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
+_GOOD_RMS: Final = 0.003  # [m] of that hand at most; a wrong label may bend the hand that it should have been
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
 
@@ -434,7 +435,7 @@ def _likelier(
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
     """Whether labels fit another hand so much better that they are not of this one."""
     kept = ((first.labels >= 0) & (best.labels == first.labels)).sum()
-    much_better = first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
+    much_better = best.fit.rms[0] < _GOOD_RMS and first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
     return bool(much_better and kept >= _HOPELESS_SHARE * (first.labels >= 0).sum())
 
 
