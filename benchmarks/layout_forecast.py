@@ -29,7 +29,7 @@ from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
-from track.glove_advice.trials import FRAMES, METHODS, WORK, try_layout
+from track.glove_advice.trials import CAPTURES, FRAMES, METHODS, WORK, try_layout
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.learned_gloves import fine_tuned_labeler, learned_labeler
 from train.glove_labeler import load_labeler
@@ -62,16 +62,17 @@ def compare_captures(folder: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
         labeler = learned_labeler(layout)
         told.append(stored(path / "told.json", lambda: trial_figures(layout, labeler, 0, FRAMES)))  # noqa: B023
-        found.append(stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600)))  # noqa: B023
+        found.append(stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600, 4)))  # noqa: B023
         for work, shares in told[-1].items():
             pairs = ", ".join(
                 f"{method} {100 * share:.2f} / {100 * found[-1][work]['share'][method]:.2f}"
                 for method, share in shares["share"].items()
             )
+            least = ", ".join(f"{100 * one:.2f}" for one in found[-1][work]["worst"].values())
             joints = f"{shares['joints']:.1f} / {found[-1][work]['joints']:.1f} deg"
             print(
-                f"{layout.name}, {work}: forecast / outcome {pairs}; joints {joints}, size off "
-                f"{found[-1][work]['size']:.1f} mm",
+                f"{layout.name}, {work}: forecast / outcome {pairs}; worst {least}; joints {joints}, size "
+                f"off {found[-1][work]['size']:.1f} mm",
                 flush=True,
             )
         worst = int(np.argmin(told[-1]["two touching"]["right"]))
@@ -83,18 +84,26 @@ def compare_captures(folder: Path) -> None:
     print(f"worst marker of touching hands among the worst three: {listed} of {len(told)}")
 
 
-def trial_figures(layout: MarkerLayout, labeler: Labeler, first: int, frames: int) -> Figures:
-    """What became of captures of a layout, by kind of work."""
-    trials = try_layout(layout, "figure5", labeler, first=first, frames=frames)
-    return {
-        work: {
-            "share": {method: one.share(method) for method in METHODS},
-            "right": one.right.tolist(),
-            "joints": float(np.rad2deg(np.sqrt(np.mean(one.joints**2)))),
-            "size": 1e3 * one.size_error,
+def trial_figures(
+    layout: MarkerLayout, labeler: Labeler, first: int, frames: int, count: int = CAPTURES
+) -> Figures:
+    """What became of captures of a layout, by kind of work: means, and the worst capture's slots."""
+    trials = [
+        try_layout(layout, "figure5", labeler, count=1, first=number, frames=frames)
+        for number in range(first, first + count)
+    ]
+    figures: Figures = {}
+    for work in trials[0]:
+        rows = [one[work] for one in trials]
+        shares = {method: [row.share(method) for row in rows] for method in METHODS}
+        figures[work] = {
+            "share": {method: float(np.mean(some)) for method, some in shares.items()},
+            "worst": {method: min(some) for method, some in shares.items()},
+            "right": np.mean([row.right for row in rows], axis=0).tolist(),
+            "joints": float(np.rad2deg(np.sqrt(np.nanmean([row.joints**2 for row in rows])))),
+            "size": 1e3 * float(np.mean([row.size_error for row in rows])),
         }
-        for work, one in trials.items()
-    }
+    return figures
 
 
 def compare_labelers(parent: Path, frames: int, samples: int) -> None:

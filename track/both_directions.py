@@ -158,11 +158,17 @@ def _events_of(one: Int[np.ndarray, "T N"], other: Int[np.ndarray, "T N"]) -> _E
 
 
 def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "P"]:
-    """For each point, whether a take's labels of its event are likelier than another take's."""
-    log_odds = []
-    for one in (take, other):
+    """For each point, whether a take's labels of its event are likelier than another take's.
+
+    A point without a label tells nothing where the hand is lost that the other take has it on.
+    """
+    log_odds, markers = [], len(take.hand_labels[0])
+    for one, rival in ((take, other), (other, take)):
         right = np.clip(one.confidence[events.rows, events.columns], _LEAST, 1.0 - _LEAST)
-        log_odds.append(np.log(right / (1.0 - right)))
+        hand = rival.labels[events.rows, events.columns] // markers
+        is_silent = (hand >= 0) & (one.labels[events.rows, events.columns] < 0)
+        is_silent &= one.status[events.rows, hand] == LOST
+        log_odds.append(np.where(is_silent, 0.0, np.log(right / (1.0 - right))))
     gain = np.bincount(events.numbers, log_odds[0] - log_odds[1])
     likelier: Bool[np.ndarray, "P"] = gain[events.numbers] > 0.0
     return likelier

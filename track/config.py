@@ -37,7 +37,7 @@ class TrackerConfig:
     """RMS distance beyond which a pose is rejected [m]; Han et al. 2018, section 4.4."""
     least_evidence: float = 5.0
     """Log-odds of a hand for each of its markers (at most those of ten), from which on it is initialized."""
-    fewest_labels: int = 5
+    fewest_labels: int = 4
     """Labeled points from which on a pose is reliable."""
     longest_coast: float = 0.1
     """Time for which a pose is predicted without enough labels [s]."""

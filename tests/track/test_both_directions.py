@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from track.both_directions import _events_of, _exchanges
+from gloves.takes.take import LOST, TRACKED
+from track.both_directions import _events_of, _exchanges, _is_likelier
 
 
 def test_runs_of_exchanged_hands_are_found():
@@ -30,3 +33,22 @@ def test_labels_that_change_together_are_one_event():
 
 def test_directions_that_agree_have_no_event():
     assert not len(_events_of(np.zeros((3, 1), dtype=int), np.zeros((3, 1), dtype=int)).numbers)
+
+
+def test_a_direction_that_has_lost_a_hand_does_not_outvote_the_other():
+    labels, none = np.array([[0, 1, 2]]), np.full((1, 3), -1)
+    parts = (range(5), range(5, 10))
+    has = SimpleNamespace(
+        labels=labels,
+        confidence=np.full((1, 3), 0.8),
+        status=np.array([[TRACKED, LOST]]),
+        hand_labels=parts,
+    )
+    for status, is_likelier in ((LOST, True), (TRACKED, False)):
+        other = SimpleNamespace(
+            labels=none,
+            confidence=np.full((1, 3), 0.9),
+            status=np.array([[status, LOST]]),
+            hand_labels=parts,
+        )
+        assert (_is_likelier(has, other, _events_of(labels, none)) == is_likelier).all()

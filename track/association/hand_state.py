@@ -46,6 +46,7 @@ _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by 
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
 _LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
+_FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers of which a fit leaves a residual that tells their spread
 _BIAS_SLACK: Final = 2.5  # standard deviations that count in how far a marker may be off its design
 # When markers come back, and how long strays live.
 _RETURN_TIME: Final = 0.01  # [s] over the time it was hidden is a marker's chance to come back in a frame
@@ -314,10 +315,13 @@ class HandState:
             self._velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
         self.confirmed[self.digits[settled & (self.digits >= 0)]] = True
+        parts = self.digits + 1
+        seen = np.bincount(parts[np.isfinite(estimate.residuals[:, 0])], minlength=len(DIGITS) + 1)
         _learn_bias(
             estimate.residuals,
             estimate.predicted.rotations,
             settled,
+            seen[parts] >= np.where(parts > 0, _FEWEST_ON_DIGIT, _FEWEST_ON_PALM),
             _AVERAGING_FRAMES,
             self._bias_frames,
             self._bias,
@@ -377,6 +381,7 @@ def _learn_bias(
     residuals: Float[np.ndarray, "M 3"],
     rotations: Float[np.ndarray, "M 3 3"],
     settled: Bool[np.ndarray, "M"],
+    is_tested: Bool[np.ndarray, "M"],
     averaging_frames: float,
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
@@ -384,8 +389,9 @@ def _learn_bias(
 ) -> None:
     """Average the residuals of markers with settled labels in the frames of their bones, and their variance.
 
-    Residuals are model minus marker in the world [m], rotations those of the markers' bones. `bias_frames`,
-    `bias` [m] and `variance` [m^2] are overwritten; an average goes over `averaging_frames` at most.
+    Residuals are model minus marker in the world [m], rotations those of the markers' bones. Any pose fits
+    markers that are not tested by others on their part: their variance stays. `bias_frames`, `bias` [m] and
+    `variance` [m^2] are overwritten; an average goes over `averaging_frames` at most.
     """
     residual = np.empty(3)
     for marker in range(len(residuals)):
@@ -399,7 +405,8 @@ def _learn_bias(
                 residual[i] += rotations[marker, j, i] * residuals[marker, j]
             bias[marker, i] += residual[i] / bias_frames[marker]
             square += residual[i] ** 2
-        variance[marker] += (square - variance[marker]) / bias_frames[marker]
+        if is_tested[marker]:
+            variance[marker] += (square - variance[marker]) / bias_frames[marker]
 
 
 @kernel

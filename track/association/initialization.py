@@ -36,7 +36,8 @@ _LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
 FEWEST_POINTS: Final = 4
 """Least number of labeled points of a hand; a pose needs as many."""
 SPARE_POINTS: Final = 6
-"""Points beyond a hand's markers from which on a group may be two hands that touch."""
+"""Points beyond a hand's markers from which on a group may be two hands that touch, at most."""
+_SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few markers mislead the labeler
 _CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
@@ -59,6 +60,7 @@ _SUPPOSED: Final = 6.0  # coordinates that this spread counts for
 _MOST_MARKERS: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker after which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
+_GOOD_RMS: Final = 0.003  # [m] of that hand at most; a wrong label may bend the hand that it should have been
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
 
@@ -271,7 +273,8 @@ class HandInitializer:
 
     def _cuts_of(self, points: NDArray[np.float64], hands: Sequence[int]) -> NDArray[np.int64]:
         """Directions along which a group is cut if it has points of more than one hand, the longest first."""
-        if len(points) <= max(self._states[index].num_markers for index in hands) + SPARE_POINTS:
+        most = max(self._states[index].num_markers for index in hands)
+        if len(points) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
         count = _CUTS if self._at_once else _CUTS_OF_SEARCH
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
@@ -432,7 +435,7 @@ def _likelier(
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
     """Whether labels fit another hand so much better that they are not of this one."""
     kept = ((first.labels >= 0) & (best.labels == first.labels)).sum()
-    much_better = first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
+    much_better = best.fit.rms[0] < _GOOD_RMS and first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
     return bool(much_better and kept >= _HOPELESS_SHARE * (first.labels >= 0).sum())
 
 

@@ -28,6 +28,7 @@ from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
 
 _RADIUS: Final = 0.06  # [m] from a missing marker, within which the labeler is shown points without a label
+_DIGIT_RADIUS: Final = 0.1  # [m] the same of a marker whose digit has no label: it may be bent or straight
 _FIRST_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
 _WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
 _SEEN_ELSEWHERE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
@@ -132,8 +133,10 @@ class LabelerReview:
         if near.any():
             missing = np.ones(track.state.num_markers, dtype=bool)
             missing[markers[markers >= 0]] = False
+            digits = track.state.digits
+            radius = np.where(np.isin(digits, digits[~missing]), _RADIUS, _DIGIT_RADIUS)
             offsets = frame.points[near, None] - track.estimate.positions[missing]
-            near[near] = (np.linalg.norm(offsets, axis=-1) < _RADIUS).any(axis=1)
+            near[near] = (np.linalg.norm(offsets, axis=-1) < radius[missing]).any(axis=1)
         return near
 
     def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:

@@ -85,6 +85,20 @@ def test_only_settled_labels_teach_a_bias(moving):
     assert (moving.adapted.positions != before).any()
 
 
+def test_a_marker_alone_on_its_digit_keeps_its_spread():
+    user = nominal_fit(load_layout("tips8"), "M", "right")
+    state, qpos = HandState(user), join_qpos(resting_angles(user.model)[None])[0]
+    target = state.solver.marker_positions(qpos)
+    state.initialize(qpos, target, 0.0)
+    first = state.biases.learned_variance
+    for frame in range(1, 30):
+        prediction = state.predict(frame / RATE)
+        state.update(state.fit(target, prediction.qpos, prediction), np.ones(8, dtype=bool), frame / RATE)
+    is_tip, learned = state.digits >= 0, state.biases.learned_variance
+    np.testing.assert_array_equal(learned[is_tip], first[is_tip])
+    assert (learned[~is_tip] < first[~is_tip]).all()
+
+
 def test_biases_are_forgotten_and_recalled(followed):
     off = np.zeros((19, 3))
     off[KNUCKLE] = 0.0, 0.01, 0.01
