@@ -57,7 +57,7 @@ def angle_error(take: Take, truth: Take, side: Side) -> float:
 def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
     """The figures of `NAMES` for each hand of a simulated capture; NaN for places of hands that stay."""
     count = round(seconds * RATE)
-    seen, layout = truth.cut(0, count), truth.hands[0].layout
+    seen, layout = truth.cut(0, count), load_layout(truth.hands[0].layout.name)  # as designed, not as worn
     before = measure_hands(seen, layout, hands=truth.sides)
     user = calibrate(seen, layout, hands=truth.sides)
     takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands) if angles]
