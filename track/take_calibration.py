@@ -32,7 +32,7 @@ _MOST_CHECKED: Final = 400  # frames that are held out
 _FEWEST_SEEN: Final = 0.75  # share of the markers of such a frame
 _RARELY: Final = 0.75  # of the frames show a marker whose label the next finger's cannot have
 _NEXT_FINGER: Final = 3  # bones further
-_AS_WELL: Final = 1.2  # times the residual, up to which labels fit as well
+_AS_WELL: Final = 1.2  # times the residual, and times the shift of markers, up to which labels fit as well
 
 
 def calibrate_take(
@@ -62,35 +62,39 @@ def calibrate_take(
         one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, progress))
         tried = _tried(markers[out], worn[hand.side], one.hand)
         if tried is not None and tried.is_better:
-            tried = tried._replace(hidden=_hidden(markers, out, hand, take.rate, tried.after))
+            tried = tried._replace(hidden=_hidden(markers, out, one, tried.after, take.rate))
         done.append(dataclasses.replace(one, held_out=tried))
     return tuple(done)
 
 
 def _hidden(
-    markers: Float[np.ndarray, "T M 3"], out: Bool[np.ndarray, "T"], hand: GloveFit, rate: float, off: float
+    markers: Float[np.ndarray, "T M 3"], out: Bool[np.ndarray, "T"], one: Calibration, off: float, rate: float
 ) -> str:
     """A rarely seen marker in whose place the next finger's, calibrated likewise, fits as well.
 
     Around a thing held, sparse markers of a finger may have the next finger's labels from the first frame to
-    the last. Other marker places explain that, and held-out frames, labeled alike, confirm them.
+    the last. Other marker places explain that, and held-out frames, labeled alike, confirm them. Right labels
+    fit better, or with places nearer to the design.
 
     Args:
         off: Residual of held-out frames with the labels as they are [m].
     """
-    shown = np.isfinite(markers[..., 0])
+    worn, shown = one.start.attachment, np.isfinite(markers[..., 0])
     rare = shown.mean(axis=0) < _RARELY * shown.any(axis=1).mean()
-    bones = enumerate(hand.attachment.main_bones)
-    on_bone = {int(bone): marker for marker, bone in bones if BONES[bone].digit > 0}
+    on_bone = {int(bone): marker for marker, bone in enumerate(worn.main_bones) if BONES[bone].digit > 0}
     for bone, beside in itertools.product(on_bone, (-_NEXT_FINGER, _NEXT_FINGER)):
         if not rare[on_bone[bone]] or bone + beside not in on_bone:
             continue
-        both, other = [on_bone[bone], on_bone[bone + beside]], markers.copy()
-        other[:, both] = other[:, both[::-1]]
-        found = calibrate_hand(np.where(out[:, None, None], np.nan, other), hand, rate)
-        tried = _tried(other[out], hand, found.hand)
-        if tried is not None and tried.after < _AS_WELL * off:
-            return hand.layout.names[both[0]]
+        hidden, taken, other = on_bone[bone], on_bone[bone + beside], markers.copy()
+        other[:, hidden], other[:, taken] = markers[:, taken], np.nan
+        try:
+            found = calibrate_hand(np.where(out[:, None, None], np.nan, other), one.start, rate)
+        except CalibrationError:  # too few frames without the marker
+            return worn.layout.names[hidden]
+        tried = _tried(other[out], one.start, found.hand)
+        farther = np.linalg.norm(found.shifts) / np.linalg.norm(one.shifts)
+        if tried is None or tried.after * farther < _AS_WELL * off:
+            return worn.layout.names[hidden]
     return ""
 
 
