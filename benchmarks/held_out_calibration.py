@@ -1,7 +1,7 @@
 """Whether a calibration keeps what it says: held-out against fresh frames, places told against true ones.
 
     python -m benchmarks.held_out_calibration [--gloves dense19 dfki13 starter10]
-        [--motions calibration hand-controller] [--people 2] [--seconds 30] [--captures DATA]
+        [--motions calibration hand-controller] [--people 2] [--seconds 30] [--no-angles] [--captures DATA]
 
 Simulated people in gloves that slipped as `handsim simulate` has it; labels are those of the tracker. Rich
 motion is "calibration" (touches) or "free", poor motion "hand-controller", which leaves most joints where
@@ -54,13 +54,13 @@ def angle_error(take: Take, truth: Take, side: Side) -> float:
     return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
 
 
-def run_capture(truth: Take, seconds: float) -> list[list[float]]:
-    """The figures of `NAMES` for each hand of a simulated capture."""
+def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
+    """The figures of `NAMES` for each hand of a simulated capture; NaN for places of hands that stay."""
     count = round(seconds * RATE)
-    seen, layout = truth.cut(0, count), truth.hands[0].layout
+    seen, layout = truth.cut(0, count), load_layout(truth.hands[0].layout.name)  # as designed, not as worn
     before = measure_hands(seen, layout, hands=truth.sides)
     user = calibrate(seen, layout, hands=truth.sides)
-    takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands)]
+    takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands) if angles]
     rows = []
     for done, worn in zip(user.calibrations, user, strict=True):
         side = worn.side
@@ -71,7 +71,10 @@ def run_capture(truth: Take, seconds: float) -> list[list[float]]:
         rows.append(
             [1e3 * done.held_out.before, 1e3 * kept]
             + [fit_error(hand, fresh) for hand in (before.of_side(side), worn)]
-            + [1e3 * done.place_error, 1e3 * float(np.sqrt((hand_errors(worn, true).positions ** 2).mean()))]
+            + [
+                1e3 * done.place_error if done.is_better else np.nan,
+                1e3 * float(np.sqrt((hand_errors(worn, true).positions ** 2).mean())),
+            ]
             + [angle_error(take, seen, side) for take in takes]
         )
     return rows
@@ -94,6 +97,19 @@ def run_person(person: Path) -> list[float]:
     return told + [fit_error(one[0], second) for one in (before, user)] + [1e3 * done.place_error]
 
 
+def judge(rows: np.ndarray) -> str:
+    """How many of the hands keep what is told of them."""
+    told, before, fresh, places, true = rows[:, 1:6].T
+    words = [f"{len(rows)} hands, {np.isfinite(places).sum()} calibrated"]
+    words.append(f"worse on fresh frames by over 2 %: {(fresh > 1.02 * before).sum()}")
+    for name, ratio in (("residual", told / fresh), ("places", (places / true)[np.isfinite(places)])):
+        close = f"{(abs(ratio - 1.0) <= 0.2).sum()} told to 20 %"
+        words.append(
+            f"{name}: {close}, {ratio.mean():.2f} times in the mean, {ratio.min():.2f} to {ratio.max():.2f}"
+        )
+    return "; ".join(words)
+
+
 def tell(name: str, values: np.ndarray) -> None:
     """A row of the table."""
     print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values), flush=True)
@@ -107,6 +123,7 @@ def main() -> None:
     parser.add_argument("--motions", nargs="+", default=["calibration", "hand-controller"])
     parser.add_argument("--people", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--angles", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--captures", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore", HandSimWarning)
@@ -121,11 +138,12 @@ def main() -> None:
             rows = []
             for person in range(options.people):
                 truth = simulate_take(motion, glove=glove, num_frames=count, seed=100 + person)
-                for row in run_capture(truth, options.seconds):
+                for row in run_capture(truth, options.seconds, options.angles):
                     tell(f"{glove}, {motion}, person {person}", np.array(row))
                     rows.append(row)
-            tell(f"{glove}, {motion}, mean", np.mean(rows, axis=0))
-            tell(f"{glove}, {motion}, worst", np.max(rows, axis=0))
+            tell(f"{glove}, {motion}, mean", np.nanmean(rows, axis=0))
+            tell(f"{glove}, {motion}, worst", np.nanmax(rows, axis=0))
+            print(f"{glove}, {motion}: {judge(np.array(rows))}", flush=True)
 
 
 if __name__ == "__main__":

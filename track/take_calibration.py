@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, TRACKED, Take
-from handsim.hand.topology import Side
+from handsim.hand.topology import BONES, Side
 from track.calibration.frames import CalibrationError
 from track.calibration.solver import Progress
 from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand
@@ -29,6 +30,9 @@ _BLOCKS: Final = 6  # at least
 _HELD_OUT: Final = 3  # one block of so many is held out
 _MOST_CHECKED: Final = 400  # frames that are held out
 _FEWEST_SEEN: Final = 0.75  # share of the markers of such a frame
+_RARELY: Final = 0.75  # of the frames show a marker whose label the next finger's cannot have
+_NEXT_FINGER: Final = 3  # bones further
+_AS_WELL: Final = 1.2  # times the residual, and times the shift of markers, up to which labels fit as well
 
 
 def calibrate_take(
@@ -57,8 +61,41 @@ def calibrate_take(
         seen = np.where(out[:, None, None], np.nan, markers)
         one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, progress))
         tried = _tried(markers[out], worn[hand.side], one.hand)
+        if tried is not None and tried.is_better:
+            tried = tried._replace(hidden=_hidden(markers, out, one, tried.after, take.rate))
         done.append(dataclasses.replace(one, held_out=tried))
     return tuple(done)
+
+
+def _hidden(
+    markers: Float[np.ndarray, "T M 3"], out: Bool[np.ndarray, "T"], one: Calibration, off: float, rate: float
+) -> str:
+    """A rarely seen marker in whose place the next finger's, calibrated likewise, fits as well.
+
+    Around a thing held, sparse markers of a finger may have the next finger's labels from the first frame to
+    the last. Other marker places explain that, and held-out frames, labeled alike, confirm them. Right labels
+    fit better, or with places nearer to the design.
+
+    Args:
+        off: Residual of held-out frames with the labels as they are [m].
+    """
+    worn, shown = one.start.attachment, np.isfinite(markers[..., 0])
+    rare = shown.mean(axis=0) < _RARELY * shown.any(axis=1).mean()
+    on_bone = {int(bone): marker for marker, bone in enumerate(worn.main_bones) if BONES[bone].digit > 0}
+    for bone, beside in itertools.product(on_bone, (-_NEXT_FINGER, _NEXT_FINGER)):
+        if not rare[on_bone[bone]] or bone + beside not in on_bone:
+            continue
+        hidden, taken, other = on_bone[bone], on_bone[bone + beside], markers.copy()
+        other[:, hidden], other[:, taken] = markers[:, taken], np.nan
+        try:
+            found = calibrate_hand(np.where(out[:, None, None], np.nan, other), one.start, rate)
+        except CalibrationError:  # too few frames without the marker
+            return worn.layout.names[hidden]
+        tried = _tried(other[out], one.start, found.hand)
+        farther = np.linalg.norm(found.shifts) / np.linalg.norm(one.shifts)
+        if tried is None or tried.after * farther < _AS_WELL * off:
+            return worn.layout.names[hidden]
+    return ""
 
 
 def kept_user(

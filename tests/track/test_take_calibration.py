@@ -63,6 +63,32 @@ def test_a_hand_that_becomes_no_better_stays(seen):
     assert not measured.is_calibrated("right")
 
 
+@pytest.mark.slow
+def test_a_hand_stays_whose_labels_may_be_the_next_fingers():
+    truth = simulate_take("hand-controller", glove="starter10", num_frames=FRAMES, seed=100)
+    start = nominal_user(load_layout("starter10"), "M", ("right",))
+    assert calibrate_take(truth, start, start, None)[0].is_better
+    label = start.layout.names.index
+    given = np.arange(-1, len(truth.label_names))  # by one finger too far: the little one's is hidden
+    for name, other in (("MiddleTip", "RingTip"), ("RingTip", "PinkyTip"), ("PinkyTip", "MiddleTip")):
+        given[1 + label(name)] = label(other)
+    take = dataclasses.replace(truth, labels=given[1 + truth.labels])
+    user = kept_user(take, calibrate_take(take, start, start, None), start, "from a test", None)
+    (one,) = user.calibrations
+    assert one.held_out.after < 0.5 * one.held_out.before and user[0] is start[0]
+    told = "MiddleTip is rarely seen, and the next finger's fits in its place as well"
+    assert str(one).endswith(f"held out, but {told}, so that it stays as it was")
+    assert one.suggestions()[0] == "let MiddleTip be seen most of the time"
+
+
+@pytest.mark.slow
+def test_a_marker_that_fell_off_is_no_doubt_where_the_others_tell_the_fingers(seen):
+    start = nominal_user(load_layout("dense19"), "M", ("right",))
+    lost = np.where(seen.labels == start.layout.names.index("RingTip"), -1, seen.labels)
+    (one,) = calibrate_take(dataclasses.replace(seen, labels=lost), start, start, None)
+    assert one.is_better and not one.held_out.hidden
+
+
 def test_a_take_without_a_hand_is_told(seen):
     no_pose = np.full_like(seen.qpos, np.nan)
     lost = dataclasses.replace(seen, qpos=no_pose, status=np.full_like(seen.status, LOST))

@@ -87,11 +87,13 @@ class HeldOut(NamedTuple):
     """The same with calibration [m]."""
     num_frames: int
     """Number of frames."""
+    hidden: str = ""
+    """A rarely seen marker whose place the next finger's may have; empty where there is none."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the calibrated hand fits better, by more than chance."""
-        return self.after < _BETTER * self.before
+        """Whether the calibrated hand fits better, by more than chance and with labels that are certain."""
+        return not self.hidden and self.after < _BETTER * self.before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,9 +133,12 @@ class Calibration:
         """The markers on held-out frames and their places, in a line [mm]."""
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
-        before, after, frames = self.held_out
+        before, after, frames, hidden = self.held_out
         line = f"markers {1e3 * before:.2f} mm off before, {1e3 * after:.2f} mm calibrated"
         line += f" on {frames} frames held out"
+        if hidden:
+            line += f", but {hidden} is rarely seen, and the next finger's fits in its place as well"
+            return f"{line}, so that it stays as it was"
         if not self.is_better:
             return f"{line}: no better, so that it stays as it was"
         return f"{line}, their places known to {1e3 * self.place_error:.1f} mm"
@@ -153,7 +158,8 @@ class Calibration:
 
     def suggestions(self) -> tuple[str, ...]:
         """What to do in a better capture, as sentences; empty when nothing is missing."""
-        sentences = []
+        hidden = self.held_out.hidden if self.held_out is not None else ""
+        sentences = [f"let {hidden} be seen most of the time"] if hidden else []
         for digit in DIGITS:
             still = [name.removeprefix(f"{digit}_") for name in self.still_joints if name.startswith(digit)]
             if still:
