@@ -28,7 +28,7 @@ from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
 
 _RADIUS: Final = 0.06  # [m] from a missing marker, within which the labeler is shown points without a label
-_DIGIT_RADIUS: Final = 0.1  # [m] the same of a marker whose digit has no label: it may be bent or straight
+_DIGIT_RADIUS: Final = 0.13  # [m] the same of a marker whose digit has no label: it may be bent or straight
 _FIRST_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
 _WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
 _SEEN_ELSEWHERE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
