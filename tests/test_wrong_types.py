@@ -41,6 +41,8 @@ VALID: dict[str, dict[str, object]] = {
     "train.evaluate_labeler": {"labeler": "dense19", "truth": np.zeros((1, 19, 3)), "every": 1},
     "train.generate_dataset": {"out": "set", "glove": "tips8", "rig": "six", "num_frames": 10, "seed": 0},
     "train.load_labeler": {"glove": "dense19"},
+    "train.plan_rig": {"cameras": 2, "room": (2.4, 1.8, 2.2), "glove": "tips8", "seed": 0},
+    "train.score_rig": {"rig": "six", "glove": "tips8", "frames": 60, "seed": 0},
     "train.simulate_take": {"kind": "free", "glove": "tips8", "rig": "six", "num_frames": 2, "seed": 0},
     "train.train_labeler": {"dataset": "set", "out": "run"},
 }  # fmt: skip
@@ -90,7 +92,7 @@ def is_right(name, argument, wrong) -> bool:
     number = isinstance(wrong, int | float)
     return (
         (number and argument in ("duration",))
-        or (isinstance(wrong, int) and argument in ("num_poses", "num_frames", "seed", "every"))
+        or (isinstance(wrong, int) and argument in ("num_poses", "num_frames", "seed", "every", "cameras"))
         or (isinstance(wrong, str) and argument == "out")
         or (argument == "path" and name == "gloves.load_take" and isinstance(wrong, str))
     )

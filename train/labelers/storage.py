@@ -106,7 +106,7 @@ def _files(name_or_path: str | Path) -> tuple[Path, Path]:
         return _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
     weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
     if not weights.is_file() or not card.is_file():
-        unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
+        unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler or glove")
         raise WeightsError(
             f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
             "module:name"
