@@ -22,7 +22,7 @@ README: Final = (
     "{calibration.after[0][0]:.2f} {calibration.after[0][1]:.2f}",
     "{calibration.people_after[0]:.2f} {calibration.people_after[1]:.2f}",
     "{judge.clean[0]:.1f} {judge.mixed[0]:.1f}",
-    "{keypoint_network.ours[2]:.1f} {keypoint_network.plain[2]:.1f}",
+    "{keypoint_network.ours[2]:.1f} {keypoint_photographs.ours[2]:.1f}",
 )
 """The numbers of each row of the table of results in README.md, which is written by hand and tested."""
 
