@@ -29,7 +29,7 @@ from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
-from track.glove_advice.trials import CAPTURES, FRAMES, METHODS, WORK, try_layout
+from track.glove_advice.trials import CAPTURES, FRAMES, METHODS, WORK, mean_trial, try_layout
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.learned_gloves import fine_tuned_labeler, learned_labeler
 from train.glove_labeler import load_labeler
@@ -95,13 +95,13 @@ def trial_figures(
     figures: Figures = {}
     for work in trials[0]:
         rows = [one[work] for one in trials]
-        shares = {method: [row.share(method) for row in rows] for method in METHODS}
+        mean = mean_trial(rows)
         figures[work] = {
-            "share": {method: float(np.mean(some)) for method, some in shares.items()},
-            "worst": {method: min(some) for method, some in shares.items()},
-            "right": np.mean([row.right for row in rows], axis=0).tolist(),
-            "joints": float(np.rad2deg(np.sqrt(np.nanmean([row.joints**2 for row in rows])))),
-            "size": 1e3 * float(np.mean([row.size_error for row in rows])),
+            "share": {method: mean.share(method) for method in METHODS},
+            "worst": {method: min(row.share(method) for row in rows) for method in METHODS},
+            "right": mean.right.tolist(),
+            "joints": float(np.rad2deg(np.sqrt(np.nanmean(mean.joints**2)))),
+            "size": 1e3 * mean.size_error,
         }
     return figures
 

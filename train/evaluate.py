@@ -72,15 +72,14 @@ def evaluate_labeler(
             f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
         )
     for one in takes:
-        if (one if isinstance(one, Take) else load_take(one)).is_tracked:
-            raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
-    if takes and (corruption != CLEAN or every > 1):
-        raise CaptureError(
-            "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
-            "(--occlude, --ghosts) and every (--every), which labeled captures take"
-        )
-    for one in takes:
         take = one if isinstance(one, Take) else load_take(one)
+        if take.is_tracked:
+            raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
+        if corruption != CLEAN or every > 1:
+            raise CaptureError(
+                "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
+                "(--occlude, --ghosts) and every (--every), which labeled captures take"
+            )
         for hand in take.hands:
             _check_markers("the take's glove", hand.layout.names, network.marker_names)
         count.add_take(take)

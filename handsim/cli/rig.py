@@ -188,8 +188,9 @@ def score_rig_file(
         frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
     """
-    named = rig if rig.endswith(".toml") else f"{load_rig(rig).name}.toml"
-    page = Path(named).with_suffix(".html") if out is None else out
+    cameras = load_rig(rig)
+    named = Path(rig).with_suffix(".html") if rig.endswith(".toml") else Path(f"{cameras.name}.html")
+    page = named if out is None else out
     check_ending(page, ".html")
     if json is not None:
         check_ending(json, ".json", option="--json")
@@ -199,7 +200,14 @@ def score_rig_file(
 
     with named_steps("getting ready") as step:
         score = scoring.score_rig(
-            rig, volume=volume, center=center, take=take, glove=glove, frames=frames, seed=seed, progress=step
+            cameras,
+            volume=volume,
+            center=center,
+            take=take,
+            glove=glove,
+            frames=frames,
+            seed=seed,
+            progress=step,
         )
     _print(work_table(score))
     _print(camera_table(score))

@@ -114,7 +114,7 @@ def try_layout(
                 kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
             )
             tried.append(try_take(take, layout, labeler))
-        found[name] = _mean(tried)
+        found[name] = mean_trial(tried)
     return found
 
 
@@ -143,7 +143,7 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     return Trial(slots, frames, _root_mean(np.concatenate(errors)), size_error)
 
 
-def _mean(trials: Sequence[Trial]) -> Trial:
+def mean_trial(trials: Sequence[Trial]) -> Trial:
     """The mean of captures of equal length."""
     return Trial(
         {name: np.mean([one.slots[name] for one in trials], axis=0) for name in METHODS},

@@ -19,8 +19,8 @@ from handsim.kernels.kernel import kernel
 from poses.shapes.library import LIBRARIES, gestures_of
 from track.kinematics.levenberg_marquardt import eliminate, invert_positive, solve_positive
 
-_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of the hinges: of one that markers leave open
-# little is known after it, and a digit with one marker, bent as few are, finds back
+# Little is known of a hinge after it, so that a digit with one marker that was bent as few are finds back.
+_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of the hinges
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge
 _GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # added to the gestures' spread, for poses that none shows
 
