@@ -181,7 +181,7 @@ class Studio:
             for body, T_world_body in zip(take.bodies, pose_matrices(take.body_poses[frame]), strict=True)
             if np.isfinite(T_world_body).all()
         )
-        known = np.isfinite(take.points[frame, :, 0])
+        seen_points = take.point_list.of(frame)
         return RenderedFrame(
             number=frame,
             time=float(take.times[frame]),
@@ -190,8 +190,8 @@ class Studio:
             bodies=bodies,
             ideal=self._requested(seen, rgb),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
-            points=take.points[frame, known],
-            labels=take.labels[frame, known],
+            points=take.point_list.points[seen_points],
+            labels=take.point_list.labels[seen_points],
             label_names=take.label_names,
             choices=self._record(choices) if recorded else {},
         )

@@ -62,4 +62,4 @@ def test_arrays_of_a_take(file: str, folder: Path) -> None:
     frames, hands = found["status"][1]
     told = {"angle_spread": ("f4", (frames, hands, 20)), "keypoint_spread": ("f4", (frames, hands, 21))}
     assert spreads == (told if file == "tracked.npz" else {})
-    assert found == stated("## Takes", "\0", {**ONE_CAPTURE, "N": found["points"][1][1]})
+    assert found == stated("## Takes", "\0", {**ONE_CAPTURE, "P": found["points"][1][0]})

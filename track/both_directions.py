@@ -17,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gloves.captures.capture import runs_of
+from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.hand.topology import NUM_QPOS
 from track.label_confidence import label_confidence
@@ -43,14 +44,12 @@ class _Track(NamedTuple):
 
 
 class _Events(NamedTuple):
-    """The P points to which the directions give different labels."""
+    """The E points to which the directions give different labels."""
 
-    rows: Int[np.ndarray, "P"]
-    """Frame of each point."""
-    columns: Int[np.ndarray, "P"]
-    """Its column."""
-    numbers: Int[np.ndarray, "P"]
-    """The event that it is of."""
+    points: Int[np.ndarray, "E"]
+    """Which points of the take these are."""
+    numbers: Int[np.ndarray, "E"]
+    """The event that each is of."""
 
 
 def label_both_ways(
@@ -74,20 +73,22 @@ def label_both_ways(
     forward = _track(take, frames, range(count), user, labeler, lambda done: told(done // 2))
     reverse = range(count)[::-1]
     backward = _track(take, frames, reverse, user, labeler, lambda done: told((count + done) // 2))
-    one, other = forward.take.labels, backward.take.labels
+    points, one, other = take.point_list, forward.take.point_list.labels, backward.take.point_list.labels
     is_second = np.zeros(one.shape, dtype=bool)
-    events = _events_of(one, other)
-    is_second[events.rows, events.columns] = _is_likelier(backward.take, forward.take, events)
+    events = _events_of(points.frames, one, other)
+    is_second[events.points] = _is_likelier(backward.take, forward.take, events)
     is_better = backward.evidence > forward.evidence
-    for run in _exchanges(one, other, user.layout.num_markers):  # right and left: the poses tell
+    for run in _exchanges(points, one, other, user.layout.num_markers):  # right and left: the poses tell
         is_better[run] = backward.evidence[run].sum() > forward.evidence[run].sum()
-        is_second[run] = is_better[run, None]
+        is_second[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
     labels = np.where(is_second, other, one)
     qpos, rms = _poses(forward.take, backward.take, is_better)
     right = label_confidence(_posed(take, labels, qpos, rms))
     odds = np.where(one == other, _AGREED, 1.0)
     confidence = odds * right / (1.0 - right + odds * right)
-    return dataclasses.replace(take, labels=labels, confidence=confidence)
+    return dataclasses.replace(
+        take, point_list=dataclasses.replace(points, labels=labels, confidence=confidence)
+    )
 
 
 def _track(
@@ -99,29 +100,31 @@ def _track(
     told: Callable[[int], None],
 ) -> _Track:
     """The hands tracked through frames in an order."""
-    tracker, present = Tracker(user, labeler), np.isfinite(take.points[..., 0])
-    labels, evidence = take.labels.copy(), np.zeros(len(frames))
+    tracker, points = Tracker(user, labeler), take.point_list
+    labels, evidence = points.labels.copy(), np.zeros(len(frames))
     qpos, rms = np.zeros((len(frames), len(user), NUM_QPOS)), np.zeros((len(frames), len(user)))
     for count, row in enumerate(order, 1):
         frame = frames[row]
         one = tracker.step(frame.points, frame.ids, abs(frame.time - frames[order[0]].time))
-        labels[row, present[row]] = one.labels
+        labels[points.of(row)] = one.labels
         qpos[row], rms[row] = [hand.qpos for hand in one.hands], [hand.rms for hand in one.hands]
         evidence[row] = sum(map(_evidence, one.hands))
         told(count)
     posed = _posed(take, labels, qpos, rms)
-    return _Track(dataclasses.replace(posed, confidence=label_confidence(posed)), evidence)
+    sure = dataclasses.replace(posed.point_list, confidence=label_confidence(posed))
+    return _Track(dataclasses.replace(posed, point_list=sure), evidence)
 
 
 def _posed(
     take: Take,
-    labels: Int[np.ndarray, "T N"],
+    labels: Int[np.ndarray, "P"],
     qpos: Float[np.ndarray, "T H 27"],
     rms: Float[np.ndarray, "T H"],
 ) -> Take:
     """The take with labels and the poses [m, rad] that they were found with, NaN of lost hands."""
     status = np.where(np.isfinite(qpos[..., 0]), TRACKED, LOST)
-    return dataclasses.replace(take, labels=labels, qpos=qpos, status=status, rms=rms)
+    points = dataclasses.replace(take.point_list, labels=labels)
+    return dataclasses.replace(take, point_list=points, qpos=qpos, status=status, rms=rms)
 
 
 def _evidence(hand: TrackedHand) -> float:
@@ -131,14 +134,17 @@ def _evidence(hand: TrackedHand) -> float:
     return (len(hand.markers) - len(hand.filled)) * (_WORTH - 0.5 * (hand.rms / _SPREAD) ** 2)
 
 
-def _events_of(one: Int[np.ndarray, "T N"], other: Int[np.ndarray, "T N"]) -> _Events:
+def _events_of(
+    frames: Int[np.ndarray, "P"], one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"]
+) -> _Events:
     """The points whose two labels are different, by event.
 
     Points are of one event if a label is one's in one direction and the other's in the other direction, or if
     they have the same two labels in one frame and the next.
     """
-    rows, columns = np.nonzero(one != other)
-    first, second = (labels[rows, columns].astype(np.int64) + 1 for labels in (one, other))
+    points = np.flatnonzero(one != other)
+    rows = frames[points]
+    first, second = (labels[points].astype(np.int64) + 1 for labels in (one, other))
     span = max(first.max(initial=0), second.max(initial=0)) + 1
     pairs = first * span + second
     order = np.lexsort((rows, pairs))
@@ -154,33 +160,36 @@ def _events_of(one: Int[np.ndarray, "T N"], other: Int[np.ndarray, "T N"]) -> _E
         [[order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]], axis=1
     )
     graph = coo_array((np.ones(links.shape[1]), links), shape=(len(rows), len(rows)))
-    return _Events(rows, columns, connected_components(graph, directed=False)[1])
+    return _Events(points, connected_components(graph, directed=False)[1])
 
 
-def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "P"]:
+def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "E"]:
     """For each point, whether a take's labels of its event are likelier than another take's.
 
     A point without a label tells nothing where the hand is lost that the other take has it on.
     """
     log_odds, markers = [], len(take.hand_labels[0])
+    rows = take.point_list.frames[events.points]
     for one, rival in ((take, other), (other, take)):
-        right = np.clip(one.confidence[events.rows, events.columns], _LEAST, 1.0 - _LEAST)
-        hand = rival.labels[events.rows, events.columns] // markers
-        is_silent = (hand >= 0) & (one.labels[events.rows, events.columns] < 0)
-        is_silent &= one.status[events.rows, hand] == LOST
+        right = np.clip(one.point_list.confidence[events.points], _LEAST, 1.0 - _LEAST)
+        hand = rival.point_list.labels[events.points] // markers
+        is_silent = (hand >= 0) & (one.point_list.labels[events.points] < 0)
+        is_silent &= one.status[rows, hand] == LOST
         log_odds.append(np.where(is_silent, 0.0, np.log(right / (1.0 - right))))
     gain = np.bincount(events.numbers, log_odds[0] - log_odds[1])
-    likelier: Bool[np.ndarray, "P"] = gain[events.numbers] > 0.0
+    likelier: Bool[np.ndarray, "E"] = gain[events.numbers] > 0.0
     return likelier
 
 
 def _exchanges(
-    one: Int[np.ndarray, "T N"], other: Int[np.ndarray, "T N"], num_markers: int
+    points: PointList, one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"], num_markers: int
 ) -> Iterator[slice]:
     """Runs of frames in which the directions give most points of a hand to different hands."""
     both = (one >= 0) & (other >= 0)
     exchanged = both & (one // num_markers != other // num_markers)
-    wrong = exchanged.sum(axis=1) > _MOST * both.sum(axis=1)
+    count = len(points.counts)
+    numbers = [np.bincount(points.frames[which], minlength=count) for which in (exchanged, both)]
+    wrong = numbers[0] > _MOST * numbers[1]
     yield from (slice(first, last + 1) for first, last in runs_of(wrong))
 
 

@@ -97,12 +97,11 @@ def label_capture(
     if _is_continuous(frames):
         labeled = label_both_ways(take, frames, user, network, told)
     else:
-        labels, confidence = take.labels.copy(), take.confidence.copy()
         found = label_alone([frame.points for frame in frames], user.hands, network, told)
-        for row, sure, there, one in zip(labels, confidence, present, found, strict=True):
-            row[there], sure[there] = one
-        labeled = dataclasses.replace(take, labels=labels, confidence=confidence)
-    if (labeled.labels < 0).all():
+        labels, confidence = (np.concatenate(values) for values in zip(*found, strict=True))
+        points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
+        labeled = dataclasses.replace(take, point_list=points)
+    if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{settings['glove']}' (--glove names another)"
         warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
     return labeled

@@ -13,6 +13,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
+from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
 from track.bodies.body_file import AnyBody
@@ -94,7 +95,8 @@ def track_capture(
     take = recorder.take(source)
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     settings = {**take.settings, **settings, **setup.settings}
-    take = dataclasses.replace(take, confidence=label_confidence(take), settings=settings)
+    points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
+    take = dataclasses.replace(take, point_list=points, settings=settings)
     return take if corrections is None else _corrected(take, Path(corrections), pins)
 
 
@@ -143,8 +145,9 @@ def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tu
     """The corrections of a file, checked against the capture before the long work."""
     corrections = load_corrections(path)
     ids = number_runs(np.isfinite(source.positions[..., 0]))
+    points = PointList.of_tables(source.positions, ids, np.full_like(ids, -1), np.ones(ids.shape))
     try:
-        find_pins(corrections, source.positions, ids, label_names(setup.user, setup.bodies))
+        find_pins(corrections, points, label_names(setup.user, setup.bodies))
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
     return corrections

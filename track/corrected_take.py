@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
-from gloves.takes.take import LOST, Take, labeled_markers
+from gloves.takes.points import PointList
+from gloves.takes.take import LOST, Take
 from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.pose_solver import AnglePrior, PoseSolver
@@ -48,26 +49,30 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
         CaptureError: A span is not within the frames, a label is unknown, or two points of a frame have one
             label.
     """
-    pins = find_pins(corrections, take.points, take.ids, take.label_names)
+    before = take.point_list
+    pins = find_pins(corrections, before, take.label_names)
     about = pins.labels != FREE
-    labels = pin_labels(take.labels, pins.labels)
+    points = dataclasses.replace(
+        before, labels=pin_labels(before, pins.labels), confidence=np.where(about, 1.0, before.confidence)
+    )
     qpos, rms = take.qpos.copy(), take.rms.copy()
     for number, span in enumerate(take.hand_labels):
-        own, before = (_of_hand(values, span) for values in (labels, take.labels))
-        frames = np.flatnonzero((own != before).any(axis=1) & (take.status[:, number] != LOST))
+        changed = before.frames[_of_hand(points.labels, span) != _of_hand(before.labels, span)]
+        frames = np.unique(changed)
+        frames = frames[take.status[frames, number] != LOST]
         if len(frames):
-            targets = labeled_markers(take.points[frames], labels[frames], span)
+            targets = points.labeled(span, frames)
             qpos[frames, number], rms[frames, number] = _fit_again(take, number, frames, targets)
-    spreads = _spreads(take, labels, qpos)
+    spreads = _spreads(take, points, qpos)
     corrected = dataclasses.replace(
-        take, **spreads, labels=labels, confidence=np.where(about, 1.0, take.confidence), qpos=qpos, rms=rms,
+        take, **spreads, point_list=points, qpos=qpos, rms=rms,
         settings={**take.settings, "corrections": _records(take, corrections, pins.unfitting)},
     )  # fmt: skip
-    return CorrectedTake(corrected, int(about.sum()), int(about.any(axis=1).sum()), pins.unfitting)
+    return CorrectedTake(corrected, int(about.sum()), len(np.unique(before.frames[about])), pins.unfitting)
 
 
-def _spreads(take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]) -> dict[str, Any]:
-    """Standard deviations of all poses with these labels, by the names of a take's fields."""
+def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[str, Any]:
+    """Standard deviations of all poses with the labels of these points, by the names of a take's fields."""
     notes = str(take.settings.get("user", ""))
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)
     keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS), np.nan)
@@ -75,7 +80,7 @@ def _spreads(take: Take, labels: NDArray[np.int16], qpos: NDArray[np.float64]) -
         there = np.flatnonzero(take.status[:, number] != LOST)
         if not len(there):
             continue
-        seen = np.isfinite(labeled_markers(take.points, labels, span)[..., 0])
+        seen = np.isfinite(points.labeled(span)[..., 0])
         last = np.maximum.accumulate(np.where(seen, take.times[:, None], -np.inf), axis=0)
         unseen = (take.times[:, None] - last)[there]
         rms = take.rms[there, number]
@@ -116,7 +121,7 @@ def _solved(
     return qpos
 
 
-def _of_hand(labels: Int[np.ndarray, "T N"], span: range) -> NDArray[np.int64]:
+def _of_hand(labels: Int[np.ndarray, "P"], span: range) -> NDArray[np.int64]:
     """Labels of one hand, -1 for those of others."""
     return np.where((labels >= span.start) & (labels < span.stop), labels, -1)
 

@@ -20,8 +20,8 @@ _UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35)
 """Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
 
 
-def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "T N"]:
-    """Probability that each label of a tracked take is right; of a point without one, that it is no marker.
+def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
+    """Probability that each point's label is right; of a point without one, that it is no marker.
 
     Confidences of rigid bodies' points stay, and all those of a take without poses.
 
@@ -29,7 +29,7 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
         take: A take of hands.
         evidence: What `evidence_of` makes of it, where that is known already.
     """
-    confidence = take.confidence.copy()
+    confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():
         return confidence
     told = evidence_of(take) if evidence is None else evidence
@@ -40,5 +40,5 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
         (~labeled, told.unlabeled, _UNLABELED),
     ):
         right[which] = 1.0 / (1.0 + np.exp(weights[0] + values @ np.array(weights[1:])))
-    confidence[told.frames, told.columns] = right
+    confidence[told.points] = right
     return confidence

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.takes.take import LOST, Take, labeled_markers
+from gloves.takes.take import LOST, Take
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import point_distance
@@ -50,12 +50,10 @@ _MOST_OFF: Final = 100.0  # usual residuals; more tells no more
 
 
 class Evidence(NamedTuple):
-    """What is told of the P points of a take, in the order of its frames."""
+    """What is told of P points of a take, in the order of its frames."""
 
-    frames: Int[np.ndarray, "P"]
-    """Frame of each point."""
-    columns: Int[np.ndarray, "P"]
-    """Its column."""
+    points: Int[np.ndarray, "P"]
+    """Which points of the take's list these are."""
     labels: Int[np.ndarray, "P"]
     """Its label, -1 for none."""
     markers: Int[np.ndarray, "P"]
@@ -69,17 +67,22 @@ class Evidence(NamedTuple):
 def evidence_of(take: Take) -> Evidence:
     """What a take with poses tells of the labels of its points; those of rigid bodies are left out."""
     count = take.hand_labels[-1].stop
-    frames, columns = np.nonzero(np.isfinite(take.points[..., 0]) & (take.labels < count))
-    points, labels = take.points[frames, columns], take.labels[frames, columns].astype(np.int64)
+    listed = take.point_list
+    chosen = np.flatnonzero(listed.labels < count)
+    frames, points, labels = (
+        listed.frames[chosen],
+        listed.points[chosen],
+        listed.labels[chosen].astype(np.int64),
+    )
     owners = np.repeat(np.arange(len(take.hands)), [len(part) for part in take.hand_labels])
     expected = np.concatenate([take.pose_markers(side) for side in take.sides], axis=1)
     centers = np.stack([expected[:, owners == hand].mean(axis=1) for hand in range(len(take.hands))], axis=1)
     starts = np.searchsorted(frames, np.arange(take.num_frames + 1))
-    lives = _follow(points, take.ids[frames, columns].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
+    lives = _follow(points, listed.ids[chosen].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
     own, others, length = _lives(lives, labels, count)
     of_life, short = np.log1p(others / own), np.log(_SHORT / np.minimum(length, _SHORT))
     which, free = np.flatnonzero(labels >= 0), np.flatnonzero(labels < 0)
-    seen = labeled_markers(take.points, take.labels, range(count))
+    seen = take.observed(range(count))
     residuals, markers = np.linalg.norm(seen - expected, axis=-1), labels.copy()
     markers[free], near = _surroundings(points, labels, starts, expected, _BESIDE, _FAR)
     of_hand = _of_hands(take, np.isfinite(seen[..., 0]), owners)[frames, owners[markers]]
@@ -104,7 +107,7 @@ def evidence_of(take: Take) -> Evidence:
         np.log1p(near[2]) * is_lost,
         *of_hand[free].T,
     ]
-    return Evidence(frames, columns, labels, markers, np.stack(labeled, axis=1), np.stack(unlabeled, axis=1))
+    return Evidence(chosen, labels, markers, np.stack(labeled, axis=1), np.stack(unlabeled, axis=1))
 
 
 def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL
+from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL, POINTS
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.take import (
     RATED_FRAMES,
@@ -31,12 +31,14 @@ from gloves.takes.take import (
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.atomic import remove_abandoned
+from track.intake import FARTHEST, LATEST_TIME
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
+_MOST_ID: Final = (1 << 31) - 1  # as takes store them; longer IDs keep their last bits
 
 
 class TakeRecorder:
@@ -92,7 +94,7 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
         "points": frame.points,
-        "ids": frame.ids.astype(np.int32),
+        "ids": np.where(frame.ids < 0, -1, frame.ids & _MOST_ID).astype(np.int32),
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
@@ -133,7 +135,7 @@ class Recorder:
             self.part,
             self._header(None),
             worn_arrays(self._hands, self._bodies),
-            [column.sized(sizes) for column in (*FRAMES, *OPTIONAL, KEYPOINTS)],
+            [column.sized(sizes) for column in (*FRAMES, *POINTS, *OPTIONAL, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
         self._closed = False
@@ -151,16 +153,28 @@ class Recorder:
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream.
 
+        Points that the tracker leaves out, because they are not finite or very far away, are left out here.
+
         Raises:
+            ArgumentError: Its time is not after that of the frame before; what was recorded is kept.
             CaptureError: The file cannot be written; what was recorded until then is kept.
         """
         try:
             if frame.silent:
                 self._archive.flush_due()
                 return
+            last = self._times[1] if self._times else -LATEST_TIME
+            if not last < frame.time < LATEST_TIME:
+                raise ArgumentError(
+                    f"frame {frame.number} is at {frame.time:g} s, expected a time after that of the frame "
+                    f"before, {last:g} s"
+                )
             values = frame_values(frame, tracked)
+            usable = np.abs(values["points"]).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not
+            for column in POINTS:
+                values[column.name] = values[column.name][usable]
             keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
-            self._archive.add({**values, KEYPOINTS.name: keypoints}, len(frame.points))
+            self._archive.add({**values, KEYPOINTS.name: keypoints}, int(usable.sum()))
         except OSError as error:
             raise CaptureError(
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
@@ -176,7 +190,7 @@ class Recorder:
     def finish(
         self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
     ) -> tuple[Take, int]:
-        """Write the take and remove the recording; without at least two frames, remove it only.
+        """Write the take, read it back, and remove the recording; of fewer than two frames, remove it only.
 
         Args:
             stream: What became of the stream's frames (`counts` of `open_source`), for the take's settings.
@@ -195,17 +209,17 @@ class Recorder:
             raise CaptureError(f"{self.num_frames} frames came, expected two or more")
         if stream is not None:
             self._settings["stream"] = dict(stream)
-        grown = GrownArchive(self.part, check=False)
-        header = self._header(usual_rate(grown.first("times", RATED_FRAMES)))
         try:
+            grown = GrownArchive(self.part, check=False)
+            header = self._header(usual_rate(grown.first("times", RATED_FRAMES)))
+            step = grown.step_for(_SUMMARIZED)
+            take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)
-        except OSError as error:
+        except Exception as error:  # whatever it is, the recording must not go
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
             raise CaptureError(
-                f"{self._out}: cannot be written ({error.strerror or error}); the recording is kept in "
-                f"{self.part}"
+                f"{self._out}: cannot be written ({reason}); the recording is kept in {self.part}"
             ) from error
-        step = grown.step_for(_SUMMARIZED)
-        take = unpack_take(header, grown.read(step))
         self.part.unlink()
         return take, step
 

@@ -141,9 +141,10 @@ def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
         filled, markers = take.filled(side), take.markers(side)
         total += filled.size
         for frame in np.flatnonzero(filled.any(axis=1) & _reliable(take, side)):
-            free = take.points[frame, take.labels[frame] < 0]
+            own = take.point_list.of(frame)
+            free = take.point_list.points[own][take.point_list.labels[own] < 0]
             expected = markers[frame, filled[frame]]
-            left += int((cdist(expected, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
+            left += int((cdist(expected, free) < _NEAR).any(axis=1).sum())
     return left > _LEFT_OVER * total
 
 

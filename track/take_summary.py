@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
+from jaxtyping import Float, Int
 from scipy.ndimage import minimum_filter1d
 
 from gloves.captures.capture import runs_of
@@ -65,10 +64,10 @@ def summarize(take: Take) -> list[str]:
         status, rms = take.body_status[:, number], take.body_rms[:, number]
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
         lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
-    there, foreign = np.isfinite(take.points[..., 0]), _unlabeled(take)
-    line = f"{int(foreign.sum())} of {int(there.sum())} points are not markers"
-    near = int(_at_hands(take, foreign).sum())
-    if foreign.sum() - near > _MANY_FAR * there.sum():
+    count, foreign = len(take.point_list.labels), int((take.point_list.labels < 0).sum())
+    line = f"{foreign} of {count} points are not markers"
+    near = _unlabeled_at_hands(take)
+    if foreign - near > _MANY_FAR * count:
         line += f", {near} of them at the hands"
     return [*lines, line]
 
@@ -80,18 +79,18 @@ def no_points(take: Take) -> str:
 
 def suspicions(take: Take) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
-    there = np.isfinite(take.points[..., 0])
-    if not there.any():
+    points = take.point_list
+    if not len(points.points):
         return [no_points(take)]
-    clouds = [points[seen] for points, seen in zip(take.points, there, strict=True)]
+    clouds = np.split(points.points, points.starts[1:-1])
     if all_at_origin(clouds):
         return [AT_ORIGIN]
     fault = unit_fault(clouds, only_wide=True)
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
-    near = int(_at_hands(take, _unlabeled(take)).sum())
-    share = near / max(1, near + int((take.labels >= 0).sum()))
+    near = _unlabeled_at_hands(take)
+    share = near / max(1, near + int((points.labels >= 0).sum()))
     if share > _MOST_UNLABELED:
         found.append(
             f"{100 * share:.1f} % of the points at the hands are not markers of what was tracked; name the "
@@ -100,21 +99,15 @@ def suspicions(take: Take) -> list[str]:
     return found
 
 
-def _unlabeled(take: Take) -> Bool[np.ndarray, "T N"]:
-    """Which points have no label."""
-    unlabeled: Bool[np.ndarray, "T N"] = np.isfinite(take.points[..., 0]) & (take.labels < 0)
-    return unlabeled
-
-
-def _at_hands(take: Take, which: Bool[np.ndarray, "T N"]) -> Bool[np.ndarray, "T N"]:
-    """Those of some points that are at a hand; markers of others that are elsewhere tell of no mistake."""
+def _unlabeled_at_hands(take: Take) -> int:
+    """Number of points without a label at the hands; those that are elsewhere tell of no mistake."""
     markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
-    near = np.zeros_like(which)
-    for frame in np.flatnonzero(which.any(axis=1)):
+    points, near = take.point_list.without(take.point_list.labels >= 0), 0
+    for frame in np.flatnonzero(points.counts):
         seen = markers[frame, np.isfinite(markers[frame, :, 0])]
         if len(seen):
-            columns = np.flatnonzero(which[frame])
-            near[frame, columns] = distances_to_nearest(take.points[frame, columns], seen) < _AT_HAND
+            distances = distances_to_nearest(points.points[points.of(frame)], seen)
+            near += int((distances < _AT_HAND).sum())
     return near
 
 
@@ -168,16 +161,17 @@ def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
         Spans `first` to `last` [frames], the `worst` frame of each, and in words of what and why.
     """
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
-    confidence, markers = _confidence(take, evidence), take.labels.astype(np.int64)
+    points = take.point_list
+    confidence, markers = _confidence(take, evidence), points.labels.astype(np.int64)
     if evidence is not None:
-        markers[evidence.frames, evidence.columns] = evidence.markers
-    least = np.fmin.reduce(confidence, axis=1, initial=1.0)
+        markers[evidence.points] = evidence.markers
+    least = np.fmin(_least_in_frames(take, confidence), 1.0)
     found: list[tuple[float, Doubt]] = []
     around, apart = round(_AROUND * take.rate), _APART * take.rate
     for first, last in _joined(runs_of(minimum_filter1d(least, 2 * around + 1) < _CERTAIN), apart):
         worst = first + int(least[first : last + 1].argmin())
-        column = int(np.nanargmin(confidence[worst]))
-        of, why = _words(take, worst, column, int(markers[worst, column]))
+        point = points.of(worst).start + int(np.nanargmin(confidence[points.of(worst)]))
+        of, why = _words(take, worst, int(points.labels[point]), int(markers[point]))
         why += f", {100 * least[worst]:.0f} %"
         found.append((float((1.0 - least[first : last + 1]).sum()), Doubt(first, last, worst, of, why)))
     found.sort(key=lambda entry: (-entry[0], entry[1].first))
@@ -195,11 +189,11 @@ def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, in
     return joined
 
 
-def _words(take: Take, frame: int, column: int, marker: int) -> tuple[str, str]:
+def _words(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
     """Of what a doubt is, and why: of a label, of a marker whose point may lack it, or of its hand."""
     if marker < 0:
         return "a point", "without a label"
-    if take.labels[frame, column] >= 0:
+    if label >= 0:
         return take.label_names[marker], "labeled"
     hand = next(number for number, part in enumerate(take.hand_labels) if marker in part)
     status = take.status[frame, hand]
@@ -210,17 +204,24 @@ def _words(take: Take, frame: int, column: int, marker: int) -> tuple[str, str]:
 
 def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
     """The least confidence in a frame's points, with a label or without; NaN in frames without points."""
-    least: NDArray[np.float64] = np.fmin.reduce(_confidence(take), axis=1, initial=np.nan)
+    return _least_in_frames(take, _confidence(take))
+
+
+def _least_in_frames(take: Take, confidence: Float[np.ndarray, "P"]) -> Float[np.ndarray, "T"]:
+    """The least confidence in a frame's points; NaN in frames without points."""
+    least = np.full(take.num_frames, np.nan)
+    np.fmin.at(least, take.point_list.frames, confidence)
     return least
 
 
-def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "T N"]:
+def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
     """The confidence by all of the take; 1 stays, as that of corrected labels and of a truth."""
+    confidence = take.point_list.confidence
     if _is_known(take):
-        return take.confidence
-    return np.where(take.confidence == 1.0, 1.0, label_confidence(take, evidence))
+        return confidence
+    return np.where(confidence == 1.0, 1.0, label_confidence(take, evidence))
 
 
 def _is_known(take: Take) -> bool:
     """Whether every label is certain, as those of a truth."""
-    return bool((take.confidence[np.isfinite(take.points[..., 0])] == 1.0).all())
+    return bool((take.point_list.confidence == 1.0).all())

@@ -75,24 +75,23 @@ def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], 
     with three or more are left out, since the system tracks it, as are those of the other hand.
     """
     nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
-    mine = take.hand_labels[hand]
-    own = (take.labels >= mine.start) & (take.labels < mine.stop)
-    ghost = (take.labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
-    truth = np.where(own, take.labels - mine.start, -1)
-    here = own | ghost
-    clouds = [points[chosen] for points, chosen in zip(take.points, here, strict=True)]
-    return clouds, [label[chosen] for label, chosen in zip(truth, here, strict=True)]
+    mine, labels = take.hand_labels[hand], take.point_list.labels
+    own = (labels >= mine.start) & (labels < mine.stop)
+    ghost = (labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
+    here = take.point_list.without(~(own | ghost))
+    truth = np.where(here.labels >= 0, here.labels - mine.start, -1)
+    clouds, truths = (np.split(values, here.starts[1:-1]) for values in (here.points, truth))
+    return clouds, truths
 
 
-def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
+def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
     """Distance of every point from the nearest marker seen of one hand [m]; inf where none is seen."""
-    markers = take.observed(label)
-    distance = np.full(take.labels.shape, np.inf)
-    for frame, points in enumerate(take.points):
-        there = np.isfinite(points[:, 0])
-        seen = markers[frame][np.isfinite(markers[frame, :, 0])]
-        if len(seen):
-            distance[frame, there] = cKDTree(seen).query(points[there])[0]
+    markers, points = take.observed(label), take.point_list
+    distance = np.full(len(points.labels), np.inf)
+    for frame, every in enumerate(markers):
+        there, seen = points.of(frame), every[np.isfinite(every[:, 0])]
+        if len(seen) and there.stop > there.start:
+            distance[there] = cKDTree(seen).query(points.points[there])[0]
     return distance
 
 

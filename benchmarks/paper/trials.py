@@ -29,13 +29,11 @@ def hide_points(take: Take, first: int, frames: int) -> Take:
         first: First frame without points.
         frames: Number of frames without points.
     """
-    points, ids, labels, confidence = (
-        values.copy() for values in (take.points, take.ids, take.labels, take.confidence)
-    )
-    hidden, after = slice(first, first + frames), ids[first + frames :]
-    points[hidden], ids[hidden], labels[hidden], confidence[hidden] = np.nan, -1, -1, np.nan
-    after[after >= 0] += take.ids.max() + 1
-    return dataclasses.replace(take, points=points, ids=ids, labels=labels, confidence=confidence)
+    points = take.point_list
+    is_later = (points.frames >= first) & (points.ids >= 0)
+    ids = points.ids + np.where(is_later, points.ids.max(initial=-1) + 1, 0)
+    hidden = (points.frames >= first) & (points.frames < first + frames)
+    return dataclasses.replace(take, point_list=dataclasses.replace(points, ids=ids).without(hidden))
 
 
 def initialization_times(

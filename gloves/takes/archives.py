@@ -13,14 +13,16 @@ import numpy as np
 
 from gloves.takes.growing import GrownArchive, growing_path, is_growing
 from handsim.errors import CaptureError, HandSimError, HandSimWarning, shortened
-from handsim.files.arrays import read_npz
+from handsim.files.arrays import Member, read_npz, write_npz
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import check_regular
 
 Content = TypeVar("Content")
 
-SCHEMA: Final = 3
-"""Version of the form of takes. Until 2 simulated and tracked takes had forms of their own."""
+SCHEMA: Final = 4
+"""Version of the form of takes. Until 3 points were tables, until 2 simulated and tracked takes differed."""
+_READABLE: Final = (3, SCHEMA)
+"""Versions that are read."""
 _KINDS: Final = ("take", "tracked take")
 """Kinds in headers: the first of takes, the other of takes as trackers wrote them before schema 3."""
 _DAMAGE: Final = (
@@ -42,8 +44,9 @@ def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np
         header: As JSON, with `kind` and `schema`.
         arrays: By name; the name `header` is taken.
     """
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(dict(header))), **arrays)
+    with atomic_write(path) as temporary:
+        every = {"header": np.array(json.dumps(dict(header))), **arrays}
+        write_npz(temporary, (Member.of(name, array) for name, array in every.items()))
 
 
 def read_archive(
@@ -60,7 +63,7 @@ def read_archive(
         raise CaptureError(_damaged(path))
     if kind not in _KINDS:
         raise CaptureError(f"{path}: a {shortened(kind)}, expected a take")
-    if schema != SCHEMA or kind != _KINDS[0]:
+    if schema not in _READABLE or kind != _KINDS[0]:
         raise CaptureError(
             f"{path}: a {kind} of schema {shortened(str(schema))}, expected a take of schema {SCHEMA}; "
             "simulate or track it again with this version of handsim"

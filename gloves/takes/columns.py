@@ -1,7 +1,7 @@
 """The one table of a take's arrays: names, types and shapes of what is kept, checked, recorded and saved.
 
-A shape is letters and numbers: T frames, H hands, N points, B bodies, M markers of all hands, Q those of all
-bodies. An array that begins with T grows by a row a frame while a take is recorded.
+A shape is letters and numbers: T frames, P points of all frames, H hands, B bodies, M markers of all hands, Q
+those of all bodies. An array that begins with T or P grows with each frame while a take is recorded.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ class Column(NamedTuple):
     dtype: str
     shape: tuple[str | int, ...]
     """Letters and numbers."""
-    missing: float | None = None
-    """Of an array with an entry per point: what stands where a column of points has none."""
 
     @property
     def of_points(self) -> bool:
-        """Whether there is an entry per point of a frame, not per frame."""
-        return self.missing is not None
+        """Whether there is an entry per point, not per frame."""
+        return self.shape[0] == "P"
 
     @property
     def entry(self) -> tuple[int, ...]:
         """Shape of one entry of a frame, or of a point; all its letters must have been given numbers."""
-        return tuple(int(size) for size in self.shape[2 if self.of_points else 1 :])
+        return tuple(int(size) for size in self.shape[1:])
+
+    @property
+    def missing(self) -> float:
+        """What stands for no entry: NaN among numbers, -1 among IDs and labels."""
+        return np.nan if np.dtype(self.dtype).kind == "f" else -1
 
     @property
     def size(self) -> int:
@@ -53,15 +56,22 @@ FRAMES: Final = (
     Column("qpos", "<f8", ("T", "H", NUM_QPOS)),
     Column("status", "|i1", ("T", "H")),
     Column("rms", "<f8", ("T", "H")),
-    Column("points", "<f8", ("T", "N", 3), np.nan),
-    Column("ids", "<i4", ("T", "N"), -1),
-    Column("labels", "<i2", ("T", "N"), -1),
-    Column("confidence", "<f8", ("T", "N"), np.nan),
     Column("body_poses", "<f8", ("T", "B", 7)),
     Column("body_status", "|i1", ("T", "B")),
     Column("body_rms", "<f8", ("T", "B")),
 )
 """The fields of a take with a row a frame."""
+POINTS: Final = (
+    Column("points", "<f8", ("P", 3)),
+    Column("ids", "<i4", ("P",)),
+    Column("labels", "<i2", ("P",)),
+    Column("confidence", "<f8", ("P",)),
+)
+"""What is kept of each point."""
+POINT_COUNTS: Final = Column("point_counts", "<u4", ("T",))
+"""How many points each frame has: where its points begin in the arrays of points."""
+POINT_COLUMNS: Final = Column("point_columns", "<i4", ("P",))
+"""The column of a capture that each point is from; the points of a stream have none."""
 NUMBERS: Final = Column("numbers", "<i8", ("T",))
 """The numbers of streamed frames; a take of anything else has none."""
 SPREADS: Final = (
@@ -84,7 +94,7 @@ BODY_MARKERS: Final = Column("body_markers", "<f8", ("Q", 3))
 _HANDS: Final = "hands"
 WORN: Final = (*ATTACHMENT, BODY_MARKERS)
 """What does not change from frame to frame, beside the `hands`, which are records."""
-STORED: Final = (*FRAMES, KEYPOINTS, *WORN)
+STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *WORN)
 """All that every file holds, beside the hands."""
 
 
@@ -101,7 +111,7 @@ def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArr
         raise ValueError(f"{column.name} has shape {array.shape}, expected ({shape})")
     if array.dtype == dtype:
         return array
-    whole = dtype.kind == "i"
+    whole = dtype.kind in "iu"
     if array.dtype.kind not in ("iu" if whole else "iuf"):
         kind = "whole numbers" if whole else "numbers"
         raise ValueError(f"{column.name} holds values of type {array.dtype}, expected {kind}")
@@ -114,33 +124,13 @@ def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArr
 
 def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -> None:
     """Raise a `ValueError` unless a file's arrays have the types and shapes of the table."""
-    columns = [*STORED, *(column for column in OPTIONAL if column.name in arrays)]
+    columns = [*STORED, *(column for column in (*OPTIONAL, POINT_COLUMNS) if column.name in arrays)]
     if arrays[_HANDS].dtype != HAND_DTYPE or arrays[_HANDS].shape != (sizes["H"],):
         raise ValueError("the hands are of another type")
     for column in columns:
         array = arrays[column.name]
         if array.dtype != column.dtype or array.shape != column.sized(sizes).shape:
             raise ValueError(f"{column.name} is of type {array.dtype} and shape {array.shape}")
-
-
-def stacked_frames(
-    frames: Sequence[Mapping[str, NDArray[Any]]], present: NDArray[np.bool_]
-) -> dict[str, NDArray[Any]]:
-    """Rows of single frames as arrays over all of them: those of `FRAMES`, and of `OPTIONAL` if there.
-
-    Entries of points are those of the points that a frame has, in the columns (T, N) that are present.
-    """
-    stacked: dict[str, NDArray[Any]] = {}
-    for column in (*FRAMES, *(column for column in OPTIONAL if column.name in frames[0])):
-        rows = [np.asarray(frame[column.name], column.dtype) for frame in frames]
-        if not column.of_points:
-            stacked[column.name] = np.array(rows)
-            continue
-        values = np.concatenate(rows)
-        table = np.full(present.shape + values.shape[1:], column.missing, dtype=column.dtype)
-        table[present] = values
-        stacked[column.name] = table
-    return stacked
 
 
 def spans(counts: Sequence[int]) -> tuple[range, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.takes.points import PointList
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write, read_toml
@@ -58,7 +59,7 @@ class Correction:
 class Pins(NamedTuple):
     """What corrections say about the points of a take."""
 
-    labels: Int[np.ndarray, "T N"]
+    labels: Int[np.ndarray, "P"]
     """Label of each point, -1 for no marker; `FREE` where no correction is about it."""
     unfitting: tuple[Correction, ...]
     """Corrections that fit no point."""
@@ -107,79 +108,76 @@ def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
         raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def find_pins(
-    corrections: Sequence[Correction],
-    points: Float[np.ndarray, "T N 3"],
-    ids: Int[np.ndarray, "T N"],
-    label_names: Sequence[str],
-) -> Pins:
+def find_pins(corrections: Sequence[Correction], points: PointList, label_names: Sequence[str]) -> Pins:
     """The points that corrections are about; of two about one point, the later counts."""
-    pinned = np.full(points.shape[:2], FREE, dtype=np.int64)
+    pinned = np.full(len(points.ids), FREE, dtype=np.int64)
     unfitting = []
     for number, correction in enumerate(corrections, start=1):
-        label = _label_of(correction, number, len(points), label_names)
-        frames, columns = follow_point(points, ids, correction)
-        if not len(frames):
+        label = _label_of(correction, number, len(points.counts), label_names)
+        followed = follow_point(points, correction)
+        if not len(followed):
             unfitting.append(correction)
-        pinned[frames, columns] = label
-    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
-        given = np.bincount(pinned[frame, pinned[frame] >= 0])
+        pinned[followed] = label
+    for frame in np.unique(points.frames[pinned >= 0]):
+        own = pinned[points.of(frame)]
+        given = np.bincount(own[own >= 0])
         if given.max() > 1:
             name = label_names[int(given.argmax())]
             raise CaptureError(f"two points of frame {frame} are corrected to {name}, expected one point")
     return Pins(pinned, tuple(unfitting))
 
 
-def follow_point(
-    points: Float[np.ndarray, "T N 3"], ids: Int[np.ndarray, "T N"], correction: Correction
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Frames (K,) in which the point of a correction is there, and its column (K,) in each.
+def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]:
+    """The points (K,) that are the point of a correction, one for each frame in which it is there.
 
-    Nothing where there is no point at the place. A point with an ID is what has that ID, also after a gap.
+    There are none where no point is at its place. A point with an ID is what has that ID, also after a gap.
     One without is the nearest to where its last two places lead, until there is none.
     """
     first, last = correction.first, correction.last
-    start = nearest_column(points[first], np.array(correction.place), _SAME_PLACE)
+    start = _nearest(points, first, np.array(correction.place), _SAME_PLACE)
     if start is None:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    number = ids[first, start]
+        return np.empty(0, dtype=np.int64)
+    number = points.ids[start]
     if number >= 0:
-        there = (ids[first : last + 1] == number) & np.isfinite(points[first : last + 1, :, 0])
-        frames, columns = np.nonzero(there)
-        return first + frames, columns
-    found, place, step = [start], points[first, start], np.zeros(3)
+        begin, end = points.starts[first], points.starts[last + 1]
+        own: NDArray[np.int64] = begin + np.flatnonzero(points.ids[begin:end] == number)
+        return own
+    found, step = [start], np.zeros(3)
     for frame in range(first + 1, last + 1):
-        free = np.where(ids[frame, :, None] < 0, points[frame], np.nan)
-        column = nearest_column(free, place + step, _LONGEST_STEP)
-        if column is None:
+        place = points.points[found[-1]]
+        nearest = _nearest(points, frame, place + step, _LONGEST_STEP, only_free=True)
+        if nearest is None:
             break
-        found.append(column)
-        place, step = points[frame, column], points[frame, column] - place
-    return first + np.arange(len(found)), np.array(found)
+        found.append(nearest)
+        step = points.points[nearest] - place
+    return np.array(found)
 
 
-def nearest_column(
-    points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], most: float
+def _nearest(
+    points: PointList, frame: int, place: Float[np.ndarray, "3"], most: float, *, only_free: bool = False
 ) -> int | None:
-    """The column of the point nearest to a place [m]; None where none is within `most` [m]."""
-    squares = ((points - place) ** 2).sum(axis=1)
-    squares[np.isnan(squares)] = np.inf
+    """The point of a frame nearest to a place [m], among those without an ID if asked; None beyond `most`."""
+    part = points.of(frame)
+    squares = ((points.points[part] - place) ** 2).sum(axis=1)
+    if only_free:
+        squares[points.ids[part] >= 0] = np.inf
     if not len(squares) or squares.min() > most**2:
         return None
-    return int(squares.argmin())
+    return int(part.start + squares.argmin())
 
 
-def pin_labels(labels: Int[np.ndarray, "T N"], pinned: Int[np.ndarray, "T N"]) -> NDArray[np.int16]:
+def pin_labels(points: PointList, pinned: Int[np.ndarray, "P"]) -> NDArray[np.int16]:
     """Labels with the pinned ones; another point of the same frame that has such a label loses it.
 
     Args:
-        labels: Label of each point, -1 for none.
+        points: The points with their labels.
         pinned: `Pins.labels`.
     """
-    result: NDArray[np.int16] = np.where(pinned != FREE, pinned, labels).astype(np.int16)
-    for frame in np.flatnonzero((pinned >= 0).any(axis=1)):
-        taken = pinned[frame, pinned[frame] >= 0]
-        result[frame, (pinned[frame] == FREE) & np.isin(labels[frame], taken)] = -1
+    result: NDArray[np.int16] = np.where(pinned != FREE, pinned, points.labels).astype(np.int16)
+    for frame in np.unique(points.frames[pinned >= 0]):
+        part = points.of(frame)
+        own = pinned[part]
+        result[part][(own == FREE) & np.isin(points.labels[part], own[own >= 0])] = -1
     return result
 
 

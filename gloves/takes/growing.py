@@ -3,30 +3,32 @@
 Such a file is the unfinished form of an archive (`gloves.takes.archives`). It begins with a JSON header and
 the arrays that do not grow. Then come blocks, each with some frames, their number and a checksum; a block
 that was cut off is left out. `finish_archive` turns it into the usual .npz, block by block, so that its
-memory does not grow with the recording.
+memory does not grow with the recording. Both forms list points as they came, so that their size goes with
+the number of points, and not with that of the fullest frame.
 """
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
 import os
 import struct
 import time
-import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gloves.takes.columns import Column
+from gloves.takes.columns import POINT_COUNTS, Column
 from handsim._closing import Closing
 from handsim.errors import CaptureError
-from handsim.files.arrays import check_npy_header
+from handsim.files.arrays import Member, check_npy_header, check_npz, write_npz
 from handsim.files.atomic import atomic_write, make_folder_of
 
 SUFFIX: Final = ".part"
@@ -37,12 +39,8 @@ _BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, poi
 _MARK: Final = b"blk\n"
 _INTERVAL: Final = 0.5  # [s] between two blocks
 _LARGEST_HEADER: Final = 1 << 26  # bytes
-_MOST_FRAMES, _MOST_POINTS = 1 << 16, 1 << 22  # of a block; a block of half a second is far below
-_MOST_EXPANSION: Final = 32  # memory of a recording as a multiple of the file's size,
-_EXPANSION_ALLOWANCE: Final = 1 << 26  # beside so many bytes: columns are as many as points in any frame
-
-
-_COUNTS: Final = Column("counts", "<u4", ("T",))  # points of each frame
+_FULL_FRAMES: Final = 1 << 16  # frames with which a block is written before its time,
+_FULL_POINTS: Final = 1 << 21  # and points; a block of half a second has far fewer
 
 
 def growing_path(archive: Path) -> Path:
@@ -66,7 +64,7 @@ class GrowingArchive(Closing):
         path: The file, which must not exist; `growing_path` names it.
         header: The header, as JSON.
         arrays: The arrays that do not grow, by name.
-        columns: Those that do, with numbers for all letters but T and N.
+        columns: Those that do, with numbers for all letters but T and P.
 
     Raises:
         CaptureError: The file exists: a recording that was cut off is never overwritten.
@@ -83,7 +81,7 @@ class GrowingArchive(Closing):
         self.path = path
         self.num_frames = 0
         """Number of added frames."""
-        self._columns = (_COUNTS, *columns)
+        self._columns = (POINT_COUNTS, *columns)
         self._waiting: list[list[bytes]] = [[] for _ in self._columns]
         self._frames = self._points = self._block = 0
         self._due = math.inf
@@ -103,7 +101,7 @@ class GrowingArchive(Closing):
         Raises:
             OSError: The disk is full, or the file cannot be written.
         """
-        rows: Mapping[str, Any] = {**values, _COUNTS.name: num_points}
+        rows: Mapping[str, Any] = {**values, POINT_COUNTS.name: num_points}
         packed = []
         for column in self._columns:
             row = np.asarray(rows[column.name], column.dtype)
@@ -119,7 +117,7 @@ class GrowingArchive(Closing):
 
     def flush_due(self) -> None:
         """Write the frames that wait, if they have waited long enough."""
-        if time.monotonic() >= self._due or self._frames == _MOST_FRAMES or self._points > _MOST_POINTS // 2:
+        if time.monotonic() >= self._due or self._frames >= _FULL_FRAMES or self._points >= _FULL_POINTS:
             self.flush()
 
     def flush(self) -> None:
@@ -166,7 +164,7 @@ class GrownArchive:
         check: Whether checksums are compared.
 
     Raises:
-        ValueError: It is damaged before its first block, or it would take far more memory than it has bytes.
+        ValueError: It is damaged before its first block.
         OSError: It cannot be read.
     """
 
@@ -179,56 +177,40 @@ class GrownArchive:
             self.header: dict[str, Any] = json.loads(_take_part(file))
             """The header, as JSON."""
             self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
-            self._columns = (_COUNTS, *map(_column, self.header.pop("columns")))
+            self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._blocks = list(self._scan(file, check))
         self.num_frames = sum(block.frames for block in self._blocks)
         """Number of whole frames."""
-        self._most_points = max(
-            (int(self._column(_COUNTS, block).max()) for block in self._blocks), default=0
-        )
-        memory = sum(column.size for column in self._columns if column.of_points)
-        if memory * self.num_frames * self._most_points > _MOST_EXPANSION * self._size + _EXPANSION_ALLOWANCE:
-            raise ValueError(f"{self._most_points} points in {self.num_frames} frames")
 
     def read(self, step: int = 1) -> dict[str, NDArray[Any]]:
-        """All arrays, with the frames of every `step`-th block; columns of points have shape (T, N, ...)."""
+        """All arrays, with the frames of every `step`-th block."""
         blocks = self._blocks[::step]
-        grown = {
-            column.name: np.concatenate([self._empty(column), *self._parts(column, blocks)])
-            for column in self._columns[1:]
-        }
-        return {**self._arrays, **grown}
+        return {**self._arrays, **{column.name: self._joined(column, blocks) for column in self._columns}}
 
     def first(self, name: str, most: int) -> NDArray[Any]:
         """At least the first `most` entries of a column of frames, or all."""
         column = next(column for column in self._columns if column.name == name)
-        parts, count = [self._empty(column)], 0
-        for part in self._parts(column, self._blocks):
-            parts.append(part)
-            count += len(part)
-            if count >= most:
-                break
-        return np.concatenate(parts)
+        before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
+        return self._joined(column, self._blocks[: int((before < most).sum())])
 
     def step_for(self, most: int) -> int:
         """The `step` of `read` with which about `most` frames are read."""
         return max(1, -(-self.num_frames // most))
 
-    def members(self) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[bytes]]]:
-        """Name, type and shape of every array, and its bytes, part by part."""
-        for name, array in self._arrays.items():
-            yield name, array.dtype, array.shape, iter([array.tobytes()])
-        for column in self._columns[1:]:
-            shape = (self.num_frames, *self._empty(column).shape[1:])
-            parts = (part.tobytes() for part in self._parts(column, self._blocks))
-            yield column.name, np.dtype(column.dtype), shape, parts
+    def members(self, told: Callable[[], None]) -> Iterator[Member]:
+        """Every array, read block by block; `told` is called after each block."""
+        yield from (Member.of(name, array) for name, array in self._arrays.items())
+        num_points = sum(block.points for block in self._blocks)
+        for column in self._columns:
+            shape = (num_points if column.of_points else self.num_frames, *column.entry)
+            yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, told))
 
     def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
         """The whole blocks."""
         number = 0
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
             mark, index, frames, points, checksum = _BLOCK.unpack(head)
-            if mark != _MARK or index != number or frames > _MOST_FRAMES or points > _MOST_POINTS:
+            if mark != _MARK or index != number:
                 return
             block = _Block(file.tell(), frames, points)
             size = sum(column.size * (points if column.of_points else frames) for column in self._columns)
@@ -237,25 +219,21 @@ class GrownArchive:
             if check and zlib.crc32(file.read(size)) != checksum:
                 return
             file.seek(block.at + size)
-            if int(self._column(_COUNTS, block).sum(dtype=np.int64)) != points:
+            if int(self._column(POINT_COUNTS, block).sum(dtype=np.int64)) != points:
                 return
             number += 1
             yield block
 
-    def _empty(self, column: Column) -> NDArray[Any]:
-        wide = (self._most_points,) if column.of_points else ()
-        return np.empty((0, *wide, *column.entry), column.dtype)
+    def _joined(self, column: Column, blocks: Sequence[_Block]) -> NDArray[Any]:
+        """A column of several blocks."""
+        none = np.empty((0, *column.entry), column.dtype)
+        return np.concatenate([none, *(self._column(column, block) for block in blocks)])
 
-    def _parts(self, column: Column, blocks: Sequence[_Block]) -> Iterator[NDArray[Any]]:
-        """A column block by block; a column of points with NaN or -1 where there is no point."""
-        for block in blocks:
-            values = self._column(column, block)
-            if column.of_points:
-                present = np.arange(self._most_points) < self._column(_COUNTS, block)[:, None]
-                table = np.full((*present.shape, *column.entry), column.missing, column.dtype)
-                table[present] = values
-                values = table
-            yield values
+    def _parts(self, column: Column, told: Callable[[], None]) -> Iterator[NDArray[Any]]:
+        """A column, block by block."""
+        for block in self._blocks:
+            yield self._column(column, block)
+            told()
 
     def _column(self, column: Column, block: _Block) -> NDArray[Any]:
         """A column of one block as it is in the file."""
@@ -283,21 +261,19 @@ def is_growing(path: Path) -> bool:
 def finish_archive(
     grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
 ) -> None:
-    """Write an archive that grew in its usual form, whole or not at all; its memory does not grow with it.
+    """Write an archive that grew in its usual form, whole or not at all, and read it back.
+
+    Memory does not grow with the archive.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: The file cannot be written, or is not what was written when it is read back.
     """
-    text = np.array(json.dumps(header))
-    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        first = [("header", text.dtype, text.shape, iter([text.tobytes()]))]
-        for name, dtype, shape, parts in (*first, *grown.members()):
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                form = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-                np.lib.format.write_array_header_1_0(member, form)
-                for part in parts:
-                    member.write(part)
-                    told()
+    with atomic_write(path) as temporary:
+        write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
+        try:
+            check_npz(temporary)
+        except ValueError as error:
+            raise OSError(errno.EIO, f"read back, it is {error}", str(path)) from error
 
 
 def _take_part(file: io.BufferedReader) -> bytes:
@@ -325,11 +301,12 @@ def _unpack_array(content: bytes) -> NDArray[Any]:
 
 
 def _column(stored: Mapping[str, Any]) -> Column:
-    shape = tuple(size if size in ("T", "N") else int(size) for size in stored["shape"])
-    column = Column(str(stored["name"]), str(stored["dtype"]), shape, stored["missing"])
-    leading = ("T", "N") if column.of_points else ("T",)
+    leading, *entry = stored["shape"]
+    if entry[:1] == ["N"]:  # until schema 3 points were described as a table with a row per frame
+        leading, entry = "P", entry[1:]
+    column = Column(str(stored["name"]), str(stored["dtype"]), (leading, *map(int, entry)))
     if (
-        shape[: len(leading)] != leading
+        leading not in ("T", "P")
         or np.dtype(column.dtype).hasobject
         or not 0 <= column.size <= _LARGEST_HEADER
         or min(column.entry, default=0) < 0

@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gloves.attachment import Attachment
 from gloves.captures.capture import Capture
@@ -29,14 +29,17 @@ from gloves.takes.columns import (
     KEYPOINTS,
     NUMBERS,
     OPTIONAL,
+    POINT_COLUMNS,
+    POINT_COUNTS,
+    POINTS,
     SPREADS,
     Column,
     check_stored,
     fitted,
     spans,
-    stacked_frames,
 )
 from gloves.takes.formats import motion_format
+from gloves.takes.points import PointList
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending
@@ -89,12 +92,16 @@ class RigidBody:
         return named_object(self.name) if self.name in object_names() else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class Take:
     """Hands in motion and labeled points: T frames, H hands, N columns of points, B rigid bodies.
 
     A label counts through the markers of the hands, in their order, then those of the bodies; -1 is a point
     of none of them (a ghost), or no point at all. `of_truth`, `of_poses` and `of_frames` make takes of less.
+
+    The points are kept in `point_list`. `points`, `ids`, `labels` and `confidence` are tables of them, made
+    when they are first asked for; the tables may be given in the place of the list, or to replace some of its
+    entries (`dataclasses.replace(take, labels=...)`).
 
     Raises:
         ArgumentError: The arrays do not fit together, or hold what they cannot.
@@ -112,15 +119,8 @@ class Take:
     """Indices into `STATUSES`; true poses are tracked."""
     rms: Float[np.ndarray, "T H"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
-    points: Float[np.ndarray, "T N 3"]
-    """Observed points in the world [m], NaN where a column has no point. The columns are the capture's; a
-    stream's points are in the order in which they arrived."""
-    ids: Int[np.ndarray, "T N"]
-    """The system's ID of each point, -1 where it has none."""
-    labels: Int[np.ndarray, "T N"]
-    """Label of each point."""
-    confidence: Float[np.ndarray, "T N"]
-    """Probability that each label is right, or that a point without one is no marker; NaN without a point."""
+    point_list: PointList
+    """The observed points, frame by frame, with their IDs, labels and confidence."""
     bodies: tuple[RigidBody, ...]
     """The rigid bodies."""
     body_poses: Float[np.ndarray, "T B 7"]
@@ -138,32 +138,75 @@ class Take:
     keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
     """Standard deviation of each keypoint in each direction [m]; NaN and None as of the angles."""
 
+    def __init__(
+        self,
+        *,
+        rate: float,
+        times: ArrayLike,
+        hands: Sequence[GloveFit],
+        qpos: ArrayLike,
+        status: ArrayLike,
+        rms: ArrayLike,
+        bodies: Sequence[RigidBody],
+        body_poses: ArrayLike,
+        body_status: ArrayLike,
+        body_rms: ArrayLike,
+        settings: dict[str, Any],
+        point_list: PointList | None = None,
+        points: ArrayLike | None = None,
+        ids: ArrayLike | None = None,
+        labels: ArrayLike | None = None,
+        confidence: ArrayLike | None = None,
+        numbers: ArrayLike | None = None,
+        angle_spread: ArrayLike | None = None,
+        keypoint_spread: ArrayLike | None = None,
+    ) -> None:
+        by_frame = dict(times=times, qpos=qpos, status=status, rms=rms, body_poses=body_poses,
+                        body_status=body_status, body_rms=body_rms, numbers=numbers,
+                        angle_spread=angle_spread, keypoint_spread=keypoint_spread)  # fmt: skip
+        tables = dict(points=points, ids=ids, labels=labels, confidence=confidence)
+        others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings)
+        for name, value in (*by_frame.items(), *others.items()):
+            object.__setattr__(self, name, value)
+        try:
+            object.__setattr__(self, "point_list", _with_tables(point_list, tables))
+            sizes = {"T": len(self.times), "H": len(self.hands), "B": len(self.bodies)}
+            for column in (*FRAMES, *self._known()):
+                object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
+            _check(self)
+        except ValueError as error:
+            raise ArgumentError(f"not a take: {error}") from error
+
     def __repr__(self) -> str:
         """What the take holds, without its arrays."""
         bodies = "".join(f", {body.name}" for body in self.bodies)
         return (
             f"Take({self.num_frames} frames at {self.rate:g} Hz of {', '.join(self.sides)}{bodies}; "
-            f"{self.points.shape[1]} columns of points)"
+            f"{self.point_list.num_columns} columns of points)"
         )
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hands", tuple(self.hands))
-        object.__setattr__(self, "bodies", tuple(self.bodies))
-        try:
-            points = np.asarray(self.points)
-            sizes = {
-                "T": len(self.times),
-                "N": points.shape[1] if points.ndim == 3 else 0,
-                "H": len(self.hands),
-                "B": len(self.bodies),
-            }
-            for column in FRAMES:
-                object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
-            for column in self._known():
-                object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
-            _check(self)
-        except ValueError as error:
-            raise ArgumentError(f"not a take: {error}") from error
+    @property
+    def points(self) -> Float[np.ndarray, "T N 3"]:
+        """Observed points in the world [m], NaN where a column has no point.
+
+        The columns are the capture's; a stream's points are in the order in which they arrived.
+        """
+        return self.point_list.tables["points"]
+
+    @property
+    def ids(self) -> Int[np.ndarray, "T N"]:
+        """The system's ID of each point, -1 where it has none."""
+        return self.point_list.tables["ids"]
+
+    @property
+    def labels(self) -> Int[np.ndarray, "T N"]:
+        """Label of each point, -1 where it has none."""
+        return self.point_list.tables["labels"]
+
+    @property
+    def confidence(self) -> Float[np.ndarray, "T N"]:
+        """Probability that each label is right, or that a point without one is no marker; NaN elsewhere."""
+        return self.point_list.tables["confidence"]
 
     @classmethod
     def of_truth(
@@ -276,19 +319,23 @@ class Take:
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
         """
+        names = [column.name for column in (*FRAMES, *OPTIONAL) if column.name in frames[0]]
+        arrays = {name: np.array([frame[name] for frame in frames]) for name in names}
+        entries = {column.name: np.concatenate([frame[column.name] for frame in frames]) for column in POINTS}
+        counts = np.array([len(frame["points"]) for frame in frames])
         if capture is None:
-            counts = np.array([len(frame["points"]) for frame in frames])
-            present = np.arange(counts.max(initial=0)) < counts[:, None]
+            point_list = PointList.in_order(counts, **entries)
         else:
-            present = np.isfinite(capture.positions[: len(frames), :, 0])
-        arrays = stacked_frames(frames, present)
-        if capture is not None:
             arrays.pop(NUMBERS.name)
+            present = np.isfinite(capture.positions[: len(frames), :, 0])
+            columns = np.nonzero(present)[1]
+            point_list = PointList(counts, **entries, columns=columns, num_columns=present.shape[1])
         return cls(
             rate=usual_rate(arrays["times"]) if capture is None else capture.rate,
-            hands=tuple(hands),
-            bodies=tuple(bodies),
+            hands=hands,
+            bodies=bodies,
             settings=dict(settings),
+            point_list=point_list,
             **arrays,
         )
 
@@ -342,7 +389,7 @@ class Take:
         Raises:
             ArgumentError: There is no such hand or body.
         """
-        return labeled_markers(self.points, self.labels, of if isinstance(of, range) else self._labels_of(of))
+        return self.point_list.labeled(of if isinstance(of, range) else self._labels_of(of))
 
     def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
         """Which markers of a hand were not seen, in frames with a pose, from which they can be filled in.
@@ -411,7 +458,7 @@ class Take:
         bias = np.zeros((worn.layout.num_markers, 3))
         if len(fits) < _FEWEST_LEARNED:
             return bias
-        seen = labeled_markers(self.points[fits], self.labels[fits], self.hand_labels[number])
+        seen = self.point_list.labeled(self.hand_labels[number], fits)
         rotations = worn.model.forward_kinematics(qpos[fits])[:, worn.attachment.main_bones, :3, :3]
         local = np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos[fits])[0] - seen)
         enough = np.isfinite(local[..., 0]).sum(axis=0) >= _FEWEST_LEARNED
@@ -480,7 +527,7 @@ class Take:
         Raises:
             CaptureError: There are no points.
         """
-        names = tuple(f"*{column}" for column in range(self.points.shape[1]))
+        names = tuple(f"*{column}" for column in range(self.point_list.num_columns))
         return Capture(names, self.points, self.rate)
 
     def labeled_capture(self, *, sides: bool = True) -> Capture:
@@ -493,24 +540,19 @@ class Take:
         Raises:
             CaptureError: There are no points.
         """
-        names, labels = self.label_names, self.labels.astype(np.int64)
+        names, labels = self.label_names, self.point_list.labels.astype(np.int64)
         if not sides:
             names = self.hands[0].layout.names
             labels = np.where(labels >= 0, labels % len(names), -1)
-        there = np.isfinite(self.points[..., 0])
-        frames = [points[seen] for points, seen in zip(self.points, there, strict=True)]
-        rows = [row[seen] for row, seen in zip(labels, there, strict=True)]
+        begins = self.point_list.starts[1:-1]
+        frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
         return labeled_columns(frames, rows, names, self.rate)
 
     def without_body(self) -> Take:
         """The take without its bodies and their points, which many optical systems track themselves."""
-        gone = self.labels >= self.hand_labels[-1].stop
         return dataclasses.replace(
             self,
-            points=np.where(gone[..., None], np.nan, self.points),
-            ids=np.where(gone, -1, self.ids),
-            labels=np.where(gone, -1, self.labels),
-            confidence=np.where(gone, np.nan, self.confidence),
+            point_list=self.point_list.without(self.point_list.labels >= self.hand_labels[-1].stop),
             bodies=(),
             body_poses=self.body_poses[:, :0],
             body_status=self.body_status[:, :0],
@@ -526,7 +568,7 @@ class Take:
         if not 0 <= first < last <= self.num_frames:
             raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
         parts = {column.name: getattr(self, column.name)[first:last] for column in (*FRAMES, *self._known())}
-        return dataclasses.replace(self, **parts)
+        return dataclasses.replace(self, **parts, point_list=self.point_list.cut(first, last))
 
     def export(self, path: str | Path, *, rate: float | None = None, up: UpAxis = "z") -> None:
         """Write the motion for other programs, in the format that the name's ending says.
@@ -562,8 +604,10 @@ class Take:
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
         check_ending(Path(path), ".npz", option="path")
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
+        arrays |= self.point_list.stored()
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
+        header["num_columns"] = None if self.point_list.is_in_order else self.point_list.num_columns
         write_archive(Path(path), header, arrays)
 
     def _known(self) -> tuple[Column, ...]:
@@ -602,16 +646,6 @@ def label_names(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> tuple
     """Name of each label of these hands and bodies: `right:ThumbTip`, `pen:Pen1`."""
     worn = [f"{hand.side}:{name}" for hand in hands for name in hand.layout.names]
     return (*worn, *(f"{body.name}:{name}" for body in bodies for name in body.marker_names))
-
-
-def labeled_markers(
-    points: Float[np.ndarray, "T N 3"], labels: Int[np.ndarray, "T N"], of: range
-) -> Float[np.ndarray, "T M 3"]:
-    """The points that have these labels [m], in their order; NaN where there is none."""
-    markers = np.full((len(points), len(of), 3), np.nan)
-    frames, columns = np.nonzero((labels >= of.start) & (labels < of.stop))
-    markers[frames, labels[frames, columns] - of.start] = points[frames, columns]
-    return markers
 
 
 def keypoints_of(
@@ -667,8 +701,8 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
     layouts = [stored_layout(layout) for layout in header["layouts"]]
     names = [(stored["name"], names_of(stored["marker_names"])) for stored in header["bodies"]]
     counts = [layout.num_markers for layout in layouts], [len(markers) for _, markers in names]
-    frames, columns = arrays["ids"].shape
-    sizes = {"T": frames, "N": columns, "H": len(layouts), "B": len(names)}
+    _list_points(header, arrays)
+    sizes = {"T": len(arrays["times"]), "P": len(arrays["ids"]), "H": len(layouts), "B": len(names)}
     check_stored(arrays, sizes | {"M": sum(counts[0]), "Q": sum(counts[1])})
     hands = []
     for record, layout, span in zip(arrays["hands"], layouts, spans(counts[0]), strict=True):
@@ -680,12 +714,39 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
     )
     return Take(
         rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
-        hands=tuple(hands),
+        hands=hands,
         bodies=bodies,
         settings=settings_of(header),
+        point_list=_stored_points(header, arrays),
         **{column.name: arrays[column.name] for column in FRAMES},
         **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
+
+
+def _list_points(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """Replace the tables of points that files had until schema 3 by a list of points."""
+    if POINT_COUNTS.name not in arrays:
+        points = PointList.of_tables(**{column.name: arrays[column.name] for column in POINTS})
+        arrays.update(points.stored())
+        header["num_columns"] = None if points.is_in_order else points.num_columns
+
+
+def _stored_points(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> PointList:
+    """The points of a file, whose arrays have been checked."""
+    counts, entries = arrays[POINT_COUNTS.name], {column.name: arrays[column.name] for column in POINTS}
+    num_columns = header.get("num_columns")  # which a stream does not have
+    if num_columns is None:
+        return PointList.in_order(counts, **entries)
+    columns = arrays[POINT_COLUMNS.name]
+    return PointList(counts, **entries, columns=columns, num_columns=int(num_columns))
+
+
+def _with_tables(points: PointList | None, tables: Mapping[str, ArrayLike | None]) -> PointList:
+    """A list of points with the entries of some tables (T, N, ...), or one made of all tables."""
+    given = {name: table for name, table in tables.items() if table is not None}
+    if not given and points is not None:
+        return points
+    return PointList.of_tables(**{**(points.tables if points is not None else {}), **given})
 
 
 def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:
@@ -708,15 +769,20 @@ def _check(take: Take) -> None:
             or (np.isnan(poses) != (status == LOST)[..., None]).any()
         ):
             raise ValueError("a status is unknown, or does not fit its pose")
-    for values in (take.qpos, take.points, take.body_poses, *(body.positions for body in take.bodies)):
+    points = take.point_list
+    if len(points.counts) != frames:
+        raise ValueError(f"points of {len(points.counts)} frames, expected {frames}")
+    for values in (take.qpos, points.points, take.body_poses, *(body.positions for body in take.bodies)):
         _check_range(values, -_LARGEST, _LARGEST)
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
-    _check_range(take.confidence, 0.0, 1.0)
+    if not np.isfinite(points.points).all():
+        raise ValueError("a position is not a number")
+    _check_range(points.confidence, 0.0, 1.0)
     for column in SPREADS:
         if getattr(take, column.name) is not None:
             _check_range(getattr(take, column.name), 0.0, _LARGEST)
-    if not _within(take.labels, -1, len(take.label_names) - 1):
+    if not _within(points.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
 
 

@@ -52,10 +52,11 @@ def label(
         )
     right, left = _hands_there(take)
     write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
-    labeled, points = take.labels >= 0, np.isfinite(take.points[..., 0])
-    sure = f", median confidence {np.median(take.confidence[labeled]):.3f}" if labeled.any() else ""
+    points = take.point_list
+    labeled = points.labels >= 0
+    sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
-        f"{out}: {take.num_frames} frames, {labeled.sum()} of {points.sum()} points labeled{sure}; "
+        f"{out}: {take.num_frames} frames, {labeled.sum()} of {len(labeled)} points labeled{sure}; "
         f"{_counts(right, left)}"
     )
 
@@ -63,8 +64,11 @@ def label(
 def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
     """In which frames there is a right hand, and a left one."""
     side_of = np.array([name.split(":")[0] for name in take.label_names])
-    labeled = take.labels >= 0
-    right, left = ((labeled & (side_of[take.labels] == side)).any(axis=1) for side in ("right", "left"))
+    points = take.point_list
+    own = np.where(points.labels >= 0, side_of[points.labels], "")
+    right, left = (
+        np.isin(np.arange(take.num_frames), points.frames[own == side]) for side in ("right", "left")
+    )
     return right, left
 
 

@@ -65,7 +65,7 @@ def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
 
 def _simulate_into(out: Path, config: TakeConfig) -> Take:
     take = record_config(config)
-    names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
+    names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.point_list.num_columns))
     with atomic_writes(out, out.with_suffix(SUFFIX)) as (capture_file, truth_file):
         # A capture without its truth is no use.
         write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)

@@ -1,4 +1,7 @@
-"""Arrays from files of others: sizes are checked before anything is allocated, nothing is unpickled."""
+"""Arrays in files: sizes are checked before anything is allocated, nothing is unpickled.
+
+What the reader refuses because of its size, the writer does not write.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,13 @@ import math
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 _MOST_MEMBERS: Final = 10_000
 _MOST_DIMENSIONS: Final = 8
@@ -23,6 +29,61 @@ _DAMAGE: Final = (
 """What the libraries raise for a damaged archive, beside a ValueError."""
 
 
+class Member(NamedTuple):
+    """An array of an archive, which need not be in memory as a whole."""
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    parts: Callable[[], Iterable[NDArray[Any]]]
+    """Gives its entries in contiguous parts; called once or twice."""
+
+    @classmethod
+    def of(cls, name: str, array: NDArray[Any]) -> Member:
+        """The member of an array in memory."""
+        return cls(name, array.dtype, array.shape, lambda: (np.ascontiguousarray(array),))
+
+
+def write_npz(path: Path, members: Iterable[Member]) -> None:
+    """Write arrays as an `.npz` that `read_npz` reads.
+
+    Arrays are compressed. The reader refuses an archive that expands too much; one that would, such as hours
+    in which nothing moves, is written again without compression.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    members = list(members)
+    for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
+        with zipfile.ZipFile(path, "w", method) as archive:
+            for name, dtype, shape, parts in members:
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    form = {
+                        "descr": np.lib.format.dtype_to_descr(dtype),
+                        "fortran_order": False,
+                        "shape": shape,
+                    }
+                    np.lib.format.write_array_header_1_0(file, form)
+                    for part in parts():
+                        file.write(part.reshape(-1).view(np.uint8))
+            held = _held(archive)
+        if held <= _most_held(path.stat().st_size):
+            return
+
+
+def check_npz(path: Path) -> None:
+    """Read an `.npz` to its end without keeping its arrays.
+
+    Raises:
+        ValueError: `read_npz` would refuse it, or a checksum is wrong.
+        OSError: It cannot be read.
+    """
+    with _damage_named(), zipfile.ZipFile(path) as archive:
+        _check_archive(archive, path)
+        if archive.testzip() is not None:
+            raise ValueError("damaged")
+
+
 def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     """All arrays of an `.npz`, by name.
 
@@ -31,14 +92,18 @@ def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
             than such a file may hold.
         OSError: It cannot be read.
     """
-    try:
+    with _damage_named():
         with zipfile.ZipFile(path) as archive:
-            check_members(archive, path.stat().st_size)
-            for member in archive.infolist():
-                with archive.open(member) as file:
-                    check_npy_header(file, member.file_size)
+            _check_archive(archive, path)
         with np.load(path, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
+
+
+@contextmanager
+def _damage_named() -> Iterator[None]:
+    """Make a ValueError of what the libraries raise for a damaged archive."""
+    try:
+        yield
     except OSError as error:
         if error.errno is None:  # of a decompressor
             raise ValueError("damaged") from error
@@ -47,12 +112,29 @@ def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
         raise ValueError("damaged") from error
 
 
+def _check_archive(archive: zipfile.ZipFile, path: Path) -> None:
+    """Raise a ValueError unless an archive holds plain arrays, of no more bytes than its size allows."""
+    check_members(archive, path.stat().st_size)
+    for member in archive.infolist():
+        with archive.open(member) as file:
+            check_npy_header(file, member.file_size)
+
+
 def check_members(archive: zipfile.ZipFile, size: int) -> None:
     """Raise a ValueError if an archive holds far more than a file of its size [bytes] may."""
-    members = archive.infolist()
-    held, most = sum(member.file_size for member in members), max(_ALWAYS, _LARGEST_RATIO * size)
+    members, held, most = archive.infolist(), _held(archive), _most_held(size)
     if len(members) > _MOST_MEMBERS or held > most:
         raise ValueError(f"{len(members)} members of {held} bytes, expected at most {most} bytes")
+
+
+def _held(archive: zipfile.ZipFile) -> int:
+    """Bytes of an archive's members in memory."""
+    return sum(member.file_size for member in archive.infolist())
+
+
+def _most_held(size: int) -> int:
+    """Bytes that a file of a size may hold in memory."""
+    return max(_ALWAYS, _LARGEST_RATIO * size)
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED
 from track.both_directions import _events_of, _exchanges, _is_likelier
 
@@ -15,40 +16,34 @@ def test_runs_of_exchanged_hands_are_found():
     digit = [1, 0, 2, 5, 6]  # another marker of the same hand
     forward = np.array([right, right, right, right, gap, right])
     backward = np.array([right, left, left, digit, left, left])
-    assert list(_exchanges(forward, backward, 5)) == [slice(1, 3), slice(5, 6)]
-    assert list(_exchanges(forward, forward, 5)) == []
+    points = PointList.of_tables(np.zeros((6, 5, 3)), forward, forward, np.ones((6, 5)))
+    assert list(_exchanges(points, forward.ravel(), backward.ravel(), 5)) == [slice(1, 3), slice(5, 6)]
+    assert list(_exchanges(points, forward.ravel(), forward.ravel(), 5)) == []
 
 
 def test_labels_that_change_together_are_one_event():
     forward = np.array([[0, 1, 2, 3], [0, 1, 2, 3], [0, 1, -1, 3], [0, 1, 2, 3]])
     backward = np.array([[1, 0, 2, 3], [1, 0, 2, -1], [0, 1, 2, 3], [1, 0, 2, 3]])
-    events = _events_of(forward, backward)
-    assert [*zip(events.rows, events.columns, strict=True)] == [
-        (0, 0), (0, 1), (1, 0), (1, 1), (1, 3), (2, 2), (3, 0), (3, 1)
-    ]  # fmt: skip
+    events = _events_of(np.repeat(np.arange(4), 4), forward.ravel(), backward.ravel())
+    assert events.points.tolist() == [0, 1, 4, 5, 7, 10, 12, 13]
     exchange, later = events.numbers[0], events.numbers[-1]
     assert (events.numbers[:4] == exchange).all() and (events.numbers[-2:] == later).all()
     assert len({exchange, events.numbers[4], events.numbers[5], later}) == 4
 
 
 def test_directions_that_agree_have_no_event():
-    assert not len(_events_of(np.zeros((3, 1), dtype=int), np.zeros((3, 1), dtype=int)).numbers)
+    assert not len(_events_of(np.arange(3), np.zeros(3, dtype=int), np.zeros(3, dtype=int)).numbers)
 
 
 def test_a_direction_that_has_lost_a_hand_does_not_outvote_the_other():
-    labels, none = np.array([[0, 1, 2]]), np.full((1, 3), -1)
-    parts = (range(5), range(5, 10))
-    has = SimpleNamespace(
-        labels=labels,
-        confidence=np.full((1, 3), 0.8),
-        status=np.array([[TRACKED, LOST]]),
-        hand_labels=parts,
-    )
+    labels, none, frames = np.array([0, 1, 2]), np.full(3, -1), np.zeros(3, dtype=int)
+
+    def take(labels, confidence, status) -> SimpleNamespace:
+        points = SimpleNamespace(labels=labels, confidence=np.full(3, confidence), frames=frames)
+        parts = (range(5), range(5, 10))
+        return SimpleNamespace(point_list=points, status=np.array([[status, LOST]]), hand_labels=parts)
+
     for status, is_likelier in ((LOST, True), (TRACKED, False)):
-        other = SimpleNamespace(
-            labels=none,
-            confidence=np.full((1, 3), 0.9),
-            status=np.array([[status, LOST]]),
-            hand_labels=parts,
-        )
-        assert (_is_likelier(has, other, _events_of(labels, none)) == is_likelier).all()
+        events = _events_of(frames, labels, none)
+        likelier = _is_likelier(take(labels, 0.8, TRACKED), take(none, 0.9, status), events)
+        assert (likelier == is_likelier).all()

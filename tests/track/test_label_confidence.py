@@ -36,14 +36,19 @@ def relabeled(take: Take, first: int, last: int, column: int, label: int) -> Tak
     return dataclasses.replace(take, labels=labels)
 
 
+def confidence_of(take: Take) -> np.ndarray:
+    """The confidence as a table (T, N)."""
+    return take.point_list.table(label_confidence(take), np.nan)
+
+
 def test_right_labels_are_sure(tracked):
     assert np.nanmedian(tracked.confidence) > 0.99, "a tracked capture has it already"
-    np.testing.assert_allclose(label_confidence(tracked), tracked.confidence)
+    np.testing.assert_allclose(confidence_of(tracked), tracked.confidence)
 
 
 def test_a_marker_that_loses_its_label_for_some_frames(tracked):
     column = column_of(tracked, 40, 80)
-    confidence = label_confidence(relabeled(tracked, 50, 65, column, -1))
+    confidence = confidence_of(relabeled(tracked, 50, 65, column, -1))
     assert (confidence[50:66, column] < 0.5).all() and (confidence[40:48, column] > 0.8).all()
 
 
@@ -51,7 +56,7 @@ def test_markers_that_exchange_their_labels_for_some_frames(tracked):
     one, other = (column_of(tracked, 40, 80, f"right:{name}") for name in ("IndexTip", "MiddleTip"))
     labels = tracked.labels.copy()
     labels[50:56, [one, other]] = labels[50:56, [other, one]]
-    confidence = label_confidence(dataclasses.replace(tracked, labels=labels))
+    confidence = confidence_of(dataclasses.replace(tracked, labels=labels))
     assert (confidence[50:56, [one, other]] < 0.5).all()
 
 
@@ -60,7 +65,7 @@ def test_lives_go_on_where_ids_do_not_last_or_are_exchanged(tracked):
     fresh = np.where(there, np.cumsum(there).reshape(there.shape), -1)
     column = column_of(tracked, 40, 80)
     wrong = relabeled(dataclasses.replace(tracked, ids=fresh), 50, 52, column, -1)
-    assert (label_confidence(wrong)[50:53, column] < 0.5).all()
+    assert (confidence_of(wrong)[50:53, column] < 0.5).all()
 
 
 def test_a_lost_hand_whose_points_are_there(tracked):
@@ -69,7 +74,7 @@ def test_a_lost_hand_whose_points_are_there(tracked):
     own = (labels[60:80] >= 0) & (labels[60:80] < 19)
     labels[60:80][own] = -1
     take = dataclasses.replace(tracked, status=status, labels=labels, qpos=qpos)
-    assert np.median(label_confidence(take)[60:80][own]) < 0.5
+    assert np.median(confidence_of(take)[60:80][own]) < 0.5
 
 
 def test_a_foreign_marker_without_a_label_is_sure(tracked):
@@ -80,18 +85,18 @@ def test_a_foreign_marker_without_a_label_is_sure(tracked):
         "labels": np.pad(tracked.labels, ((0, 0), (0, 1)), constant_values=-1),
         "confidence": np.pad(tracked.confidence, ((0, 0), (0, 1)), constant_values=0.5),
     }
-    assert (label_confidence(dataclasses.replace(tracked, **columns))[:, -1] > 0.9).all()
+    assert (confidence_of(dataclasses.replace(tracked, **columns))[:, -1] > 0.9).all()
 
 
 def test_a_take_without_poses_keeps_its_confidence(tracked):
     blank = np.full(tracked.qpos.shape, np.nan)
     take = dataclasses.replace(tracked, qpos=blank, status=np.full(tracked.status.shape, LOST))
-    np.testing.assert_array_equal(label_confidence(take), take.confidence)
+    np.testing.assert_array_equal(confidence_of(take), take.confidence)
 
 
 def test_evidence_is_of_every_point_of_a_hand(tracked):
     evidence = evidence_of(tracked)
-    assert len(evidence.frames) == np.isfinite(tracked.points[..., 0]).sum()
-    assert (evidence.labels == tracked.labels[evidence.frames, evidence.columns]).all()
+    assert len(evidence.points) == np.isfinite(tracked.points[..., 0]).sum()
+    assert (evidence.labels == tracked.point_list.labels[evidence.points]).all()
     assert np.isfinite(evidence.labeled).all() and np.isfinite(evidence.unlabeled).all()
     assert len(evidence.labeled) == (evidence.labels >= 0).sum()

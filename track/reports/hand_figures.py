@@ -102,8 +102,9 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
         there = take.status[:, number] != LOST
         angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
         confidence = np.full((take.num_frames, len(labels)), np.nan)
-        frames, columns = np.nonzero((take.labels >= labels.start) & (take.labels < labels.stop))
-        confidence[frames, take.labels[frames, columns] - labels.start] = take.confidence[frames, columns]
+        points = take.point_list
+        own = (points.labels >= labels.start) & (points.labels < labels.stop)
+        confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
         residuals = np.full((take.num_frames, len(labels)), np.nan)
         observed, shown = take.observed(hand.side), np.flatnonzero(there)
         for first in range(0, len(shown), _CHUNK):

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gloves.takes.corrections import (
     NO_MARKER,
@@ -59,12 +58,12 @@ class Corrector:
 
     def span_of(self, frame: int, column: int) -> tuple[int, int]:
         """The frames around one in which its point has the same ID and label without a gap."""
-        take = self.take
-        number, label = take.ids[frame, column], take.labels[frame, column]
-        if number < 0:
+        take, points = self.take, self.take.point_list
+        point = points.at(frame, column)
+        if points.ids[point] < 0:
             return frame, frame
-        same = ((take.ids == number) & (take.labels == label) & np.isfinite(take.points[..., 0])).any(axis=1)
-        ends = np.flatnonzero(~same)
+        same = (points.ids == points.ids[point]) & (points.labels == points.labels[point])
+        ends = np.setdiff1d(np.arange(take.num_frames), points.frames[same])
         position = np.searchsorted(ends, frame)
         first = int(ends[position - 1]) + 1 if position else 0
         last = int(ends[position]) - 1 if position < len(ends) else take.num_frames - 1
@@ -120,22 +119,22 @@ class Corrector:
 
     def _meant(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
         """A correction of the frames of a span in which a point is there."""
-        take = self.take
+        points = self.take.point_list
         first, last = min(span), max(span)
-        number = take.ids[frame, column]
+        point = points.at(frame, column)
         start = frame
-        if number >= 0:
-            there = ((take.ids == number) & np.isfinite(take.points[..., 0])).any(axis=1)
-            frames = first + np.flatnonzero(there[first : last + 1])
-            if not len(frames):
+        if points.ids[point] >= 0:
+            same = np.flatnonzero(points.ids == points.ids[point])
+            same = same[(points.frames[same] >= first) & (points.frames[same] <= last)]
+            if not len(same):
                 raise CaptureError(
                     f"the point is not there in frames {first} to {last}, expected a frame with it"
                 )
-            start, last = int(frames[0]), int(frames[-1])
-            column = int(np.flatnonzero(take.ids[start] == number)[0])
-        place: list[float] = take.points[start, column].tolist()
+            point = int(same[0])
+            start, last = int(points.frames[point]), int(points.frames[same[-1]])
+        place: list[float] = points.points[point].tolist()
         correction = Correction(start, max(start, last), (place[0], place[1], place[2]), label)
-        followed: NDArray[np.int64] = follow_point(take.points, take.ids, correction)[0]
+        followed = points.frames[follow_point(points, correction)]
         return Correction(start, int(followed[-1]), correction.place, label)
 
     def _make(self, added: Sequence[Correction]) -> None:
@@ -148,7 +147,7 @@ class Corrector:
 
 def label_of(take: Take, frame: int, column: int) -> str:
     """Name of a point's marker, or `NO_MARKER`."""
-    label = int(take.labels[frame, column])
+    label = int(take.point_list.labels[take.point_list.at(frame, column)])
     return take.label_names[label] if label >= 0 else NO_MARKER
 
 

@@ -64,15 +64,16 @@ class LabelEditor:
 
     def choose(self, frame: int, column: int) -> None:
         """Choose a point by its column in a frame; the span becomes that of its label."""
-        take = self._corrector.take
+        points = self._corrector.take.point_list
         self.chosen = (frame, column)
         _set(self.span, self._corrector.span_of(frame, column))
-        _set(self.label, label_of(take, frame, column))
+        _set(self.label, label_of(self._corrector.take, frame, column))
         self._show_halo()
         self._show_points()
         first, last = self.span.value
+        sure = points.confidence[points.at(frame, column)]
         self.state.content = (
-            f"**{self._name(frame, column)}**, {100 * float(take.confidence[frame, column]):.0f} %, "
+            f"**{self._name(frame, column)}**, {100 * float(sure):.0f} %, "
             f"with this label in frames {first} to {last}"
         )
 
@@ -143,11 +144,12 @@ class LabelEditor:
 
     def _columns(self) -> np.ndarray:
         """Columns of the points of the shown frame."""
-        return np.flatnonzero(np.isfinite(self._corrector.take.points[self._frame, :, 0]))
+        points = self._corrector.take.point_list
+        return points.columns[points.of(self._frame)]
 
     def _name(self, frame: int, column: int) -> str:
         take = self._corrector.take
-        number = int(take.ids[frame, column])
+        number = int(take.point_list.ids[take.point_list.at(frame, column)])
         return f"{'ID ' if number >= 0 else 'column '}{number if number >= 0 else column}: " + label_of(
             take, frame, column
         )
@@ -167,19 +169,19 @@ class LabelEditor:
         """The column of the chosen point in the shown frame."""
         if self.chosen is None:
             return None
-        take, (frame, column) = self._corrector.take, self.chosen
-        number = take.ids[frame, column]
+        points, (frame, column) = self._corrector.take.point_list, self.chosen
+        number = points.ids[points.at(frame, column)]
         if number < 0:
             return column if frame == self._frame else None
-        there = np.flatnonzero(
-            (take.ids[self._frame] == number) & np.isfinite(take.points[self._frame, :, 0])
-        )
+        shown = points.of(self._frame)
+        there = points.columns[shown][points.ids[shown] == number]
         return int(there[0]) if len(there) else None
 
     def _show_halo(self) -> None:
         column = self._chosen_column()
         if column is not None:
-            self.halo.position = self._corrector.take.points[self._frame, column]
+            points = self._corrector.take.point_list
+            self.halo.position = points.points[points.at(self._frame, column)]
         if self.halo.visible != (column is not None):
             self.halo.visible = column is not None
 

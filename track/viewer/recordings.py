@@ -112,11 +112,10 @@ class TakeRecording(Recording):
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
         self._models = tuple(hand.model for hand in take.hands)
-        points = np.isfinite(take.points[..., 0]).sum(axis=1)
         super().__init__(
             take.times,
             take.label_names,
-            most_points=int(points.max()) + take.hand_labels[-1].stop,
+            most_points=int(take.point_list.counts.max()) + take.hand_labels[-1].stop,
             radius=take.hands[0].layout.radius,
             bodies=tuple(shown_body(body) for body in take.bodies),
             rig=rig_of_settings(take.settings.get("rig")) if rig is None else rig,
@@ -131,17 +130,17 @@ class TakeRecording(Recording):
 
     def frame(self, index: int) -> ShownFrame:
         """One of the frames."""
-        take = self._take
-        there = np.isfinite(take.points[index, :, 0])
+        take, points = self._take, self._take.point_list
+        there = points.of(index)
         filled = np.flatnonzero(self._filled[index])
         return ShownFrame(
             time=float(take.times[index]),
             words=tuple(self._words(index)),
             hands=self._models,
             qpos=take.qpos[index],
-            points=np.concatenate([take.points[index, there], self._markers[index, filled]]),
-            labels=np.concatenate([take.labels[index, there].astype(np.int64), filled]),
-            seen=np.repeat([True, False], [int(there.sum()), len(filled)]),
+            points=np.concatenate([points.points[there], self._markers[index, filled]]),
+            labels=np.concatenate([points.labels[there].astype(np.int64), filled]),
+            seen=np.repeat([True, False], [there.stop - there.start, len(filled)]),
             bodies=take.body_poses[index],
         )
 
@@ -161,8 +160,8 @@ class TakeRecording(Recording):
             parts += [f"RMS {1e3 * rms:.2f} mm"] if np.isfinite(rms) else []
             parts += [f"{filled} filled in"] if filled else []
             lines.append(", ".join(parts))
-        there = np.isfinite(take.points[index, :, 0])
-        return [*lines, f"{there.sum()} points, {(take.labels[index, there] < 0).sum()} without label"]
+        labels = take.point_list.labels[take.point_list.of(index)]
+        return [*lines, f"{len(labels)} points, {(labels < 0).sum()} without label"]
 
 
 def _curves(take: Take) -> tuple[Curve, ...]:

@@ -21,6 +21,7 @@ from gloves.takes.corrections import (
     save_corrections,
     told,
 )
+from gloves.takes.points import PointList
 from handsim.errors import CaptureError
 
 NAMES = ("right:ThumbTip", "right:IndexTip", "pen:Pen1")
@@ -36,6 +37,12 @@ def points(rng) -> np.ndarray:
 
 def place(points, frame, column) -> tuple[float, float, float]:
     return tuple(points[frame, column].tolist())
+
+
+def listed(points, ids, labels=None) -> PointList:
+    return PointList.of_tables(
+        points, ids, np.full(ids.shape, -1) if labels is None else labels, np.ones(ids.shape)
+    )
 
 
 corrections = st.builds(
@@ -67,10 +74,10 @@ def test_an_id_leads_through_columns_and_gaps(points):
     points = points.copy()
     points[30:, [0, 1]], ids[30:, [0, 1]] = points[30:, [1, 0]], ids[30:, [1, 0]]  # columns of a stream
     points[20:25, 0] = np.nan
-    pins = find_pins([Correction(15, 40, place(points, 15, 0), NAMES[1])], points, ids, NAMES)
+    pins = find_pins([Correction(15, 40, place(points, 15, 0), NAMES[1])], listed(points, ids), NAMES)
     expected = np.full((FRAMES, 3), FREE)
     expected[15:20, 0] = expected[25:30, 0] = expected[30:41, 1] = 1
-    np.testing.assert_array_equal(pins.labels, expected)
+    np.testing.assert_array_equal(listed(points, ids).table(pins.labels, FREE), expected)
     assert pins.unfitting == ()
 
 
@@ -79,8 +86,8 @@ def test_a_point_without_an_id_is_followed_from_place_to_place(points, rng):
     order = np.array([rng.permutation(3) for _ in range(FRAMES)])
     shuffled = np.take_along_axis(truth, order[..., None], axis=1)
     shuffled[50:] += 1.0  # everything is gone
-    pins = find_pins([Correction(5, 59, place(truth, 5, 2), NO_MARKER)], shuffled, ids, NAMES)
-    frames, columns = np.nonzero(pins.labels == -1)
+    pins = find_pins([Correction(5, 59, place(truth, 5, 2), NO_MARKER)], listed(shuffled, ids), NAMES)
+    frames, columns = np.nonzero(pins.labels.reshape(FRAMES, 3) == -1)
     np.testing.assert_array_equal(frames, np.arange(5, 50))
     np.testing.assert_array_equal(order[frames, columns], 2)
 
@@ -88,22 +95,22 @@ def test_a_point_without_an_id_is_followed_from_place_to_place(points, rng):
 def test_the_later_of_two_about_one_point_counts(points):
     ids = np.tile([1, 2, 3], (FRAMES, 1))
     both = [Correction(0, 9, place(points, 0, 0), NAMES[0]), Correction(5, 9, place(points, 5, 0), NO_MARKER)]
-    pins = find_pins(both, points, ids, NAMES)
-    np.testing.assert_array_equal(pins.labels[:11, 0], [0] * 5 + [-1] * 5 + [FREE])
+    pins = find_pins(both, listed(points, ids), NAMES)
+    np.testing.assert_array_equal(pins.labels.reshape(FRAMES, 3)[:11, 0], [0] * 5 + [-1] * 5 + [FREE])
 
 
 def test_who_had_the_label_loses_it_in_these_frames_alone():
-    labels = np.array([[0, 1, -1], [0, 1, -1]], dtype=np.int16)
-    pinned = np.array([[FREE, FREE, FREE], [FREE, FREE, 1]])
-    np.testing.assert_array_equal(pin_labels(labels, pinned), [[0, 1, -1], [0, -1, 1]])
-    pinned[1] = [1, 0, FREE]
-    np.testing.assert_array_equal(pin_labels(labels, pinned)[1], [1, 0, -1])
+    points = listed(np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int), [[0, 1, -1], [0, 1, -1]])
+    pinned = np.array([FREE, FREE, FREE, FREE, FREE, 1])
+    np.testing.assert_array_equal(pin_labels(points, pinned), [0, 1, -1, 0, -1, 1])
+    pinned[3:] = [1, 0, FREE]
+    np.testing.assert_array_equal(pin_labels(points, pinned)[3:], [1, 0, -1])
 
 
 def test_what_no_longer_fits_is_told(points, tmp_path):
     ids = np.tile([1, 2, 3], (FRAMES, 1))
     moved = Correction(7, 9, (5.0, 5.0, 5.0), NAMES[0])
-    pins = find_pins([moved], points, ids, NAMES)
+    pins = find_pins([moved], listed(points, ids), NAMES)
     assert (pins.labels == FREE).all() and pins.unfitting == (moved,)
     (sentence,) = told(tmp_path / "a.corrections.toml", pins.unfitting)
     assert "the correction to right:ThumbTip in frames 7 to 9 no longer fits" in sentence
@@ -121,7 +128,7 @@ def test_what_cannot_be_meant_is_told_in_one_sentence(points):
         ),
     ):
         with pytest.raises(CaptureError) as caught:
-            find_pins(wrong, points, ids, NAMES)
+            find_pins(wrong, listed(points, ids), NAMES)
         assert words in str(caught.value)
 
 

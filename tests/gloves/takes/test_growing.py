@@ -19,12 +19,13 @@ from gloves.takes.growing import (
     is_growing,
 )
 from handsim.errors import CaptureError
+from handsim.files.arrays import read_npz, write_npz
 
 COLUMNS = (
     Column("times", "<f8", ("T",)),
     Column("nothing", "<f8", ("T", 0, 7)),
-    Column("points", "<f8", ("T", "N", 3), np.nan),
-    Column("ids", "<i4", ("T", "N"), -1),
+    Column("points", "<f8", ("P", 3)),
+    Column("ids", "<i4", ("P",)),
 )
 FIXED = {"places": np.arange(12.0).reshape(4, 3), "none": np.zeros((0, 3))}
 
@@ -50,16 +51,12 @@ def record(path, rng, counts, *, every: int = 4) -> list[dict]:
 
 
 def check(arrays, rows) -> None:
-    most = max((len(row["ids"]) for row in rows), default=0)
     np.testing.assert_array_equal(arrays["times"], [row["times"] for row in rows])
-    assert arrays["points"].shape == (len(rows), most, 3) and arrays["nothing"].shape == (len(rows), 0, 7)
-    for number, row in enumerate(rows):
-        count = len(row["ids"])
-        np.testing.assert_array_equal(arrays["points"][number, :count], row["points"])
-        np.testing.assert_array_equal(arrays["ids"][number, :count], row["ids"])
-        assert (
-            np.isnan(arrays["points"][number, count:]).all() and (arrays["ids"][number, count:] == -1).all()
-        )
+    np.testing.assert_array_equal(arrays["point_counts"], [len(row["ids"]) for row in rows])
+    assert arrays["nothing"].shape == (len(rows), 0, 7)
+    points = np.concatenate([np.zeros((0, 3)), *(row["points"] for row in rows)])
+    np.testing.assert_array_equal(arrays["points"], points)
+    np.testing.assert_array_equal(arrays["ids"], np.concatenate([[], *(row["ids"] for row in rows)]))
     for name, array in FIXED.items():
         np.testing.assert_array_equal(arrays[name], array)
 
@@ -162,7 +159,7 @@ def test_headers_that_lie_take_no_memory(rng, tmp_path):
     path = tmp_path / "x.part"
     record(path, rng, [2] * 4)
     content = path.read_bytes()
-    huge = content.replace(b'"shape": ["T", "N", 3]', b'"shape": ["T", "N", 99999999]')
+    huge = content.replace(b'"shape": ["P", 3]', b'"shape": ["P", 99999999]')
     assert len(huge) > len(content)
     for damaged in (
         b"handsim recording 1\n" + b"\xff\xff\xff\x7f" + bytes(100),
@@ -174,18 +171,38 @@ def test_headers_that_lie_take_no_memory(rng, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises((ValueError, KeyError, TypeError)):
             GrownArchive(path)
-    # One frame with many points makes all columns wide.
-    counts = [0] * 20_000 + [3000]
-    with GrowingArchive(tmp_path / "wide.part", {}, {}, COLUMNS) as archive:
-        for count in counts:
-            archive.add(
-                {
-                    "times": 0.0,
-                    "nothing": np.zeros((0, 7)),
-                    "points": np.zeros((count, 3)),
-                    "ids": np.zeros(count),
-                },
-                count,
-            )
-    with pytest.raises(ValueError, match="3000 points in 20001 frames"):
-        GrownArchive(tmp_path / "wide.part")
+
+
+def test_a_crowded_frame_makes_nothing_larger(rng, tmp_path):
+    path = tmp_path / "take.npz.part"
+    rows = record(path, rng, [0] * 20_000 + [300_000, 2], every=1000)
+    grown = GrownArchive(path)
+    check(grown.read(), rows)
+    finish_archive(grown, tmp_path / "take.npz", {"kind": "test"})
+    check(read_npz(tmp_path / "take.npz"), rows)
+
+
+def test_hours_in_which_nothing_moves_are_read(tmp_path):
+    """What compresses far better than the reader allows is written without compression."""
+    columns = (Column("qpos", "<f8", ("T", 20_000)),)
+    with GrowingArchive(tmp_path / "x.part", {}, {}, columns) as archive:
+        for _ in range(2000):
+            archive.add({"qpos": np.full(20_000, np.nan)}, 0)
+    finish_archive(GrownArchive(tmp_path / "x.part"), tmp_path / "x.npz", {})
+    assert np.isnan(read_npz(tmp_path / "x.npz")["qpos"]).all()
+
+
+def test_what_cannot_be_read_back_is_not_written(rng, tmp_path, monkeypatch):
+    """The disk returns other bytes than were written."""
+    record(tmp_path / "x.part", rng, [3] * 12)
+
+    def damage(path, members):
+        write_npz(path, members)
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        path.write_bytes(content)
+
+    monkeypatch.setattr(growing, "write_npz", damage)
+    with pytest.raises(OSError, match="read back"):
+        finish_archive(GrownArchive(tmp_path / "x.part"), tmp_path / "x.npz", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["x.part"]

@@ -338,11 +338,13 @@ def test_arrays_that_do_not_fit_together_are_refused(take, tmp_path):
     with np.load(path) as stored:
         names = set(stored.files) - {"numbers"}
         wrong = {
-            "points": np.zeros((FRAMES, COLUMNS, 2)),
-            "ids": stored["ids"][:, 1:],
+            "points": stored["points"][:, :2],
+            "point_counts": stored["point_counts"] + np.uint32(1),
+            "point_columns": stored["point_columns"][::-1],
+            "ids": stored["ids"][1:],
             "qpos": stored["qpos"][1:],
             "keypoints": stored["keypoints"][:, :, 1:],
-            "labels": np.full((FRAMES, COLUMNS), 44, dtype=np.int16),
+            "labels": np.full_like(stored["labels"], 44),
             "confidence": stored["confidence"].astype("f4"),
             "numbers": np.arange(FRAMES, dtype=float),
             "hands": np.zeros(2),
