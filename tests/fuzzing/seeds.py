@@ -217,16 +217,19 @@ def recording(folder: Path) -> list[Path]:
     path.unlink()
     header = take_header(take.hands, take.bodies, None, {"glove": "sparse13"})
     sizes = {"H": len(take.hands), "B": len(take.bodies)}
-    columns = [column.sized(sizes) for column in (*table.FRAMES, table.NUMBERS, table.KEYPOINTS)]
+    growing = (*table.FRAMES, *table.POINTS, table.NUMBERS, table.KEYPOINTS)
+    columns = [column.sized(sizes) for column in growing]
     keypoints = keypoints_of(take.hands, take.qpos)
-    growing = growing_path(path)
-    growing.unlink(missing_ok=True)
-    with GrowingArchive(growing, header, worn_arrays(take.hands, take.bodies), columns) as archive:
+    path = growing_path(path)
+    path.unlink(missing_ok=True)
+    with GrowingArchive(path, header, worn_arrays(take.hands, take.bodies), columns) as archive:
         for row in range(take.num_frames):
-            values = {column.name: getattr(take, column.name)[row] for column in table.FRAMES}
+            values = {
+                column.name: getattr(take, column.name)[row] for column in (*table.FRAMES, *table.POINTS)
+            }
             archive.add(values | {"numbers": row, "keypoints": keypoints[row]}, COLUMNS)
             archive.flush()
-    return [growing]
+    return [path]
 
 
 def user(folder: Path) -> list[Path]:

@@ -130,6 +130,7 @@ def test_a_disk_that_is_full_keeps_the_recording(tmp_path):
     recorder._archive._file.close()
     recorder._archive._file = open("/dev/full", "wb", buffering=0)
     frame, one = tracked()[1][-1]
+    frame = dataclasses.replace(frame, time=frame.time + 1.0)
     recorder._archive._due = 0.0
     words = (
         r"the recording ended after 24 frames \(No space left on device\); they are kept in .*take\.npz\.part"

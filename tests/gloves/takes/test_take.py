@@ -6,6 +6,7 @@ import dataclasses
 import json
 import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -309,6 +310,22 @@ def test_another_schema_is_named(take, tmp_path):
     assert_refused(path, f"a tracked take of schema 2, expected a take of schema {SCHEMA}", "track it again")
     altered(path, header=np.array(json.dumps(header | {"kind": "picture"})))
     assert_refused(path, "a picture, expected a take")
+
+
+@pytest.mark.parametrize("name", ["take.npz", "take.npz.part"])
+def test_files_of_schema_3_are_read(name, tmp_path, recwarn):
+    """Their points were tables with a row per frame; the files were written by the version before."""
+    old = load_take(Path(__file__).parent / "schema3" / name)
+    assert (old.points.shape, old.label_names[-1]) == ((4, 24, 3), "pen:Pen3")
+    there = np.isfinite(old.points[..., 0])
+    np.testing.assert_array_equal(old.ids, np.where(there, np.arange(24), -1))
+    np.testing.assert_array_equal(old.labels, old.ids)
+    assert (old.point_list.counts.tolist() == [24, 23, 4, 24]) == (name == "take.npz")
+    old.save(tmp_path / "new.npz")
+    new = load_take(tmp_path / "new.npz")
+    assert header_of(tmp_path / "new.npz")["schema"] == SCHEMA
+    for table in ("points", "ids", "labels", "confidence", "qpos", "times"):
+        np.testing.assert_array_equal(getattr(new, table), getattr(old, table))
 
 
 def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
