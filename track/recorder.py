@@ -171,10 +171,10 @@ class Recorder:
                 )
             values = frame_values(frame, tracked)
             usable = np.abs(values["points"]).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not
-            for column in POINTS:
-                values[column.name] = values[column.name][usable]
+            if not usable.all():
+                values |= {column.name: values[column.name][usable] for column in POINTS}
             keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
-            self._archive.add({**values, KEYPOINTS.name: keypoints}, int(usable.sum()))
+            self._archive.add({**values, KEYPOINTS.name: keypoints}, len(values["points"]))
         except OSError as error:
             raise CaptureError(
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "

@@ -115,6 +115,8 @@ def _read_cut_off(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             f"{path}: a recording that was cut off with {grown.num_frames} frames, expected two or more"
         )
     told = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
+    if grown.num_lost_bytes:
+        told += f"; {grown.num_lost_bytes} bytes after them, an incomplete half second, are left out"
     warnings.warn(told, CutOffWarning, stacklevel=4)
     return grown.header, arrays
 

@@ -85,14 +85,16 @@ class GrowingArchive(Closing):
         self._waiting: list[list[bytes]] = [[] for _ in self._columns]
         self._frames = self._points = self._block = 0
         self._due = math.inf
+        text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
+        parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
+        if max(map(len, parts)) > _LARGEST_HEADER:  # it could not be read again
+            raise CaptureError(f"{path}: the settings take more than {_LARGEST_HEADER} bytes")
         make_folder_of(path)
         try:
             self._file = open(path, "xb", buffering=0)
         except FileExistsError:
             check_free(path)
             raise
-        text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
-        parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
         self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
@@ -178,7 +180,10 @@ class GrownArchive:
             """The header, as JSON."""
             self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
+            self._end = file.tell()
             self._blocks = list(self._scan(file, check))
+        self.num_lost_bytes = self._size - self._end
+        """Bytes after the last whole block, which are left out."""
         self.num_frames = sum(block.frames for block in self._blocks)
         """Number of whole frames."""
 
@@ -218,10 +223,11 @@ class GrownArchive:
                 return
             if check and zlib.crc32(file.read(size)) != checksum:
                 return
-            file.seek(block.at + size)
             if int(self._column(POINT_COUNTS, block).sum(dtype=np.int64)) != points:
                 return
+            file.seek(block.at + size)
             number += 1
+            self._end = file.tell()
             yield block
 
     def _joined(self, column: Column, blocks: Sequence[_Block]) -> NDArray[Any]:

@@ -48,9 +48,9 @@ class PointList:
         for column in POINTS:
             object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
         object.__setattr__(self, "columns", fitted(POINT_COLUMNS, self.columns, sizes))
-        rises = (np.diff(self.columns) > 0) | (np.diff(self.frames) > 0)
-        within = (self.columns >= 0) & (self.columns < self.num_columns)
-        if not (rises.all() and within.all()):
+        falls = 1 + np.flatnonzero(np.diff(self.columns) <= 0)
+        is_within = 0 <= self.columns.min(initial=0) and self.columns.max(initial=-1) < self.num_columns
+        if not is_within or not np.isin(falls, self.starts).all():
             raise ValueError(f"columns of points do not increase from 0 to {self.num_columns - 1} at most")
 
     @classmethod

@@ -772,12 +772,12 @@ def _check(take: Take) -> None:
     points = take.point_list
     if len(points.counts) != frames:
         raise ValueError(f"points of {len(points.counts)} frames, expected {frames}")
-    for values in (take.qpos, points.points, take.body_poses, *(body.positions for body in take.bodies)):
+    for values in (take.qpos, take.body_poses, *(body.positions for body in take.bodies)):
         _check_range(values, -_LARGEST, _LARGEST)
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
-    if not np.isfinite(points.points).all():
-        raise ValueError("a position is not a number")
+    if points.points.size and not -_LARGEST <= points.points.min() <= points.points.max() <= _LARGEST:
+        raise ValueError(f"a position is not from {-_LARGEST:g} to {_LARGEST:g}")
     _check_range(points.confidence, 0.0, 1.0)
     for column in SPREADS:
         if getattr(take, column.name) is not None:
