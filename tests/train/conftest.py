@@ -1,4 +1,4 @@
-"""What tests of labelers share: pages without pictures, and gloves learned from little in a cache of their own."""
+"""What tests of labelers share: pages without pictures, and gloves learned from little, in an own cache."""
 
 from __future__ import annotations
 
