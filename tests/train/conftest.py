@@ -14,7 +14,8 @@ from train.any_layout.learned_gloves import fine_tuned_labeler
 def pages_without_pictures() -> Iterator[None]:
     """A run of a small network draws for longer than it learns; tests of pages draw (tests/train/reports)."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("train.reports.run_page.picture", lambda size, draw: "data:,")
+        for page in ("run_page", "dataset_page"):
+            patch.setattr(f"train.reports.{page}.picture", lambda size, draw: "data:,")
         yield
 
 
