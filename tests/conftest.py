@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from handsim.app.interrupts import ENDING
 from handsim.errors import HandSimError
@@ -21,6 +22,10 @@ ROOT = Path(__file__).resolve().parents[1]
 # training uses, on which the last bits of weights depend, would be a question of what else the machine does.
 # torch reads it when it is imported, which conftest.py of a folder may do before `pytest_configure`.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Hypothesis fails examples that take longer than 0.2 s: a question of what else the machine does, too.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 
 def pytest_configure() -> None:
