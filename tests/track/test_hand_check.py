@@ -59,7 +59,7 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
     ],
 )
 def test_another_unit_is_named(scale, said):
-    both = simulate_take("single-hand", num_frames=FRAMES).capture()
+    both = simulate_take("single-hand", num_frames=20).capture()
     with pytest.raises(ArgumentError, match=said):
         track_capture(dataclasses.replace(both, positions=scale * both.positions))
 

@@ -50,7 +50,12 @@ def run(dataset, tmp_path_factory):
     return out, train_labeler(dataset, out, SMALL)
 
 
-def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path):
+@pytest.fixture
+def without_pictures(monkeypatch):
+    monkeypatch.setattr("train.reports.run_page.picture", lambda size, draw: "data:,")
+
+
+def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path, without_pictures):
     told = []
     train_labeler(dataset, tmp_path / "run", dataclasses.replace(SMALL, samples=256), told=told.append)
     assert told[0] == "training set"
@@ -110,7 +115,9 @@ def test_the_last_look_agrees_with_the_card(run):
     assert accuracies[-1][-1] == card["held_out_simulated"]["occlude 5, ghosts 2"]["slot_accuracy"]
 
 
-def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
+def test_looking_at_held_out_frames_leaves_the_training_alone(
+    dataset, run, tmp_path, monkeypatch, without_pictures
+):
     monkeypatch.setattr(TrainingState, "evaluate", lambda state, rows, names: None)
     train_labeler(dataset, tmp_path / "blind", SMALL)
     one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
