@@ -15,6 +15,7 @@ from rich.text import Text
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import RigError
+from handsim.files.atomic import written_together
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.space.cameras import (
@@ -216,9 +217,10 @@ def score_rig_file(
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
     for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
-    if json is not None:
-        save_json(json, score.record())
-    write_rig_page(page, score)
+    with written_together():
+        if json is not None:
+            save_json(json, score.record())
+        write_rig_page(page, score)
     print_line(f"{page}: what to do, the cameras' worth, a map of the volume")
 
 
