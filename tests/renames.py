@@ -13,7 +13,7 @@ import pytest
 def fails_at(patch: pytest.MonkeyPatch, at: int, number: int | None = None) -> list[Path]:
     """Let the rename of a temporary file to its final name number `at` fail, or send a signal after it.
 
-    Renames to and from other hidden names are not counted.
+    Renames within hidden folders and to hidden names are not counted.
 
     Returns:
         The final names, as they come.
@@ -22,7 +22,7 @@ def fails_at(patch: pytest.MonkeyPatch, at: int, number: int | None = None) -> l
 
     def replace(source: str | Path, target: str | Path) -> None:
         counts = ".tmp-" in Path(source).name and "-older" not in Path(source).name
-        counts = counts and not Path(target).name.startswith(".")
+        counts = counts and not any(part.startswith(".") for part in Path(target).parts)
         if counts:
             finals.append(Path(target))
         if counts and len(finals) == at + 1 and number is None:

@@ -57,21 +57,30 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     make_folder_of(final)
     remove_abandoned(final)
     temporary = temporary_beside(final)
-    mode = _usual_mode(temporary, final)
+    with _errors_name(final, temporary):
+        mode = _usual_mode(temporary)
+        try:
+            yield temporary
+            os.chmod(temporary, mode)
+            _flush(temporary)
+            together = _TOGETHER.get()
+            if together is None:
+                _name({final: temporary})
+            else:
+                together[final] = temporary
+        except BaseException:  # also an interrupt must leave nothing behind
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def _errors_name(final: Path, temporary: Path) -> Iterator[None]:
+    """Errors name the file that was asked for, not the temporary one, nor none as those of full disks do."""
     try:
-        yield temporary
-        os.chmod(temporary, mode)
-        _flush(temporary)
-        together = _TOGETHER.get()
-        if together is None:
-            _name({final: temporary})
-        else:
-            together[final] = temporary
-    except BaseException as error:  # also an interrupt must leave nothing behind
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno is not None:
-            if error.filename is None or str(error.filename) == str(temporary):  # nobody knows that name
-                error.filename = str(final)
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(temporary), temporary):
+            error.filename = str(final)
         raise
 
 
@@ -115,7 +124,8 @@ def _name(files: Mapping[Path, Path]) -> None:
                     older[final] = temporary_beside(final, _OLDER)
                     _keep(final, older[final])
             for final, temporary in files.items():
-                os.replace(temporary, final)
+                with _errors_name(final, temporary):
+                    os.replace(temporary, final)
                 named.append(final)
         except BaseException:
             for final in reversed(named):
@@ -132,7 +142,8 @@ def _keep(final: Path, older: Path) -> None:
     try:
         os.link(final, older)
     except OSError:  # the file system has no hard links
-        shutil.copy2(final, older)
+        with _errors_name(final, older):
+            shutil.copy2(final, older)
 
 
 def _put_back(final: Path, older: Path | None) -> None:
@@ -206,12 +217,9 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def _usual_mode(temporary: Path, final: Path) -> int:
+def _usual_mode(temporary: Path) -> int:
     """The mode of a new file here; some writers make theirs readable by the owner alone."""
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(final)) from error
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
     try:
         return os.fstat(descriptor).st_mode & 0o777
     finally:
