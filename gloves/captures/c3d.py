@@ -20,6 +20,7 @@ from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
 from handsim.errors import CaptureError, shortened
+from handsim.files.names import plain_path
 
 if TYPE_CHECKING:
     import ezc3d
@@ -68,7 +69,8 @@ def write_c3d(path: Path, capture: Capture) -> None:
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
     try:
         written.touch()  # ezc3d does not report that it may not write
-        _content(capture).write(str(written))
+        with plain_path(written) as plain:
+            _content(capture).write(str(plain))
         _check_written(written, capture)
         written.replace(path)
     except BaseException:

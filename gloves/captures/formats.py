@@ -26,6 +26,7 @@ from handsim._checks import check_type
 from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.names import as_text
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
@@ -139,7 +140,7 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     try:
         with atomic_write(path) as temporary:
             if path.suffix.lower() in _TEXT_WRITERS:
-                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=path.name)
+                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=as_text(path.name))
             else:
                 write_c3d(temporary, capture)
     except OSError as error:

@@ -17,6 +17,7 @@ from handsim.app.progress import named_steps
 from handsim.errors import RigError
 from handsim.files.atomic import written_together
 from handsim.files.json_files import save_json
+from handsim.files.names import as_text
 from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.space.cameras import (
     ROOM_CENTER,
@@ -136,7 +137,7 @@ def import_rig(
     """
     check_ending(out, ".toml")
     check_outputs([file], [out])
-    name = "".join(one for one in file.stem if one.isprintable()) or "rig"
+    name = as_text(file.stem)
     try:
         rig = CameraRig(name, import_cameras(file, up))
     except RigError as error:
@@ -270,7 +271,7 @@ def plan_rig(
             camera=planning.plain_camera(size, field_of_view) if keep is None else None,
             keep=keep,
             glove=glove,
-            name=out.stem,
+            name=as_text(out.stem),
             seed=seed,
             progress=step,
         )

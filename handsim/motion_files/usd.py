@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
+from handsim.files.names import plain_path
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, PALM, Side
@@ -64,8 +65,8 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         _add_hand(stage, hand, codes)
     for number, thing in enumerate(posed_bodies(motion)):
         _add_thing(stage, thing, number, codes)
-    with atomic_write(path) as temporary:
-        if not stage.GetRootLayer().Export(str(temporary)):
+    with atomic_write(path) as temporary, plain_path(temporary) as plain:
+        if not stage.GetRootLayer().Export(str(plain)):
             raise HandSimError(f"{path}: usd-core could not write it")
 
 

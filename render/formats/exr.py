@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
+from handsim.files.names import plain_path
 from render.frames import Pictures, RenderedFrame
 
 _RGB: Final = ("R", "G", "B")
@@ -64,9 +65,9 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
         "T_world_camera": frame.camera.T_world_camera,
         "lens": json.dumps(record["lens"]),
     }
-    with atomic_write(path) as temporary:
+    with atomic_write(path) as temporary, plain_path(temporary) as plain:
         try:
-            OpenEXR.File(header, channels).write(str(temporary))
+            OpenEXR.File(header, channels).write(str(plain))
         except RuntimeError as error:  # raised on a full disk
             raise OSError(errno.EIO, str(error), str(path)) from error
 
