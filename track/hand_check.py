@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gloves.captures.plausibility import spacing
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
@@ -46,6 +47,8 @@ _MUCH_BETTER: Final = 2.0  # and where the scale is another
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
 _WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
+_FAR_OFF: Final = 4.0  # times the distance between a glove's neighbors, on a flat hand, which no hand has
+_LEAST_SPACING: Final = 1e-9  # [m]
 _MOST_OWN: Final = 16  # gloves of the working folder that are tried
 
 
@@ -117,7 +120,7 @@ def check_hands(
     if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    others = _others(some, glove, labeler)  # of these a glove of few markers fits anything somehow
+    others = _of_told_scale(some, hands[0], labeler) or _others(some, glove, labeler)
     likely = [other for other in others if other.layout == glove or other.fit.is_good]
     best = max(likely, key=lambda other: other.fit.log_odds)
     fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
@@ -136,6 +139,19 @@ def check_hands(
         known = [one for one in remedy if one.split()[0] in options]
         how = f"; name it ({' '.join(known)})" if known else ""
         warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)
+
+
+def _of_told_scale(frames: Sequence[StreamedFrame], hand: GloveFit, labeler: Labeler) -> list[_Other]:
+    """The hands that are asked for at the scale that distances between neighbors tell, if these are far off."""
+    found = float(np.median([spacing(frame.points) for frame in frames]))
+    factor = spacing(hand.attachment.points) / max(found, _LEAST_SPACING)
+    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
+        return []
+    scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
+    scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
+    glove = designed_glove(hand.layout)
+    other = _Other(glove.name, glove, scale, _measured_fit(scaled, glove, labeler))
+    return [other] if other.fit.is_good else []
 
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:

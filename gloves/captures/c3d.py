@@ -7,8 +7,6 @@ their labels, units and rate; analog channels, events and force plates are passe
 
 from __future__ import annotations
 
-import errno
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +18,7 @@ from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
 from handsim.errors import CaptureError, shortened
+from handsim.files.atomic import unwritten
 from handsim.files.names import plain_path
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ def _check_written(path: Path, capture: Capture) -> None:
         expected = (int(header[8]) - 1) * BLOCK + 16 * capture.num_frames * len(capture.names)
         if path.stat().st_size >= expected:
             return
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    raise unwritten(path)
 
 
 def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:

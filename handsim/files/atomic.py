@@ -24,6 +24,7 @@ from handsim.files.signals import signals_wait
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
 _INTEGER_BITS: Final = 63
 _OLDER: Final = "-older"  # marks the second name of a file that is being replaced
+_PROBE: Final = 1 << 20  # bytes
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 
 
@@ -153,6 +154,16 @@ def _put_back(final: Path, older: Path | None) -> None:
             final.unlink()
         else:
             os.replace(older, final)
+
+
+def unwritten(path: Path) -> OSError:
+    """The system's error for a file that a library did not write whole, without saying why."""
+    try:
+        with path.open("ab") as file:
+            file.write(bytes(_PROBE))
+    except OSError as error:
+        return error
+    return OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
 
 def make_folder_of(path: Path) -> None:

@@ -13,7 +13,6 @@ Compression is ZIP: lossless, and every reader has it.
 
 from __future__ import annotations
 
-import errno
 import json
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +22,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, unwritten
 from handsim.files.names import plain_path
 from render.frames import Pictures, RenderedFrame
 
@@ -69,7 +68,7 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
         try:
             OpenEXR.File(header, channels).write(str(plain))
         except RuntimeError as error:  # raised on a full disk
-            raise OSError(errno.EIO, str(error), str(path)) from error
+            raise unwritten(temporary) from error
 
 
 def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:
