@@ -89,6 +89,31 @@ class _AtOnce:
         return labeler_at_once(self._layout).label_frames(frames)
 
 
+def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
+    """Refuse points that fit hands at another scale, which distances between neighbors tell.
+
+    `check_hands` finds that too, after all else that may be wrong.
+
+    Args:
+        frames: Frames of unlabeled points [m], as `sample_frames` gives.
+
+    Raises:
+        ArgumentError: The points fit hands at another scale alone.
+    """
+    some = _compared(frames)
+    if not some:
+        return
+    found = float(np.median([spacing(frame.points) for frame in some]))
+    factor = spacing(hands[0].attachment.points) / max(found, _LEAST_SPACING)
+    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
+        return
+    scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
+    scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in some]
+    fit = _measured_fit(scaled, designed_glove(hands[0].layout), labeler)
+    if fit.is_good and fit.log_odds > _MUCH_BETTER * _fit(some, hands, labeler).log_odds:
+        raise ArgumentError(_of_scale(1.0 / scale))
+
+
 def check_hands(
     frames: Sequence[StreamedFrame],
     hands: Sequence[GloveFit],
@@ -111,16 +136,14 @@ def check_hands(
     Warns:
         HandSimWarning: They fit another hand or glove clearly better.
     """
-    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
-    half = max(_WINDOW, len(shown) // (2 * _WINDOW) * _WINDOW)
-    some = [*shown[:_WINDOW], *shown[half : half + _WINDOW]]
-    if len(some) < _LEAST_FRAMES:
+    some = _compared(frames)
+    if not some:
         return
     asked = _fit(some, hands, labeler)
     if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    others = _of_told_scale(some, hands[0], labeler) or _others(some, glove, labeler)
+    others = _others(some, glove, labeler)  # of these a glove of few markers fits anything somehow
     likely = [other for other in others if other.layout == glove or other.fit.is_good]
     best = max(likely, key=lambda other: other.fit.log_odds)
     fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
@@ -141,17 +164,12 @@ def check_hands(
         warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)
 
 
-def _of_told_scale(frames: Sequence[StreamedFrame], hand: GloveFit, labeler: Labeler) -> list[_Other]:
-    """The hands that are asked for at the scale that distances between neighbors tell, if these are far off."""
-    found = float(np.median([spacing(frame.points) for frame in frames]))
-    factor = spacing(hand.attachment.points) / max(found, _LEAST_SPACING)
-    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
-        return []
-    scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
-    scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
-    glove = designed_glove(hand.layout)
-    other = _Other(glove.name, glove, scale, _measured_fit(scaled, glove, labeler))
-    return [other] if other.fit.is_good else []
+def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
+    """The frames in which hands are compared; none where there are too few to tell anything."""
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
+    half = max(_WINDOW, len(shown) // (2 * _WINDOW) * _WINDOW)
+    some = [*shown[:_WINDOW], *shown[half : half + _WINDOW]]
+    return some if len(some) >= _LEAST_FRAMES else []
 
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:

@@ -56,6 +56,7 @@ LOST, COASTING, INITIALIZED, TRACKED = range(4)
 RATED_FRAMES: Final = 100_000
 """Frames of a stream that its rate is measured on."""
 _LARGEST: Final = 1e9  # [m], of anything
+_UNIT_LENGTH: Final = 1e-3  # by which the length of a quaternion may differ; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MOST_LEARNED: Final = 2000  # frames that biases are learned from
 _FEWEST_LEARNED: Final = 30  # frames with a marker from which its bias is learned
@@ -712,12 +713,21 @@ def _check(take: Take) -> None:
         _check_range(values, -_LARGEST, _LARGEST)
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
+    _check_orientations(take)
     _check_range(take.confidence, 0.0, 1.0)
     for column in SPREADS:
         if getattr(take, column.name) is not None:
             _check_range(getattr(take, column.name), 0.0, _LARGEST)
     if not _within(take.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
+
+
+def _check_orientations(take: Take) -> None:
+    """Raise a `ValueError` unless the quaternions of wrists and bodies have unit length, but for rounding."""
+    for poses in (take.qpos, take.body_poses):
+        lengths = np.linalg.norm(poses[..., 3:7], axis=-1)
+        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
+            raise ValueError("an orientation is not a quaternion of unit length")
 
 
 def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:
