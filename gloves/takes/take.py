@@ -56,7 +56,8 @@ LOST, COASTING, INITIALIZED, TRACKED = range(4)
 RATED_FRAMES: Final = 100_000
 """Frames of a stream that its rate is measured on."""
 _LARGEST: Final = 1e9  # [m], of anything
-_UNIT_LENGTH: Final = 1e-3  # by which the length of a quaternion may differ; our own files have 1e-6
+_LATEST: Final = 1e12  # [s], and the rate [Hz]; clocks of computers count 2e9 s
+_UNIT_LENGTH: Final = 1e-2  # by which the length of a quaternion may differ; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MOST_LEARNED: Final = 2000  # frames that biases are learned from
 _FEWEST_LEARNED: Final = 30  # frames with a marker from which its bias is learned
@@ -713,7 +714,7 @@ def _check(take: Take) -> None:
         _check_range(values, -_LARGEST, _LARGEST)
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
-    _check_orientations(take)
+    _check_values(take)
     _check_range(take.confidence, 0.0, 1.0)
     for column in SPREADS:
         if getattr(take, column.name) is not None:
@@ -722,8 +723,13 @@ def _check(take: Take) -> None:
         raise ValueError("a label names no marker")
 
 
-def _check_orientations(take: Take) -> None:
-    """Raise a `ValueError` unless the quaternions of wrists and bodies have unit length, but for rounding."""
+def _check_values(take: Take) -> None:
+    """Raise a `ValueError` for numbers that nothing can be computed with.
+
+    These are times and rates beyond all clocks, and orientations whose quaternions have not unit length.
+    """
+    _check_range(take.times, -_LATEST, _LATEST)
+    _check_range(np.array(take.rate), 1.0 / _LATEST, _LATEST)
     for poses in (take.qpos, take.body_poses):
         lengths = np.linalg.norm(poses[..., 3:7], axis=-1)
         if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
