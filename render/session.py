@@ -222,7 +222,8 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     if drawing.config.background.photo > 0.0:
         files, _ = photo_files(Path(str(drawing.config.background.photos)))
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
-        settings["photos"] = f"sha256:{hashlib.sha256(listed.encode()).hexdigest()}"
+        names = listed.encode("utf-8", "surrogateescape")  # they need not be text
+        settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:

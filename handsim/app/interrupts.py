@@ -10,10 +10,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
-ENDING: Final = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
-"""Ctrl-C, the end of a batch job, and a terminal that closes."""
+from handsim.files.signals import ENDING
+
 _AGAIN: Final = 0.05  # [s] after which a signal comes again whose exception was lost
 
 

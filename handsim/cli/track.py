@@ -14,6 +14,7 @@ from rich.console import Console
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.files.atomic import written_together
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.config import Size, TrackerConfig
@@ -93,15 +94,18 @@ def track(
     with open_sinks(send) as sinks:
         if capture is not None:
             tracked = _track_file(
-                capture, out, glove, chosen, chosen_size, labeler, body, sinks, on_frame, calibrate=calibrate
-            )
+                capture, out, labeled, glove, chosen, chosen_size, labeler, body, sinks, on_frame,
+                calibrate=calibrate,
+            )  # fmt: skip
         else:
             setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
             with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
-    if labeled is not None:
-        write_capture(labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture())
+            if labeled is not None:  # after the recording, which nobody can make again
+                write_capture(
+                    labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture()
+                )
     if shape is not None and glove is None:
         print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
@@ -110,6 +114,7 @@ def track(
 def _track_file(
     capture: Path,
     out: Path,
+    labeled: Path | None,
     glove: str | None,
     hands: AnyHands,
     size: Size,
@@ -120,7 +125,8 @@ def _track_file(
     *,
     calibrate: bool,
 ) -> LiveTake:
-    """Track a capture, with the corrections beside OUT, and write the take."""
+    """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
+    from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
     from track.capture_tracking import track_capture
     from track.live import LiveTake
@@ -145,7 +151,10 @@ def _track_file(
             ),
             on_frame=on_frame,
         )
-    take.save(out)
+    with written_together():
+        take.save(out)
+        if labeled is not None:
+            write_capture(labeled, take.labeled_capture())
     applied = len(take.settings.get("corrections", ()))
     notes = [f"{corrections}: {applied} correction{'s' * (applied != 1)} applied"] if applied else []
     return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))

@@ -14,11 +14,13 @@ import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.topology import BONES
+from tests.renames import fails_at
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
 from train.history import History
 from train.labeler_evaluation import Report
+from train.labelers.storage import CARD, WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
 from train.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.reports.model_card import MODEL_CARD
@@ -82,6 +84,20 @@ def test_a_run_has_a_model_card_of_what_was_trained(run):
     text = (out / MODEL_CARD).read_text("utf-8")
     assert text.startswith("---\nlicense: unknown\n")
     assert "400 of them, from `handsim generate` with\nseed 3, of which training saw 2,560 clouds" in text
+
+
+def test_weights_card_and_page_are_all_new_or_all_old(dataset, tmp_path, monkeypatch):
+    config = dataclasses.replace(SMALL, samples=256)
+    train_labeler(dataset, tmp_path, config)
+    names = [WEIGHTS, CARD, PAGE]
+    for name in names:
+        (tmp_path / name).write_text(f"older {name}")
+    with monkeypatch.context() as patch:
+        renamed = fails_at(patch, 3)
+        with pytest.raises(OSError, match=PAGE):
+            train_labeler(dataset, tmp_path, config)
+    assert [file.name for file in renamed] == [CHECKPOINT, *names]
+    assert [(tmp_path / name).read_text() for name in names] == [f"older {name}" for name in names]
 
 
 def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
