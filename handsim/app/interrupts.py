@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -110,7 +111,7 @@ def signals_raise() -> Iterator[None]:
     def stop(number: int, _frame: FrameType | None) -> None:
         raise _Persistent(number, block)
 
-    with _handled(stop, ENDING), block, interrupts_bare():
+    with _handled(stop, ENDING), _lost_silently(), block, interrupts_bare():
         yield
 
 
@@ -137,6 +138,22 @@ def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
     while below is not None and not isinstance(below, KeyboardInterrupt):
         below = below.__cause__ or (None if isinstance(below, HandSimError | OSError) else below.__context__)
     return below
+
+
+@contextmanager
+def _lost_silently() -> Iterator[None]:
+    """Within the block Python prints no traceback of a lost `Stopped`, which comes again."""
+    others = sys.unraisablehook
+
+    def tell(lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, Stopped):
+            others(lost)
+
+    sys.unraisablehook = tell
+    try:
+        yield
+    finally:
+        sys.unraisablehook = others
 
 
 @contextmanager
