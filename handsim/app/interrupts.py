@@ -73,9 +73,10 @@ def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> 
 
 
 class _Block(Closing):
-    """Whether a block of code was left."""
+    """Whether a block of code was left, and the last signal that came in it, 0 if none did."""
 
     left = False
+    number = 0
 
     def close(self) -> None:
         """It was left."""
@@ -104,15 +105,23 @@ def signals_raise() -> Iterator[None]:
     """Within the block a signal to end raises `Stopped`, also SIGTERM and SIGHUP.
 
     So a command that a batch system ends cleans up like one that its user interrupts. Compiled code that
-    calls back into Python may swallow the exception; then the signal comes again.
+    calls back into Python may swallow the exception; then the signal comes again. A module that loads may
+    keep it and fail of another error, which counts as the interrupt.
     """
     block = _Block()
 
     def stop(number: int, _frame: FrameType | None) -> None:
+        block.number = number
         raise _Persistent(number, block)
 
-    with _handled(stop, ENDING), _lost_silently(), block, interrupts_bare():
-        yield
+    with _handled(stop, ENDING), _lost_silently(), block:
+        try:
+            with interrupts_bare():
+                yield
+        except Exception as error:
+            if block.number and not isinstance(error, HandSimError | OSError):
+                raise Stopped(block.number) from error
+            raise
 
 
 @contextmanager

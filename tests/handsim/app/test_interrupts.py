@@ -110,6 +110,19 @@ def test_an_interrupt_in_compiled_code_is_no_mistake_of_ours(error, levels, monk
     assert capsys.readouterr().err == "handsim: interrupted\n"
 
 
+def test_what_fails_because_an_interrupt_was_kept_is_no_mistake_of_ours(monkeypatch, capsys):
+    def interrupted(*_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except BaseException as error:  # as trimesh does while it loads
+            kept = error
+        return kept | None  # type: ignore[operator]
+
+    monkeypatch.setattr(command, "_dispatch", interrupted)
+    assert command.run({}, []) == 143
+    assert capsys.readouterr().err == "handsim: ended by SIGTERM\n"
+
+
 def test_a_full_disk_that_an_interrupt_met_is_told(monkeypatch, capsys):
     def interrupted(*_: object) -> int:
         try:
