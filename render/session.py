@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_type
-from handsim.app.interrupts import Stopped
+from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning
@@ -155,7 +155,7 @@ def _draw_shards(
     tell = _Telling(output.folder, count, total, progress)
     try:
         job = output.job(make, last=[INDEX, f"*{TAR}"])
-        with tell:
+        with tell, interrupts_bare():
             for drawn, number in enumerate(run_jobs(job, todo, workers)):
                 count += counts[number]
                 tell.finished(number, counts[number])
