@@ -9,6 +9,7 @@ import pytest
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning
+from track import hand_check
 from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
 from track.hand_check import check_scale
@@ -63,7 +64,9 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
         (3.2808, "at 3.28 of their size"),
     ],
 )
-def test_another_unit_is_named(scale, said):
+def test_another_unit_is_named(scale, said, monkeypatch):
+    few = [(name, load_layout(name)) for name in ("sparse13", "tips8")]  # of all that are shipped
+    monkeypatch.setattr(hand_check, "_gloves", lambda: few)
     both = simulate_take("single-hand", num_frames=20).capture()
     with pytest.raises(ArgumentError, match=said):
         track_capture(dataclasses.replace(both, positions=scale * both.positions))

@@ -20,6 +20,7 @@ import pytest
 from handsim.app.cluster import ClusterExecutor, _Task, _versions, check_worker, chosen_workers
 from handsim.app.output import open_output
 from handsim.app.workers import run_jobs
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError, LayoutError
 from handsim.files.inputs import checksum
 from render.config import RenderConfig
@@ -311,20 +312,31 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind():
     script = """
 import gc
 import threading
+from handsim.app.cluster import chosen_workers
+from handsim.errors import HandSimError
 gc.set_threshold(1, 1, 1)
-from handsim.cli.main import main
-for _ in range(3):
-    main(["generate", "--num-frames", "10", "--out", "set", "--cluster", "tcp://a:b"])
+for address in ["tcp://a:b", "tls://localhost:1"] * 3:
+    try:
+        with chosen_workers(address, None, print):
+            pass
+    except HandSimError as error:
+        print(error)
 threads = [thread.name for thread in threading.enumerate()]
 assert threads == ["MainThread"], threads
 """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=LONG, check=False
     )
-    assert done.returncode == 0
-    said = done.stderr.splitlines()
-    assert len(said) == 3
-    assert all(line.startswith("handsim generate: no Dask scheduler answers at tcp://a:b: ") for line in said)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("no Dask scheduler answers at") == len(done.stdout.splitlines()) == 6
+
+
+def test_the_command_says_it_in_a_sentence(tmp_path, capsys):
+    options = ["--num-frames", "10", "--out", str(tmp_path / "set"), "--cluster", "tcp://a:b"]
+    assert main(["generate", *options]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]  # after what tells the time on a busy machine
+    assert said.startswith("handsim generate: no Dask scheduler answers at tcp://a:b: ")
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_scheduler_file_that_is_none(tmp_path):
