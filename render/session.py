@@ -7,7 +7,7 @@ import functools
 import hashlib
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,7 @@ from handsim._checks import check_choice, check_type
 from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
@@ -40,9 +41,6 @@ from render.illustrations.contact_sheet import contact_sheet
 from render.scenery.photographs import photo_files
 from render.subject import Model, PoseFile, Source, load_subject, source_of
 
-Progress = Callable[[int, int], None]
-"""Called with the numbers of finished pictures and of all pictures: first with what is there already, then
-about every second, from a thread of its own."""
 SHEET: Final = "contact_sheet.png"
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
@@ -66,7 +64,7 @@ def render_take(
     glove: MarkerLayout | str | None = None,
     camera: Cameras | None = None,
     workers: int | Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> int:
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
@@ -87,7 +85,8 @@ def render_take(
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
-        progress: Called while pictures are drawn.
+        progress: Called with the numbers of finished pictures and of all pictures: first with what is there
+            already, then about every second, from a thread of its own.
 
     Returns:
         Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
@@ -145,7 +144,7 @@ def _draw_shards(
     make: Make,
     counts: Sequence[int],
     workers: int | Executor,
-    progress: Progress | None,
+    progress: Progress,
 ) -> bool:
     """Have the shards drawn that are not there, each of a count of pictures; whether there were any."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
@@ -175,7 +174,7 @@ class _Telling:
         count: Pictures that are there already.
     """
 
-    def __init__(self, folder: Path, count: int, total: int, progress: Progress | None) -> None:
+    def __init__(self, folder: Path, count: int, total: int, progress: Progress) -> None:
         self._folder, self._count, self._total, self._progress = folder, count, total, progress
         self._told = -1
         self._lock, self._ended = threading.Lock(), threading.Event()
@@ -208,7 +207,7 @@ class _Telling:
         with self._lock:
             parts = [file.stat().st_size for file in self._folder.glob(_DRAWN.format("*")) if file.is_file()]
             count = min(self._count + sum(parts), self._total)
-            if self._progress is not None and count > self._told:
+            if count > self._told:
                 self._told = count
                 self._progress(count, self._total)
 

@@ -15,6 +15,7 @@ from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import CaptureError, HandSimWarning
 from track.bodies.body_file import AnyBody
 from track.calibration.frames import CalibrationError
@@ -32,7 +33,6 @@ from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.user import MEASURED
 
-Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 
 
@@ -48,7 +48,7 @@ def track_capture(
     corrections: str | Path | None = None,
     calibrate: bool = False,
     sinks: SinkGroup | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     on_frame: OnFrame | None = None,
 ) -> Take:
     """Track the hands of a capture, as `handsim track` does.
@@ -105,7 +105,7 @@ def record_frames(
     tracker: Tracker,
     sinks: SinkGroup | None = None,
     on_frame: OnFrame | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> TakeRecorder:
     """Track all frames; sinks take them at the capture's own rate."""
     recorder = TakeRecorder(tracker)
@@ -120,8 +120,7 @@ def record_frames(
         if on_frame is not None:
             on_frame(frame, tracked)
         recorder.add(frame, tracked)
-        if progress is not None:
-            progress(recorder.num_frames, len(frames))
+        progress(recorder.num_frames, len(frames))
     return recorder
 
 

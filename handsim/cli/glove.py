@@ -192,7 +192,7 @@ def score_glove(
             frames=frames,
             captures=captures,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     _tell(score)
     for number, sentence in enumerate(score.advice, 1):
@@ -275,7 +275,7 @@ def improve_glove(
             captures=captures,
             name=out.stem,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     layout, found = improved.start, improved.layout
     found.save(out)

@@ -207,7 +207,7 @@ def score_rig_file(
             glove=glove,
             frames=frames,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     _print(work_table(score))
     _print(camera_table(score))
@@ -270,7 +270,7 @@ def plan_rig(
             glove=glove,
             name=out.stem,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     table = Table("camera", box=None, pad_edge=False)
     table.add_column(Text("position [m]"), justify="right")

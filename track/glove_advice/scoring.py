@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +11,7 @@ import numpy as np
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_type
+from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.cameras import CameraRig, as_rig
 from track.given import AnyGlove, AnyLabeler
@@ -38,7 +38,7 @@ def score_glove(
     frames: int = 1500,
     captures: int = CAPTURES,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda step: None,
+    on_step: OnStep = no_step,
 ) -> LayoutScore:
     """Score a layout as `handsim glove score` does; nothing is trained.
 
@@ -53,7 +53,7 @@ def score_glove(
         captures: Simulated captures of each kind of work that are labeled and tracked with nothing
             calibrated, of different people; 0 for none.
         seed: Seed of people, poses and cameras' losses; captures have their own.
-        progress: Called with the name of each step.
+        on_step: Called with the name of each step.
 
     Returns:
         Shares of labels that are right, standard deviations of joints [rad], what became of the captures, and
@@ -69,14 +69,14 @@ def score_glove(
     check_count("captures", captures, 0)
     check_count("seed", seed, 0)
     rng = np.random.default_rng(seed)
-    progress("simulating hands")
+    on_step("simulating hands")
     hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-    progress("learning the layout, about a minute the first time")
+    on_step("learning the layout, about a minute the first time")
     known = learned_labeler(layout, cameras) if labeler is None else load_labeler(layout, labeler)
-    progress("labeling")
+    on_step("labeling")
     score = score_layout(layout, hands, known, rng=rng)
     trials = try_layout(
-        layout, cameras, known, count=captures, told=lambda words: progress(f"trying captures: {words}")
+        layout, cameras, known, count=captures, told=lambda words: on_step(f"trying captures: {words}")
     )
     score = dataclasses.replace(score, trials=trials, seen_by=f"{seen}, seen by rig {cameras.name}")
     return dataclasses.replace(score, advice=tuple(advice(score)))
