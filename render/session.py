@@ -65,6 +65,7 @@ def render_take(
     camera: Cameras | None = None,
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
+    **settings: Any,
 ) -> int:
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
@@ -87,6 +88,7 @@ def render_take(
             `Client.get_executor()`.
         progress: Called with the numbers of finished pictures and of all pictures: first with what is there
             already, then about every second, from a thread of its own.
+        settings: Settings of `RenderConfig` that differ from `config`, as `seed=1` or `num_frames=100`.
 
     Returns:
         Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
@@ -99,7 +101,7 @@ def render_take(
     """
     check_type("formats", formats, (str, list, tuple), "names of formats", FORMATS)
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    config = configured(config, camera, None).settled()
+    config = configured(config, camera, settings).settled()
     _check_formats(formats, config)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
     if not isinstance(place, Path) and _RENAMES in formats:
@@ -115,9 +117,9 @@ def render_take(
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
-    settings = _settings(drawing, kept) | {"formats": list(formats)}
+    record = _settings(drawing, kept) | {"formats": list(formats)}
     with open_output(place) as output:
-        output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
+        output.claim(CONFIG, record, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
         drew = _draw_shards(output, formats, make, counts, workers, progress)
         output.fetch(INDEX, _LEFT_OUT.format("*"))
@@ -218,7 +220,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
     settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
-    if drawing.config.background.photo > 0.0:
+    if drawing.config.background.shares["photo"] > 0.0:
         files, _ = photo_files(Path(str(drawing.config.background.photos)))
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         settings["photos"] = f"sha256:{hashlib.sha256(listed.encode()).hexdigest()}"
