@@ -170,7 +170,7 @@ def score_rig_file(
     glove: str | None = None,
     out: Path | None = None,
     json: Path | None = None,
-    frames: int = 900,
+    num_frames: Annotated[int, tyro.conf.arg(aliases=["--frames"])] = 900,
     seed: int = 0,
 ) -> None:
     """Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is recorded.
@@ -185,7 +185,7 @@ def score_rig_file(
             not given.
         out: The page, an .html file; named after the rig when not given.
         json: File for the figures.
-        frames: Frames of every person and kind of work, or of the take.
+        num_frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
     """
     cameras = load_rig(rig)
@@ -205,7 +205,7 @@ def score_rig_file(
             center=center,
             take=take,
             glove=glove,
-            frames=frames,
+            num_frames=num_frames,
             seed=seed,
             on_step=step,
         )

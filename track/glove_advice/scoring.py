@@ -35,7 +35,7 @@ def score_glove(
     *,
     motion: Take | str | Path = _POSES,
     labeler: AnyLabeler = None,
-    frames: int = 1500,
+    num_frames: int = 1500,
     captures: int = CAPTURES,
     seed: int = 0,
     on_step: OnStep = no_step,
@@ -49,7 +49,7 @@ def score_glove(
             two), or a take or the path of one (.npz).
         labeler: A labeler trained on the layout, or what `load_labeler` reads; the network for any layout
             when not given.
-        frames: Frames of hands, of a take those of each hand.
+        num_frames: Frames of hands, of a take those of each hand.
         captures: Simulated captures of each kind of work that are labeled and tracked with nothing
             calibrated, of different people; 0 for none.
         seed: Seed of people, poses and cameras' losses; captures have their own.
@@ -65,12 +65,12 @@ def score_glove(
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     layout, cameras = load_layout(glove), as_rig(rig)
-    check_count("frames", frames, _FEWEST_FRAMES)
+    check_count("num_frames", num_frames, _FEWEST_FRAMES)
     check_count("captures", captures, 0)
     check_count("seed", seed, 0)
     rng = np.random.default_rng(seed)
     on_step("simulating hands")
-    hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
+    hands, seen = _hands(motion, layout, cameras, num_frames, seed, rng)
     on_step("learning the layout, about a minute the first time")
     known = learned_labeler(layout, cameras) if labeler is None else load_labeler(layout, labeler)
     on_step("labeling")
@@ -78,7 +78,9 @@ def score_glove(
     trials = try_layout(
         layout, cameras, known, count=captures, told=lambda words: on_step(f"trying captures: {words}")
     )
-    score = dataclasses.replace(score, trials=trials, seen_by=f"{seen}, seen by rig {cameras.name}")
+    score = dataclasses.replace(
+        score, trials=trials, is_trained=labeler is not None, seen_by=f"{seen}, seen by rig {cameras.name}"
+    )
     return dataclasses.replace(score, advice=tuple(advice(score)))
 
 

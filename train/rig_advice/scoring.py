@@ -29,7 +29,7 @@ def score_rig(
     center: Sequence[float] | None = None,
     take: Take | str | Path | None = None,
     glove: MarkerLayout | str | Path | None = None,
-    frames: int = 900,
+    num_frames: int = 900,
     seed: int = 0,
     on_step: OnStep = no_step,
 ) -> RigScore:
@@ -43,7 +43,7 @@ def score_rig(
             given.
         glove: Marker layout, or its shipped name or the path of its .toml file; dense19 or that of the take
             when not given.
-        frames: Frames of every person and kind of work, or of the take.
+        num_frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
         on_step: Called with the name of each step.
 
@@ -57,7 +57,7 @@ def score_rig(
         LayoutError, RigError: The glove or the rig is unknown.
     """
     cameras = as_rig(rig)
-    check_count("frames", frames, _FEWEST_FRAMES)
+    check_count("num_frames", num_frames, _FEWEST_FRAMES)
     check_count("seed", seed, 0)
     sides = checked_sides("volume", volume)
     middle = None if center is None else checked_center(center)
@@ -65,13 +65,13 @@ def score_rig(
     if take is None:
         middle = np.array(ROOM_CENTER) if middle is None else middle
         layout = load_layout(GLOVE if glove is None else glove)
-        work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=np.random.default_rng(seed))
+        work = sample_work(layout, middle, sides, num_frames, _PEOPLE, rng=np.random.default_rng(seed))
         told = f"simulated people in the glove {layout.name}"
     else:
         check_type("take", take, (Take, str, Path), "a Take, or the path of one")
         told = "a take" if isinstance(take, Take) else f"the take {Path(take).name}"
         given = take if isinstance(take, Take) else load_take(take)
-        work = work_of_take(given, None if glove is None else load_layout(glove), frames)
+        work = work_of_take(given, None if glove is None else load_layout(glove), num_frames)
         middle = _middle(work.values()) if middle is None else middle
     on_step("forecasting")
     return score_work(cameras, work, middle, sides, told=told, seed=seed)

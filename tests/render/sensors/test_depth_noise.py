@@ -239,7 +239,6 @@ def test_sampling_is_plain_and_repeatable():
 
 
 def test_mistakes_are_told():
-    rng = np.random.default_rng(0)
     with pytest.raises(ArgumentError, match="did you mean 'kinect2'"):
         DepthSensor("kinect3")
     with pytest.raises(ArgumentError, match="expected \\(240, 320\\)"):
