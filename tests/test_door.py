@@ -96,7 +96,7 @@ def our_types(annotation: object) -> set[type]:
 
 
 def signatures(value: object) -> list[object]:
-    """What states types of a public name: a function; a class with its fields, public methods and properties."""
+    """What states types: a function; a class with its fields, and its public methods and properties."""
     if not inspect.isclass(value):
         return [value]
     members = [

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from track.glove_advice.trials import Trial
     from track.kinematics.pose_solver import PoseFit, solve_pose
     from track.recorder import Recorder
+    from track.settings import TrackSettings
     from track.setup import measure_hands
     from track.sinks.addresses import SinkGroup, open_sinks
     from track.sinks.message import LiveBody, LiveHand, LiveHeader, LiveMessage, LiveSink
@@ -63,6 +64,7 @@ __getattr__, __dir__ = lazy_exports(
         "Status": "gloves.takes.status",
         "StreamedFrame": "track.streams.frame_source",
         "Touch": "track.calibration.user_calibration",
+        "TrackSettings": "track.settings",
         "TrackedBody": "track.tracked_frame",
         "TrackedFrame": "track.tracked_frame",
         "TrackedHand": "track.tracked_frame",
@@ -106,6 +108,7 @@ __all__ = [
     "Status",
     "StreamedFrame",
     "Touch",
+    "TrackSettings",
     "TrackedBody",
     "TrackedFrame",
     "TrackedHand",

@@ -12,11 +12,12 @@ from gloves.takes.take import Take
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import HandSimWarning
 from track.capture_tracking import record_frames
-from track.config import BOTH, Size, TrackerConfig
+from track.config import BOTH, Size
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands
 from track.hand_size import sample_frames
-from track.setup import AnyHands, TrackerSetup, as_designed, found_user
+from track.settings import AnyHands, TrackSettings
+from track.setup import TrackerSetup, as_designed, found_user
 from track.streams.frame_source import checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.tracker import Tracker
@@ -66,7 +67,7 @@ def calibrate(
         on_step(what)
         progress(done, total)
 
-    setup = TrackerSetup.of(glove, hands, size, labeler, (), TrackerConfig())
+    setup = TrackerSetup.of(TrackSettings(glove=glove, hands=hands, size=size, labeler=labeler))
     source = capture_of(capture)
     frames, user, network = checked_frames(source), setup.user, setup.labeler
     sample = sample_frames(frames)

@@ -28,7 +28,8 @@ from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands
 from track.hand_size import sample_frames
-from track.setup import AnyHands, choose_user, found_user
+from track.settings import AnyHands
+from track.setup import choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_summary import no_points
 from train.glove_labeler import load_labeler
