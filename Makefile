@@ -23,10 +23,10 @@ demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
 test: $(DEVELOPER) drawing lint  ## lint, and every test that is quick
-	$(BIN)/pytest -n 2 --dist loadgroup --durations 20 -m "not slow"
+	$(BIN)/pytest -n 2 --dist loadgroup --max-worker-restart 0 --durations 20 -m "not slow" -o faulthandler_timeout=600
 
 test-slow: $(DEVELOPER) drawing  ## the other tests
-	$(BIN)/pytest -n 2 --dist loadgroup --durations 20 -m slow
+	$(BIN)/pytest -n 2 --dist loadgroup --max-worker-restart 0 --durations 20 -m slow
 
 lint: $(DEVELOPER)  ## style, format, types and the order of imports
 	$(BIN)/ruff check .

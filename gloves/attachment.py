@@ -23,6 +23,7 @@ _MOST_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
 _LARGEST: Final = 100.0  # [m], of a direction and a bone's number too; far more than any hand has
 _SUM_TOLERANCE: Final = 1e-6
+_UNIT_LENGTH: Final = 1e-3  # by which the length of a normal may differ
 _SLACK: Final = 1e-9  # of barycentric weights: a ray through an edge meets a face
 
 
@@ -53,6 +54,9 @@ class Attachment:
                 raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
             if np.abs(getattr(self, name)).max(initial=0) > _LARGEST:
                 raise ArgumentError(f"{name} holds numbers beyond {_LARGEST:g}, expected markers on a hand")
+        lengths = np.linalg.norm(self.normals, axis=1)
+        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
+            raise ArgumentError("normals are not of unit length, expected the outward directions of markers")
         bones, shares = self.bone_indices, self.bone_weights
         if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
             raise ArgumentError(

@@ -64,7 +64,7 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
 
         spec.compile()  # fills in what the XML writer asks for
         temporary.write_text(spec.to_xml(), "utf-8")
-        mujoco.MjModel.from_xml_path(str(temporary))  # before it takes its name
+        mujoco.MjModel.from_xml_string(temporary.read_text("utf-8"))  # before it takes its name
 
 
 def write_skin(path: Path, model: HandModel) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import DatasetError
 from handsim.files.json_files import load_json
+from handsim.files.names import plain_path
 from handsim.hand.topology import NUM_KEYPOINTS, SIDES
 
 _CENTER: Final = 0.5  # COCO counts pixels from the first one's center, we count from its corner
@@ -87,7 +88,8 @@ def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Genera
 
     What is outside of the photograph has the color of its border.
     """
-    photograph = cv2.imread(str(hand.file), cv2.IMREAD_COLOR)
+    with plain_path(hand.file) as plain:
+        photograph = cv2.imread(str(plain), cv2.IMREAD_COLOR)
     if photograph is None:
         raise DatasetError(f"{hand.file}: not a readable photograph")
     low, high = np.nanmin(hand.keypoints, axis=0), np.nanmax(hand.keypoints, axis=0)

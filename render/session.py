@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_type
-from handsim.app.interrupts import Stopped
+from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
@@ -156,7 +156,7 @@ def _draw_shards(
     tell = _Telling(output.folder, count, total, progress)
     try:
         job = output.job(make, last=[INDEX, f"*{TAR}"])
-        with tell:
+        with tell, interrupts_bare():
             for drawn, number in enumerate(run_jobs(job, todo, workers)):
                 count += counts[number]
                 tell.finished(number, counts[number])
@@ -223,7 +223,8 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     if drawing.config.background.shares["photo"] > 0.0:
         files, _ = photo_files(Path(str(drawing.config.background.photos)))
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
-        settings["photos"] = f"sha256:{hashlib.sha256(listed.encode()).hexdigest()}"
+        names = listed.encode("utf-8", "surrogateescape")  # they need not be text
+        settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:

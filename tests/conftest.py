@@ -11,17 +11,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from handsim.app.interrupts import ENDING
 from handsim.errors import HandSimError
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# Two test processes with two threads each would wait for one another most of the time, and how many threads
+# training uses, on which the last bits of weights depend, would be a question of what else the machine does.
+# torch reads it when it is imported, which conftest.py of a folder may do before `pytest_configure`.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Hypothesis fails examples that take longer than 0.2 s: a question of what else the machine does, too.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
+
 
 def pytest_configure() -> None:
-    """Two test processes with two threads each would wait for one another most of the time."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch reads it when it is imported
-    # What tests learn is theirs alone; workers of pytest-xdist share it.
+    """What tests learn is theirs alone; workers of pytest-xdist share it."""
     if "HANDSIM_TEST_CACHE" not in os.environ:
         os.environ["HANDSIM_TEST_CACHE"] = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(
             prefix="handsim-cache-"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -22,16 +21,14 @@ SLOW = ("05", "06", "07", "11", "14")
         for path in sorted((ROOT / "examples").glob("*.py"))
     ],
 )
-def test_example_runs(path, tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, str(path)],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip()
+def test_example_runs(path, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(path.parent)
+    monkeypatch.setattr(sys, "argv", [str(path)])
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+    finally:
+        for other in path.parent.glob("*.py"):
+            sys.modules.pop(other.stem, None)
+    assert capfd.readouterr().out.strip()
     assert not list(tmp_path.iterdir()), "examples leave nothing behind"

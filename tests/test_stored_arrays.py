@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.cli.main import main
+from train.simulation.generation import generate_dataset
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "stored_arrays.md"
 ROW = re.compile(r"^\| `(\w+)` \| (\S+) \| \(([^)]*)\) \|", re.M)
@@ -45,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     take, tracked = str(folder / "take.c3d"), str(folder / "tracked.npz")
     assert main(["simulate", "--kind", "hand-controller", "--num-frames", "40", "--out", take]) == 0
     assert main(["track", take, "--size", "M", "--body", "controller", "--out", tracked]) == 0
-    assert main(["generate", "--num-frames", "60", "--workers", "1", "--out", str(folder / "set")]) == 0
+    generate_dataset(folder / "set", num_frames=60, workers=1)
     return folder
 
 

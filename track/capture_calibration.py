@@ -14,7 +14,7 @@ from handsim.errors import HandSimWarning
 from track.capture_tracking import record_frames
 from track.config import BOTH, Size
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.hand_check import check_hands
+from track.hand_check import check_hands, check_scale
 from track.hand_size import sample_frames
 from track.settings import AnyHands, TrackSettings
 from track.setup import TrackerSetup, as_designed, found_user
@@ -71,6 +71,7 @@ def calibrate(
     source = capture_of(capture)
     frames, user, network = checked_frames(source), setup.user, setup.labeler
     sample = sample_frames(frames)
+    check_scale(sample, user, network)
     if setup.is_measured:
         user = found_user(sample, user.layout, user.sides, network) or user
     check_hands(sample, user, network)

@@ -26,7 +26,7 @@ from track.association.single_frames import label_alone
 from track.both_directions import label_both_ways
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.hand_check import check_hands
+from track.hand_check import check_hands, check_scale
 from track.hand_size import sample_frames
 from track.settings import AnyHands
 from track.setup import choose_user, found_user
@@ -80,6 +80,7 @@ def label_capture(
     worn = [side for side in BOTH if side in layout.sides]
     user, is_measured = choose_user(layout, worn if hands is None else hands, "auto")
     sample = sample_frames(frames)
+    check_scale(sample, user, network)
     if is_measured:
         user = found_user(sample, layout, user.sides, network) or user
     check_hands(sample, user, network, options=("--glove",))

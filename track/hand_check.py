@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gloves.captures.plausibility import spacing
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.status import Status
@@ -46,6 +47,8 @@ _MUCH_BETTER: Final = 2.0  # and where the scale is another
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
 _WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
+_FAR_OFF: Final = 4.0  # times the distance between a glove's neighbors, on a flat hand, which no hand has
+_LEAST_SPACING: Final = 1e-9  # [m]
 _MOST_OWN: Final = 16  # gloves of the working folder that are tried
 
 
@@ -86,6 +89,31 @@ class _AtOnce:
         return labeler_at_once(self._layout).label_frames(frames)
 
 
+def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
+    """Refuse points that fit hands at another scale, which distances between neighbors tell.
+
+    `check_hands` finds that too, after all else that may be wrong.
+
+    Args:
+        frames: Frames of unlabeled points [m], as `sample_frames` gives.
+
+    Raises:
+        ArgumentError: The points fit hands at another scale alone.
+    """
+    some = _compared(frames)
+    if not some:
+        return
+    found = float(np.median([spacing(frame.points) for frame in some]))
+    factor = spacing(hands[0].attachment.points) / max(found, _LEAST_SPACING)
+    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
+        return
+    scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
+    scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in some]
+    fit = _measured_fit(scaled, designed_glove(hands[0].layout), labeler)
+    if fit.is_good and fit.log_odds > _MUCH_BETTER * _fit(some, hands, labeler).log_odds:
+        raise ArgumentError(_of_scale(1.0 / scale))
+
+
 def check_hands(
     frames: Sequence[StreamedFrame],
     hands: Sequence[GloveFit],
@@ -108,10 +136,8 @@ def check_hands(
     Warns:
         HandSimWarning: They fit another hand or glove clearly better.
     """
-    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
-    half = max(_WINDOW, len(shown) // (2 * _WINDOW) * _WINDOW)
-    some = [*shown[:_WINDOW], *shown[half : half + _WINDOW]]
-    if len(some) < _LEAST_FRAMES:
+    some = _compared(frames)
+    if not some:
         return
     asked = _fit(some, hands, labeler)
     if asked.is_good:
@@ -136,6 +162,14 @@ def check_hands(
         known = [one for one in remedy if one.split()[0] in options]
         how = f"; name it ({' '.join(known)})" if known else ""
         warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)
+
+
+def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
+    """The frames in which hands are compared; none where there are too few to tell anything."""
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
+    half = max(_WINDOW, len(shown) // (2 * _WINDOW) * _WINDOW)
+    some = [*shown[:_WINDOW], *shown[half : half + _WINDOW]]
+    return some if len(some) >= _LEAST_FRAMES else []
 
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:

@@ -6,6 +6,7 @@ import gc
 import math
 from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Final, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 
 from gloves.takes.growing import check_free, growing_path
 from gloves.takes.take import Take
-from handsim.app.interrupts import interrupt_flag
+from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from handsim.app.messages import LiveStatus
 from track.capture_tracking import OnFrame
 from track.intake import FARTHEST
@@ -127,6 +128,17 @@ def measured_setup(
     return setup, _first_and_others(first, stream)
 
 
+@contextmanager
+def recording_kept(recorder: Recorder) -> Iterator[None]:
+    """An interrupt that ends the block closes the recording as it is, and says where it is kept."""
+    try:
+        with interrupts_bare():
+            yield
+    except KeyboardInterrupt as stop:
+        recorder.close()
+        raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
+
+
 def track_live(
     address: str,
     out: Path,
@@ -137,6 +149,9 @@ def track_live(
     on_frame: OnFrame,
 ) -> LiveTake:
     """Track and record a stream until time is up, the stream ends, or a signal ends it.
+
+    At the first signal the take is written, without the frames that still wait. The recording is kept as it
+    is at the second one.
 
     Args:
         address: The stream, see `open_source`.
@@ -149,54 +164,51 @@ def track_live(
 
     Raises:
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
+        Stopped: A signal came before the recording began, or a second one after that.
     """
     check_free(growing_path(out))
     until = [math.inf]  # [s], when it is over by this machine's clock
+    interrupted = InterruptFlag()
 
     def over() -> bool:
-        return bool(interrupted()) or monotonic() >= until[0]
+        return interrupted() or monotonic() >= until[0]
 
-    with (
-        interrupt_flag() as interrupted,  # the frames so far are kept
-        open_source(address, ended=over) as stream,
-        LiveStatus() as status,
-    ):
+    with open_source(address, ended=over) as stream, LiveStatus() as status:
         setup, frames = measured_setup(stream, setup, status, seconds=seconds)
         tracker = setup.tracker()
         sinks.start(tracker.hands, tracker.bodies)
-        with Recorder(out, tracker, {"capture": address, **setup.settings}) as recorder:
+        with (
+            interrupt_flag(interrupted),  # the frames so far are kept
+            Recorder(out, tracker, {"capture": address, **setup.settings}) as recorder,
+            recording_kept(recorder),
+        ):
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
             status.show("waiting for the first frame")
-            try:
-                kept_up, asked = _Now(), False
-                for frame in frames:
-                    if seconds is not None and not frame.silent:
-                        until[0] = min(until[0], frame.arrived + seconds)
-                    if frame.arrived > until[0]:
-                        break
-                    tracked = tracker.step(frame.points, frame.ids, frame.time)
-                    sinks.send(frame, tracked)
-                    kept_up.add(frame, stream.forgiven_until)
-                    recorder.add(frame, tracked)
-                    on_frame(frame, tracked)
-                    dropping = kept_up.tick(stream.counts)
-                    if frame.silent or dropping or status.due:
-                        line = _status_line(frame, tracked, stream.counts, sinks.counts, kept_up)
-                        status.show(line, now=frame.silent or dropping)
-                    if not asked and (doubt := _unit_doubt(stream)):
-                        asked = True
-                        status.say(doubt)
-                stream.end(until[0])
-                counts = stream.counts
-                status.show(f"writing {out}", now=True)
-                take, step = recorder.finish(
-                    counts,
-                    told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
-                )
-            except KeyboardInterrupt:
-                status.say(f"the recording is kept in {recorder.part}")
-                recorder.close()
-                raise
+            kept_up, asked = _Now(), False
+            for frame in frames:
+                if seconds is not None and not frame.silent:
+                    until[0] = min(until[0], frame.arrived + seconds)
+                if interrupted() or frame.arrived > until[0]:
+                    break
+                tracked = tracker.step(frame.points, frame.ids, frame.time)
+                sinks.send(frame, tracked)
+                kept_up.add(frame, stream.forgiven_until)
+                recorder.add(frame, tracked)
+                on_frame(frame, tracked)
+                dropping = kept_up.tick(stream.counts)
+                if frame.silent or dropping or status.due:
+                    line = _status_line(frame, tracked, stream.counts, sinks.counts, kept_up)
+                    status.show(line, now=frame.silent or dropping)
+                if not asked and (doubt := _unit_doubt(stream)):
+                    asked = True
+                    status.say(doubt)
+            stream.end(until[0])
+            counts = stream.counts
+            status.show(f"writing {out}", now=True)
+            take, step = recorder.finish(
+                counts,
+                told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
+            )
         after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
         counts["frames_after_end"] = max(0, after - recorder.num_frames)
         notes = (*_notes(counts, step, kept_up, stream.order.interval), *sinks.notes())

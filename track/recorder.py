@@ -28,6 +28,7 @@ from gloves.takes.take import (
     worn_arrays,
 )
 from handsim._checks import check_type
+from handsim.app.interrupts import interrupt_behind
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.atomic import remove_abandoned
 from track.intake import FARTHEST, LATEST_TIME
@@ -230,7 +231,10 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._closed or not (error is None or isinstance(error, KeyboardInterrupt)):
+        stop = None if error is None else interrupt_behind(error)
+        if self._closed or (error is not None and stop is None):
             self.close()
         else:
             self.finish()
+        if stop is not None and stop is not error:  # compiled code wrapped it
+            raise stop from error

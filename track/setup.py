@@ -20,7 +20,7 @@ from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
-from track.hand_check import check_hands
+from track.hand_check import check_hands, check_scale
 from track.hand_size import fit_size, sample_frames
 from track.settings import AnyHands, TrackSettings
 from track.streams.frame_source import StreamedFrame, checked_frames
@@ -82,6 +82,7 @@ class TrackerSetup:
         Raises:
             ArgumentError: See `check_hands`, which warns of hands that do not fit.
         """
+        check_scale(frames, self.user, self.labeler)
         if not self.is_measured:
             named = self.user.notes in get_args(Size)
             options = ("--hands", "--glove") if named else ()

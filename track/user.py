@@ -164,7 +164,8 @@ class User(Sequence[GloveFit]):
         }
         try:
             with atomic_write(Path(path)) as temporary:
-                temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+                text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+                temporary.write_text(text, "utf-8", errors="replace")  # notes have names of files
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 

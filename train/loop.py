@@ -16,7 +16,7 @@ import torch
 from lightning_fabric import Fabric
 
 from handsim._checks import check_type, make_settings
-from handsim.app.interrupts import Stopped, interrupt_flag
+from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
@@ -297,7 +297,8 @@ class _Run:
     def kept(self, checkpoint: Path) -> Iterator[None]:
         """Write a checkpoint when a signal ends the block, and say so."""
         try:
-            yield
+            with interrupts_bare():
+                yield
         except KeyboardInterrupt as stop:
             self.state.save(checkpoint)
             done, expected = self.state.done, self.state.config.samples

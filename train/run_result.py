@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from handsim._version import __version__
+from handsim.files.atomic import written_together
 from train.config import CNNConfig, Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption, right_hands
@@ -66,9 +67,10 @@ def finish_run(
     card, report = _card(network, few(held_out, _CARD_FRAMES[config.labeler]), config, manifest)
     card["curve"] = state.history.accuracies
     tell("weights and report")
-    save_network(out, network, card)
-    write_run_page(out, card, state.history, report)
-    write_model_card(out, card)
+    with written_together():
+        save_network(out, network, card)
+        write_run_page(out, card, state.history, report)
+        write_model_card(out, card)
     return card
 
 

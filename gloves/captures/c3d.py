@@ -7,8 +7,6 @@ their labels, units and rate; analog channels, events and force plates are passe
 
 from __future__ import annotations
 
-import errno
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +18,8 @@ from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
 from handsim.errors import CaptureError, shortened
+from handsim.files.atomic import unwritten
+from handsim.files.names import plain_path
 
 if TYPE_CHECKING:
     import ezc3d
@@ -68,7 +68,8 @@ def write_c3d(path: Path, capture: Capture) -> None:
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
     try:
         written.touch()  # ezc3d does not report that it may not write
-        _content(capture).write(str(written))
+        with plain_path(written) as plain:
+            _content(capture).write(str(plain))
         _check_written(written, capture)
         written.replace(path)
     except BaseException:
@@ -108,7 +109,7 @@ def _check_written(path: Path, capture: Capture) -> None:
         expected = (int(header[8]) - 1) * BLOCK + 16 * capture.num_frames * len(capture.names)
         if path.stat().st_size >= expected:
             return
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    raise unwritten(path)
 
 
 def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from handsim._checks import check_type
 from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.names import as_text
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
@@ -108,7 +109,7 @@ def _checked(path: Path, capture: Capture) -> Capture:
     return capture
 
 
-def write_capture(path: str | Path, capture: Capture, *, title: str | None = None) -> None:
+def write_capture(path: str | Path, capture: Capture) -> None:
     """Write a `.trc`, `.c3d` or Motive `.csv` file in millimeters, whole or not at all.
 
     A TRC keeps positions to 5e-9 m, a CSV to 5e-10 m; a C3D keeps single precision (6e-8 of the value).
@@ -116,7 +117,6 @@ def write_capture(path: str | Path, capture: Capture, *, title: str | None = Non
     Args:
         path: The file; its suffix decides the format.
         capture: Positions (T, N, 3) [m] at a rate [Hz].
-        title: The file name that a text states in its header; that of `path` when None.
 
     Raises:
         ArgumentError: An argument is of another type.
@@ -140,7 +140,7 @@ def write_capture(path: str | Path, capture: Capture, *, title: str | None = Non
     try:
         with atomic_write(path) as temporary:
             if path.suffix.lower() in _TEXT_WRITERS:
-                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=title or path.name)
+                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=as_text(path.name))
             else:
                 write_c3d(temporary, capture)
     except OSError as error:

@@ -41,6 +41,11 @@ class UnitFault(NamedTuple):
         return "; scaled twice?" if self.guess == "meters" else f"; {self.guess}?"
 
 
+def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
+    """Median distance of a point from its nearest neighbor [m], of two points or more."""
+    return float(np.median(np.sqrt(_nearest_squared(np.ascontiguousarray(cloud, dtype=np.float64)))))
+
+
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
     """What tells that clouds are not in meters, if anything does.
 
@@ -65,15 +70,10 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     span = float(np.median(spans))
     if span < _MIN_SPAN:
         return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", "meters")
-    spacing = float(np.median([_spacing(cloud) for cloud in shown]))
-    if spacing > _MAX_SPACING:
-        return UnitFault(f"the points of a frame are {spacing:.2g} m apart", "centimeters")
+    apart = float(np.median([spacing(cloud) for cloud in shown]))
+    if apart > _MAX_SPACING:
+        return UnitFault(f"the points of a frame are {apart:.2g} m apart", "centimeters")
     return None
-
-
-def _spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
-    """Median distance of a point from its nearest neighbor [m]."""
-    return float(np.median(np.sqrt(_nearest_squared(np.ascontiguousarray(cloud, dtype=np.float64)))))
 
 
 @kernel

@@ -30,6 +30,7 @@ from handsim._closing import Closing
 from handsim.errors import CaptureError
 from handsim.files.arrays import Member, check_npy_header, check_npz, write_npz
 from handsim.files.atomic import atomic_write, make_folder_of
+from handsim.files.signals import signals_wait
 
 SUFFIX: Final = ".part"
 """Added to the name of the archive."""
@@ -79,11 +80,9 @@ class GrowingArchive(Closing):
         columns: Sequence[Column],
     ) -> None:
         self.path = path
-        self.num_frames = 0
-        """Number of added frames."""
         self._columns = (POINT_COUNTS, *columns)
-        self._waiting: list[list[bytes]] = [[] for _ in self._columns]
-        self._frames = self._points = self._block = 0
+        self._waiting: list[list[bytes]] = []  # a frame's entries of each column
+        self._points = self._block = self._written = 0
         self._due = math.inf
         text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
         parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
@@ -96,6 +95,11 @@ class GrowingArchive(Closing):
             check_free(path)
             raise
         self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
+
+    @property
+    def num_frames(self) -> int:
+        """Number of added frames."""
+        return self._written + len(self._waiting)
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
         """Add a frame; columns of points have an entry for each of its points.
@@ -110,32 +114,29 @@ class GrowingArchive(Closing):
             if row.shape != ((num_points,) if column.of_points else ()) + column.entry:
                 raise ValueError(f"{column.name} has shape {row.shape}")
             packed.append(row.tobytes())
-        for waiting, one in zip(self._waiting, packed, strict=True):
-            waiting.append(one)
-        self._frames, self._points = self._frames + 1, self._points + num_points
-        self.num_frames += 1
+        self._waiting.append(packed)  # at once: an interrupt leaves no half of a frame
+        self._points += num_points
         self._due = min(self._due, time.monotonic() + _INTERVAL)
         self.flush_due()
 
     def flush_due(self) -> None:
         """Write the frames that wait, if they have waited long enough."""
-        if time.monotonic() >= self._due or self._frames >= _FULL_FRAMES or self._points >= _FULL_POINTS:
+        is_full = len(self._waiting) >= _FULL_FRAMES or self._points >= _FULL_POINTS
+        if is_full or time.monotonic() >= self._due:
             self.flush()
 
     def flush(self) -> None:
         """Write the frames that wait."""
-        if not self._frames:
+        if not self._waiting:
             return
-        content = b"".join(one for waiting in self._waiting for one in waiting)
-        head = _BLOCK.pack(_MARK, self._block, self._frames, self._points, zlib.crc32(content))
-        frames, self._block = self._frames, self._block + 1
-        self._waiting = [[] for _ in self._columns]
-        self._frames, self._points, self._due = 0, 0, math.inf
-        try:
+        with signals_wait():  # until the block is whole and counted
+            rows, self._waiting, self._points, self._due = self._waiting, [], 0, math.inf
+            counts, *others = (b"".join(column) for column in zip(*rows, strict=True))
+            points = int(np.frombuffer(counts, POINT_COUNTS.dtype).sum(dtype=np.int64))
+            content = b"".join((counts, *others))
+            head = _BLOCK.pack(_MARK, self._block, len(rows), points, zlib.crc32(content))
             self._write(head + content)
-        except OSError:
-            self.num_frames -= frames
-            raise
+            self._block, self._written = self._block + 1, self._written + len(rows)
 
     def close(self) -> None:
         """Write what waits, and close the file."""

@@ -60,6 +60,8 @@ LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Frames of a stream that its rate is measured on."""
 _LARGEST: Final = 1e9  # [m], of anything
+_LATEST: Final = 1e12  # [s], and the rate [Hz]; clocks of computers count 2e9 s
+_UNIT_LENGTH: Final = 1e-2  # by which the length of a quaternion may differ; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MOST_LEARNED: Final = 2000  # frames that biases are learned from
 _FEWEST_LEARNED: Final = 30  # frames with a marker from which its bias is learned
@@ -810,6 +812,7 @@ def _check(take: Take) -> None:
         _check_range(values, -_LARGEST, _LARGEST)
     for values in (take.rms, take.body_rms):
         _check_range(values, 0.0, _LARGEST)
+    _check_values(take)
     if points.points.size and not -_LARGEST <= points.points.min() <= points.points.max() <= _LARGEST:
         raise ValueError(f"a position is not from {-_LARGEST:g} to {_LARGEST:g}")
     _check_range(points.confidence, 0.0, 1.0)
@@ -818,6 +821,19 @@ def _check(take: Take) -> None:
             _check_range(getattr(take, column.name), 0.0, _LARGEST)
     if not _within(points.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
+
+
+def _check_values(take: Take) -> None:
+    """Raise a `ValueError` for numbers that nothing can be computed with.
+
+    These are times and rates beyond all clocks, and orientations whose quaternions have not unit length.
+    """
+    _check_range(take.times, -_LATEST, _LATEST)
+    _check_range(np.array(take.rate), 1.0 / _LATEST, _LATEST)
+    for poses in (take.qpos, take.body_poses):
+        lengths = np.linalg.norm(poses[..., 3:7], axis=-1)
+        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
+            raise ValueError("an orientation is not a quaternion of unit length")
 
 
 def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import platform
+import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
@@ -76,8 +78,9 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         if not address:
             raise HandSimError(f"{file}: no address, expected what `dask scheduler --scheduler-file` writes")
     try:
+        _greet(distributed, address)
         client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error.__cause__ or error).rpartition("] ")[2] or f"none within {_PATIENCE:g} s"
         raise HandSimError(
             f"no Dask scheduler answers at {address}: {reason}; expected tcp://host:port, tls://host:port, a "
@@ -85,6 +88,31 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         ) from error
     with client:
         yield client
+
+
+def _greet(distributed: Any, address: str) -> None:
+    """Connect to the scheduler and close the connection again.
+
+    A `distributed.Client` that cannot connect stays half made: it tries for as long as it may, and when it is
+    collected it waits ten seconds, or forever if that happens while another client is being made.
+    """
+
+    async def connect_and_close() -> None:
+        async with asyncio.timeout(_PATIENCE):
+            client = distributed.Client(address, timeout=_PATIENCE, asynchronous=True, set_as_default=False)
+            try:
+                await client
+            finally:
+                await client.close()
+
+    host_and_port = distributed.comm.get_address_host_port(address)
+    socket.create_connection(host_and_port, timeout=_PATIENCE).close()  # a refusal ends here
+    try:
+        asyncio.run(connect_and_close())
+    except (OSError, RuntimeError, TypeError):
+        raise
+    except Exception:  # whatever Dask makes of the words
+        raise ValueError("something else listens there") from None
 
 
 class ClusterExecutor(Executor):

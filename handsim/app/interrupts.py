@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
-ENDING: Final = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
-"""Ctrl-C, the end of a batch job, and a terminal that closes."""
+from handsim._closing import Closing
+from handsim.errors import HandSimError
+from handsim.files.signals import ENDING
+
 _AGAIN: Final = 0.05  # [s] after which a signal comes again whose exception was lost
 
 
@@ -36,44 +37,47 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """Whether a signal to end came; called, it answers.
+    """Whether a signal to end came; called, it answers."""
 
-    Args:
-        again: Whether a second signal raises.
-    """
-
-    def __init__(self, *, again: bool = True) -> None:
+    def __init__(self) -> None:
         self.number = 0
         """The first signal that came, 0 if none did."""
-        self._again = again
 
     def __call__(self) -> bool:
         """Whether one came."""
         return self.number != 0
 
-    def note(self, number: int, _frame: FrameType | None) -> None:
-        """Keep the first signal; raise at the second, if at all."""
-        if self.number and self._again:
-            raise Stopped(number)
-        self.number = self.number or number
-
 
 @contextmanager
-def interrupt_flag(*, again: bool = True) -> Iterator[InterruptFlag]:
+def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> Iterator[InterruptFlag]:
     """Within the block the first signal to end raises nothing; the yielded flag says whether it came.
 
-    An exception from a signal can be lost: compiled code that calls back into Python swallows it. Only the
-    main thread gets signals; in other threads the flag stays down. A second signal raises where `again`.
+    Only the main thread gets signals; in other threads the flag stays down.
+
+    Args:
+        flag: The flag that says so; a new one when not given.
+        again: Whether a second signal raises, as in `signals_raise`.
     """
-    flag = InterruptFlag(again=again)
-    with _handled(flag.note, ENDING):
+    flag, block = flag or InterruptFlag(), _Block()
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if flag() and again:
+            raise _Persistent(number, block)
+        flag.number = flag.number or number
+
+    with _handled(note, ENDING), block:
         yield flag
 
 
-class _Block:
-    """Whether a block of code was left."""
+class _Block(Closing):
+    """Whether a block of code was left, and the last signal that came in it, 0 if none did."""
 
     left = False
+    number = 0
+
+    def close(self) -> None:
+        """It was left."""
+        self.left = True
 
     def send(self, number: int) -> None:
         """Send a signal to this process unless the block was left."""
@@ -98,18 +102,64 @@ def signals_raise() -> Iterator[None]:
     """Within the block a signal to end raises `Stopped`, also SIGTERM and SIGHUP.
 
     So a command that a batch system ends cleans up like one that its user interrupts. Compiled code that
-    calls back into Python swallows exceptions; then the signal comes again.
+    calls back into Python may swallow the exception; then the signal comes again. A module that loads may
+    keep it and fail of another error, which counts as the interrupt.
     """
     block = _Block()
 
     def stop(number: int, _frame: FrameType | None) -> None:
+        block.number = number
         raise _Persistent(number, block)
 
-    with _handled(stop, ENDING):
+    with _handled(stop, ENDING), _lost_silently(), block:
         try:
-            yield
-        finally:
-            block.left = True
+            with interrupts_bare():
+                yield
+        except Exception as error:
+            if block.number and not isinstance(error, HandSimError | OSError):
+                raise Stopped(block.number) from error
+            raise
+
+
+@contextmanager
+def interrupts_bare() -> Iterator[None]:
+    """An interrupt that was wrapped in other errors leaves the block as itself, so that `except` finds it."""
+    try:
+        yield
+    except Exception as error:
+        stop = interrupt_behind(error)
+        if stop is None:
+            raise
+        raise stop from error
+
+
+def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """The interrupt that an error comes from, if one does.
+
+    Compiled code that is interrupted ends in a `SystemError`, and a module that loads in an `ImportError`;
+    such an error is wrapped again by each call that it passes. An error that was met while the interrupt
+    was dealt with, such as a full disk, counts as itself.
+    """
+    below: BaseException | None = error
+    while below is not None and not isinstance(below, KeyboardInterrupt):
+        below = below.__cause__ or (None if isinstance(below, HandSimError | OSError) else below.__context__)
+    return below
+
+
+@contextmanager
+def _lost_silently() -> Iterator[None]:
+    """Within the block Python prints no traceback of a lost `Stopped`, which comes again."""
+    others = sys.unraisablehook
+
+    def tell(lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, Stopped):
+            others(lost)
+
+    sys.unraisablehook = tell
+    try:
+        yield
+    finally:
+        sys.unraisablehook = others
 
 
 @contextmanager

@@ -63,7 +63,7 @@ def write_page(path: Path, sections: Sequence[Section], *, title: str, lead: str
         f"{body}\n</body>\n</html>\n"
     )
     with atomic_write(path) as temporary:
-        temporary.write_text(page, "utf-8")
+        temporary.write_text(page, "utf-8", errors="replace")  # names of files need not be text
 
 
 def _section(section: Section) -> str:

@@ -10,6 +10,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
+from handsim.files.names import as_text
 from handsim.files.outputs import check_ending, check_outputs
 from handsim.space.objects import named_object
 
@@ -35,7 +36,10 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
 
     check_ending(out, TOML)
     check_outputs([source], [out])
-    found = _take_body(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
+    if source.name.endswith(SUFFIX):
+        found = _take_body(source)
+    else:
+        found = learn_body(read_capture(source), as_text(out.stem))
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)
     print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")

@@ -82,12 +82,12 @@ class DemoFigures:
 
 
 def demo_sections(
-    out: Path, work: Path, *, seed: int, num_frames: int, report: Callable[[str], None]
+    pictures: Path, work: Path, *, seed: int, num_frames: int, report: Callable[[str], None]
 ) -> Iterator[Section]:
-    """Run the whole chain; the sections of the page in order, their pictures written to `out`.
+    """Run the whole chain; the sections of the page in order, their pictures written to a folder.
 
     Args:
-        out: Folder of the page.
+        pictures: Folder for the pictures.
         work: Folder for the training set, which may go afterwards.
         seed: Of the generated frames and of everything drawn at random.
         num_frames: Frames to generate and label.
@@ -95,16 +95,16 @@ def demo_sections(
     """
     labeler = load_labeler(GLOVE)  # first, so that a missing labeler is reported before any work
     report("drawing hands")
-    yield _draw_hands(out)
+    yield _draw_hands(pictures)
     report("drawing the glove")
-    yield _draw_worn_glove(out)
+    yield _draw_worn_glove(pictures)
     report("drawing what a camera sees")
-    yield _draw_camera_view(out)
+    yield _draw_camera_view(pictures)
     figures = _generate_and_label(work, labeler, seed, num_frames, report)
     report("drawing a labeled frame")
-    yield _draw_labeled_frame(out, figures.frame)
+    yield _draw_labeled_frame(pictures, figures.frame)
     report("tracking a simulated capture")
-    yield _track_and_draw(out, labeler, seed)
+    yield _track_and_draw(pictures, labeler, seed)
     yield _figures_section(figures, seed, num_frames)
 
 

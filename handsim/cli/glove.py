@@ -23,6 +23,7 @@ from gloves.layout import (
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import LayoutError
+from handsim.files.names import as_text
 from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 
@@ -273,7 +274,7 @@ def improve_glove(
             keep=keep,
             minutes=minutes,
             captures=captures,
-            name=out.stem,
+            name=as_text(out.stem),
             seed=seed,
             on_step=step,
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
+from handsim.files.atomic import written_together
 from handsim.files.outputs import check_ending, check_outputs
 from handsim.hand.topology import NUM_JOINTS, Side
 
@@ -63,9 +64,10 @@ def hand(
     check_outputs([glove, shape, take], (out, mesh))
     chosen, words = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
-    write_hand(out, chosen, actuators=actuators)
-    if mesh is not None:
-        write_skin(mesh, model)
+    with written_together():
+        write_hand(out, chosen, actuators=actuators)
+        if mesh is not None:
+            write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0
     extras = {
         ".xml": f"{markers} marker sites" + f", {NUM_JOINTS} servos" * actuators,

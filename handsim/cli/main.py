@@ -82,9 +82,6 @@ def _leave(end: SystemExit) -> int:
 
 def _say_failed(program: str, error: Exception) -> int:
     """Say in one line what went wrong; the exit code."""
-    cause = error.__cause__
-    if isinstance(cause, KeyboardInterrupt):  # it came while compiled code was left, or a module loaded
-        return _say_stopped(program, cause)
     expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
     _complain(f"{program}: {sentence(error) if expected else _unexpected(program, error)}")
     return 1

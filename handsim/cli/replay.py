@@ -49,8 +49,8 @@ def replay(
         raise ArgumentError(f"--rate is {rate:g}, expected a positive number")
     check_count("--port", port, 0, _MOST_PORT)
     with (
-        interrupt_flag() as ended,
         ReplayServer(capture, rate=rate, host=host, port=port, loop=loop) as server,
+        interrupt_flag() as ended,
     ):
         print_line(f"{capture}: {server.num_frames} frames at {server.rate:g} Hz on {server.url}")
         with LiveStatus() as status:

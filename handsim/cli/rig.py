@@ -15,7 +15,9 @@ from rich.text import Text
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import RigError
+from handsim.files.atomic import written_together
 from handsim.files.json_files import save_json
+from handsim.files.names import as_text
 from handsim.files.outputs import check_ending, check_outputs, write_starter
 from handsim.space.cameras import (
     ROOM_CENTER,
@@ -135,7 +137,7 @@ def import_rig(
     """
     check_ending(out, ".toml")
     check_outputs([file], [out])
-    name = "".join(one for one in file.stem if one.isprintable()) or "rig"
+    name = as_text(file.stem)
     try:
         rig = CameraRig(name, import_cameras(file, up))
     except RigError as error:
@@ -216,9 +218,10 @@ def score_rig_file(
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
     for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
-    if json is not None:
-        save_json(json, score.record())
-    write_rig_page(page, score)
+    with written_together():
+        if json is not None:
+            save_json(json, score.record())
+        write_rig_page(page, score)
     print_line(f"{page}: what to do, the cameras' worth, a map of the volume")
 
 
@@ -268,7 +271,7 @@ def plan_rig(
             camera=planning.plain_camera(size, field_of_view) if keep is None else None,
             keep=keep,
             glove=glove,
-            name=out.stem,
+            name=as_text(out.stem),
             seed=seed,
             on_step=step,
         )

@@ -17,7 +17,7 @@ from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.workers import run_jobs
 from handsim.errors import ArgumentError
-from handsim.files.atomic import atomic_writes
+from handsim.files.atomic import written_together
 from handsim.files.outputs import check_free, check_memory, check_outputs
 from train.simulation.takes import TakeConfig, record_config
 
@@ -66,8 +66,7 @@ def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
 def _simulate_into(out: Path, config: TakeConfig) -> Take:
     take = record_config(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.point_list.num_columns))
-    with atomic_writes(out, out.with_suffix(SUFFIX)) as (capture_file, truth_file):
-        # A capture without its truth is no use.
-        write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)
-        take.save(truth_file)
+    with written_together():  # a capture without its truth is no use
+        write_capture(out, Capture(names, take.points, take.rate))
+        take.save(out.with_suffix(SUFFIX))
     return take

@@ -14,6 +14,7 @@ from rich.console import Console
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.files.atomic import written_together
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.config import Size
@@ -94,23 +95,31 @@ def track(
 
     with open_sinks(send) as sinks:
         if capture is not None:
-            tracked = _track_file(capture, out, settings, sinks, on_frame)
+            tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
             setup = TrackerSetup.of(settings)
             with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
-    if labeled is not None:
-        write_capture(labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture())
+            if labeled is not None:  # after the recording, which nobody can make again
+                write_capture(
+                    labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture()
+                )
     if shape is not None and glove is None:
         print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
 
 
 def _track_file(
-    capture: Path, out: Path, settings: TrackSettings, sinks: SinkGroup, on_frame: OnFrame
+    capture: Path,
+    out: Path,
+    labeled: Path | None,
+    settings: TrackSettings,
+    sinks: SinkGroup,
+    on_frame: OnFrame,
 ) -> LiveTake:
-    """Track a capture, with the corrections beside OUT, and write the take."""
+    """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
+    from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
     from track.capture_tracking import track_capture
     from track.live import LiveTake
@@ -130,7 +139,10 @@ def _track_file(
             ),
             on_frame=on_frame,
         )
-    take.save(out)
+    with written_together():
+        take.save(out)
+        if labeled is not None:
+            write_capture(labeled, take.labeled_capture())
     applied = len(take.settings.get("corrections", ()))
     notes = [f"{corrections}: {applied} correction{'s' * (applied != 1)} applied"] if applied else []
     return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
-from handsim.app.interrupts import interrupt_flag
+from handsim.app.interrupts import InterruptFlag, interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
@@ -93,10 +93,11 @@ def view(
     if video is not None:
         _draw(str(file), content, video)
         return
-    with interrupt_flag() as ended, opened_server(host, port, "handsim view") as server:
+    with opened_server(host, port, "handsim view") as server:
         run = content.show(server)
-        print_line(f"{file} ({content.kind}): {address_of(server)} ; Ctrl-C ends it")
-        run(ended)
+        with interrupt_flag() as ended:
+            print_line(f"{file} ({content.kind}): {address_of(server)} ; Ctrl-C ends it")
+            run(ended)
 
 
 def _draw(name: str, content: Content, video: Path) -> None:
@@ -126,7 +127,7 @@ def _view_live(
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
     from handsim.space.cameras import load_rig
-    from track.live import measured_setup
+    from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
     from track.setup import warm_up
     from track.streams.addresses import open_source
@@ -135,8 +136,8 @@ def _view_live(
     cameras = None if rig is None else load_rig(rig)
     with Console(stderr=True).status("getting ready"):
         warm_up(setup.user, setup.labeler)
+    ended = InterruptFlag()
     with (
-        interrupt_flag() as ended,
         opened_server(host, port, "handsim view") as server,
         open_source(url, ended=ended) as stream,
     ):
@@ -144,9 +145,16 @@ def _view_live(
         with LiveStatus() as status:
             setup, frames = measured_setup(stream, setup, status)
         tracker = setup.tracker()
-        recording = Recorder(out, tracker, {"capture": url, **setup.settings}) if out is not None else None
-        with recording or nullcontext(), closing(LiveView(server, tracker, cameras)) as live_view:
+        with ExitStack() as stack:
+            stack.enter_context(interrupt_flag(ended))
+            recording = None
+            if out is not None:
+                recording = stack.enter_context(Recorder(out, tracker, {"capture": url, **setup.settings}))
+                stack.enter_context(recording_kept(recording))
+            live_view = stack.enter_context(closing(LiveView(server, tracker, cameras)))
             for frame in frames:
+                if ended():
+                    break
                 tracked = tracker.step(frame.points, frame.ids, frame.time)
                 if recording is not None:
                     recording.add(frame, tracked)

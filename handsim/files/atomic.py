@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and TOML files read with one kind of error."""
+"""Files that are written whole or not at all, alone or together; TOML files read with one kind of error."""
 
 from __future__ import annotations
 
@@ -10,17 +10,21 @@ import re
 import shutil
 import tomllib
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final
 
 from handsim._checks import check_type
 from handsim.errors import HandSimError, shortened
 from handsim.files.inputs import read_bytes
+from handsim.files.signals import signals_wait
 
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
 _INTEGER_BITS: Final = 63
+_OLDER: Final = "-older"  # marks the second name of a file that is being replaced
+_PROBE: Final = 1 << 20  # bytes
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 
 
@@ -30,9 +34,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     The temporary file has the same suffix, because some writers add one they miss. If the block raises,
     whatever the reason, the temporary file is removed, an older file at `path` stays as it was, and the error
-    goes on to the caller. Folders that are missing on the way to `path` are made. The finished file has the
-    mode that the umask asks for, whatever its writer chose. What a killed process left of the same file is
-    removed first.
+    goes on to the caller; one of the system that names no file names `path` then. Folders that are missing on
+    the way to `path` are made. The finished file has the mode that the umask asks for, whatever its writer
+    chose. What a killed process left of the same file is removed first.
 
     Args:
         path: Where the finished file shall be; an existing file there is replaced, of a link the file that
@@ -46,51 +50,120 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
             wrote nothing.
     """
-    with atomic_writes(path) as (temporary,):
-        yield temporary
+    check_type("path", path, (str, os.PathLike), "a path")
+    final = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.
+    if final.exists() and not final.is_file():
+        raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
+    make_folder_of(final)
+    remove_abandoned(final)
+    temporary = temporary_beside(final)
+    with _errors_name(final, temporary):
+        mode = _usual_mode(temporary)
+        try:
+            yield temporary
+            os.chmod(temporary, mode)
+            _flush(temporary)
+            together = _TOGETHER.get()
+            if together is None:
+                _name({final: temporary})
+            else:
+                together[final] = temporary
+        except BaseException:  # also an interrupt must leave nothing behind
+            temporary.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
-def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
-    """Temporary paths of files that belong together: all take their names when the block ends well, or none.
+def _errors_name(final: Path, temporary: Path) -> Iterator[None]:
+    """Errors name the file that was asked for, not the temporary one, nor none as those of full disks do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(temporary), temporary):
+            error.filename = str(final)
+        raise
 
-    Args:
-        paths: Where the finished files shall be; see `atomic_write`.
 
-    Yields:
-        The paths to write to, in the same order.
+_TOGETHER: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", default=None)
+"""Temporary files that wait for the end of a block of `written_together`, by their final names."""
+
+
+@contextmanager
+def written_together() -> Iterator[None]:
+    """Files of `atomic_write` within the block take their names at its end, all of them or none.
+
+    If the block raises, or one file cannot take its name, older files stay as they were, and those that were
+    not there before are not there. Signals to end wait for the renames. Only a process that is killed between
+    two of them leaves new files beside older ones.
 
     Raises:
-        ArgumentError: One is no path.
-        OSError: As `atomic_write`.
+        OSError: A file cannot take its name.
     """
-    for path in paths:
-        check_type("path", path, (str, os.PathLike), "a path")
-    finals = [Path(os.path.realpath(path)) if os.path.islink(path) else Path(path) for path in paths]
-    for final in finals:
-        # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.
-        if final.exists() and not final.is_file():
-            raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
-        make_folder_of(final)
-        remove_abandoned(final)
-    temporaries = [temporary_beside(final) for final in finals]
-    modes = [_usual_mode(*pair) for pair in zip(temporaries, finals, strict=True)]
-    renamed: list[Path] = []
+    if _TOGETHER.get() is not None:
+        yield
+        return
+    files: dict[Path, Path] = {}
+    token = _TOGETHER.set(files)
     try:
-        yield tuple(temporaries)
-        for temporary, mode in zip(temporaries, modes, strict=True):
-            os.chmod(temporary, mode)
-            _flush(temporary)
-        for temporary, final in zip(temporaries, finals, strict=True):
-            os.replace(temporary, final)
-            renamed.append(final)
-    except BaseException as error:  # also an interrupt must leave nothing behind
-        for file in (*temporaries, *renamed):
-            file.unlink(missing_ok=True)
-        names = dict(zip(map(str, temporaries), map(str, finals), strict=True))
-        if isinstance(error, OSError) and str(error.filename) in names:  # nobody knows the temporary name
-            error.filename = names[str(error.filename)]
-        raise
+        yield
+        _name(files)
+    finally:
+        _TOGETHER.reset(token)
+        for temporary in files.values():
+            temporary.unlink(missing_ok=True)
+
+
+def _name(files: Mapping[Path, Path]) -> None:
+    """Rename temporary files, which come by their final names; all of them, or none."""
+    older: dict[Path, Path] = {}
+    named: list[Path] = []
+    with signals_wait():
+        try:
+            if len(files) > 1:  # a single rename is whole in itself
+                for final in filter(Path.exists, files):
+                    older[final] = temporary_beside(final, _OLDER)
+                    _keep(final, older[final])
+            for final, temporary in files.items():
+                with _errors_name(final, temporary):
+                    os.replace(temporary, final)
+                named.append(final)
+        except BaseException:
+            for final in reversed(named):
+                _put_back(final, older.pop(final, None))
+            raise
+        finally:
+            for kept in older.values():
+                kept.unlink(missing_ok=True)
+
+
+def _keep(final: Path, older: Path) -> None:
+    """Keep a file under a second name."""
+    older.unlink(missing_ok=True)
+    try:
+        os.link(final, older)
+    except OSError:  # the file system has no hard links
+        with _errors_name(final, older):
+            shutil.copy2(final, older)
+
+
+def _put_back(final: Path, older: Path | None) -> None:
+    """Undo a rename; where that fails too, the older file stays under its second name."""
+    with suppress(OSError):
+        if older is None:
+            final.unlink()
+        else:
+            os.replace(older, final)
+
+
+def unwritten(path: Path) -> OSError:
+    """The system's error for a file that a library did not write whole, without saying why."""
+    try:
+        with path.open("ab") as file:
+            file.write(bytes(_PROBE))
+    except OSError as error:
+        return error
+    return OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
 
 def make_folder_of(path: Path) -> None:
@@ -105,9 +178,9 @@ def make_folder_of(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
 
 
-def temporary_beside(path: Path) -> Path:
+def temporary_beside(path: Path, mark: str = "") -> Path:
     """The hidden name under which this process writes `path`; `remove_leftovers` knows such names."""
-    return path.with_name(f"{_prefix(path)}{os.getpid()}{path.suffix}")
+    return path.with_name(f"{_prefix(path)}{os.getpid()}{mark}{path.suffix}")
 
 
 def _prefix(path: Path) -> str:
@@ -132,10 +205,13 @@ def _remove(leftover: Path) -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove what was to become `final` and whose process is gone; that of other machines stays."""
+    """Remove what was to become `final`, or was it before, and whose process is gone.
+
+    What processes of other machines left stays.
+    """
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
-        number = leftover.name.removeprefix(prefix).removesuffix(final.suffix)
+        number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
         if number.isdecimal() and not _is_running(int(number)):
             _remove(leftover)
 
@@ -152,12 +228,9 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def _usual_mode(temporary: Path, final: Path) -> int:
+def _usual_mode(temporary: Path) -> int:
     """The mode of a new file here; some writers make theirs readable by the owner alone."""
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(final)) from error
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
     try:
         return os.fstat(descriptor).st_mode & 0o777
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Iterable
@@ -23,9 +24,11 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
     """
     read, written = [Path(name) for name in inputs if isinstance(name, str | Path)], set()
     for output in (path for path in outputs if path is not None):
-        if output.resolve() in written:
+        _check_links(output)
+        real = os.path.realpath(output)
+        if real in written:
             raise ArgumentError(f"two outputs are {output}, expected two files")
-        written.add(output.resolve())
+        written.add(real)
         there = next((path for path in output.absolute().parents if path.exists()), None)
         if there is not None and not there.is_dir():
             raise ArgumentError(
@@ -36,6 +39,24 @@ def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> N
         for source in read:
             if _same(source, output):
                 raise ArgumentError(f"the output {output} is the input {source}, expected another file")
+
+
+def _check_links(output: Path) -> None:
+    """Refuse links on the way to an output that lead to themselves, or to no folder."""
+    for path in (*reversed(output.absolute().parents), output):
+        if not path.is_symlink() or path.exists():
+            continue
+        try:
+            path.stat()
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise ArgumentError(
+                    f"the output {output} cannot be written: {path} is a link that leads to itself"
+                ) from error
+        if path != output:
+            raise ArgumentError(
+                f"the output {output} cannot be written: {path} is a link to a folder that is not there"
+            )
 
 
 def check_ending(path: Path, *endings: str, option: str = "--out") -> None:

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
 from handsim.errors import ArgumentError
@@ -68,6 +69,7 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
+_SHORTEST, _LONGEST = 1e-4, 1.0  # [m] of anything in a hand; far from any, but not from what can be computed
 HAND_DTYPE: Final = np.dtype(
     [
         ("left", "?"),
@@ -87,8 +89,8 @@ class HandShape:
     """One person's hand, always described as a right hand; `side` names the hand it is.
 
     Raises:
-        ArgumentError: The side is unknown, an array has another shape or is not finite, a length is not
-            positive, or the hand length is not between 0.05 and 0.35 m.
+        ArgumentError: The side is unknown, an array has another shape or is not finite, a measure is no
+            hand's, or the hand length is not between 0.05 and 0.35 m.
     """
 
     side: Side
@@ -117,11 +119,15 @@ class HandShape:
             ("radii", (5, 4)),
         ):
             object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
-        smallest = min(
-            self.length, self.breadth, self.palm_thickness, self.bone_lengths.min(), self.radii.min()
-        )
-        if not smallest > 0.0:
-            raise ArgumentError(f"a hand's lengths must be positive, got {smallest:g} m")
+        for name in ("length", "breadth", "palm_thickness", "bone_lengths", "radii"):
+            smallest = np.min(getattr(self, name))
+            if not smallest > 0.0:
+                raise ArgumentError(f"a hand's lengths must be positive, got {smallest:g} m")
+            _check_measure(name, getattr(self, name), _SHORTEST, _LONGEST)
+        _check_measure("knuckles", self.knuckles, -_LONGEST, _LONGEST)
+        _check_measure("knuckles along the hand", self.knuckles[1:, 0], _SHORTEST, _LONGEST)
+        if np.abs(self.base_angles).max() > 2.0 * np.pi:
+            raise ArgumentError("base_angles of a hand are more than a turn, expected radians")
         if not 0.05 <= self.length <= 0.35:
             raise ArgumentError(
                 f"hand length {self.length:g} m is no human hand's; expected meters, 0.05 to 0.35"
@@ -130,6 +136,13 @@ class HandShape:
     def with_side(self, side: Side) -> HandShape:
         """The same hand on the other (or the same) arm."""
         return dataclasses.replace(self, side=side)
+
+
+def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
+    """Refuse measures [m] that no hand has, of which models would be without a shape."""
+    wrong = np.extract((np.asarray(values) < low) | (np.asarray(values) > high), values)
+    if len(wrong):
+        raise ArgumentError(f"{name} of a hand: {wrong[0]:g} m, expected {low:g} to {high:g} m")
 
 
 def shape_from_measures(length: float, breadth: float, *, side: Side = "right") -> HandShape:

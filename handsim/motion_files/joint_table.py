@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.names import as_text
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.osim import coordinate_names
 from handsim.hand.topology import JOINT_NAMES, SIDES, Side
@@ -139,8 +140,8 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             for name, column in zip(NUMBERS, numbers.T, strict=True)
         },
     }
-    with atomic_write(path) as temporary:
-        parquet.write_table(pyarrow.table(columns), temporary)
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        parquet.write_table(pyarrow.table(columns), file)
 
 
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
@@ -162,7 +163,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
     names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
     header = [
-        path.stem,
+        as_text(path.stem),
         "version=1",
         f"nRows={len(table)}",
         f"nColumns={table.shape[1]}",

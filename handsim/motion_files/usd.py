@@ -16,7 +16,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, unwritten
+from handsim.files.names import plain_path
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, PALM, Side
@@ -48,7 +49,7 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         HandSimError: usd-core is not installed.
     """
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Tf, Usd, UsdGeom
     except ImportError as error:
         raise HandSimError(f"{path.suffix} needs usd-core; run `pip install 'handsim[usd]'`") from error
     stage = Usd.Stage.CreateInMemory()
@@ -64,9 +65,13 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         _add_hand(stage, hand, codes)
     for number, thing in enumerate(posed_bodies(motion)):
         _add_thing(stage, thing, number, codes)
-    with atomic_write(path) as temporary:
-        if not stage.GetRootLayer().Export(str(temporary)):
-            raise HandSimError(f"{path}: usd-core could not write it")
+    with atomic_write(path) as temporary, plain_path(temporary) as plain:
+        try:
+            done = stage.GetRootLayer().Export(str(plain))
+        except Tf.ErrorException as error:  # raised on a full disk
+            raise unwritten(temporary) from error
+        if not done:
+            raise unwritten(temporary)
 
 
 def joint_paths(side: Side) -> list[str]:

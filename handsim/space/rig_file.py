@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
+from handsim.files.names import as_text
 from handsim.files.toml_values import (
     check_keys,
     number_list,
@@ -56,7 +57,7 @@ def read_rig_file(path: Path) -> RigFile:
     """Read a file of cameras."""
     table = read_toml(path, error=RigError)
     try:
-        return _parse(table, path.stem)
+        return _parse(table, as_text(path.stem))
     except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
 

@@ -13,7 +13,6 @@ Compression is ZIP: lossless, and every reader has it.
 
 from __future__ import annotations
 
-import errno
 import json
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +22,8 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, unwritten
+from handsim.files.names import plain_path
 from render.frames import Pictures, RenderedFrame
 
 _RGB: Final = ("R", "G", "B")
@@ -64,11 +64,11 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
         "T_world_camera": frame.camera.T_world_camera,
         "lens": json.dumps(record["lens"]),
     }
-    with atomic_write(path) as temporary:
+    with atomic_write(path) as temporary, plain_path(temporary) as plain:
         try:
-            OpenEXR.File(header, channels).write(str(temporary))
+            OpenEXR.File(header, channels).write(str(plain))
         except RuntimeError as error:  # raised on a full disk
-            raise OSError(errno.EIO, str(error), str(path)) from error
+            raise unwritten(temporary) from error
 
 
 def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim.errors import ArgumentError, FileError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, unwritten
+from handsim.files.names import plain_path
 from handsim.hand.model import HandModel
 from render.illustrations.scene import Balls, HandScene, PosedHand, View, render_rgb, view_along
 
@@ -51,8 +52,8 @@ def write_clip(
         raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
     view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
     try:
-        with atomic_write(path) as temporary:
-            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
+        with atomic_write(path) as temporary, plain_path(temporary) as plain:
+            writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
             try:
                 if not writer.isOpened():
                     raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
@@ -61,8 +62,19 @@ def write_clip(
                     writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
             finally:
                 writer.release()
+            _check_written(plain)
     except OSError as error:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _check_written(path: Path) -> None:
+    """Check that a video can be read: OpenCV does not notice failed writes, such as on a full disk."""
+    reader = cv2.VideoCapture(str(path))
+    try:
+        if not reader.isOpened():
+            raise unwritten(path)
+    finally:
+        reader.release()
 
 
 def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:

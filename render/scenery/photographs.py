@@ -15,6 +15,7 @@ from PIL import Image
 
 from handsim.errors import HandSimError
 from handsim.files.inputs import check_regular
+from handsim.files.names import plain_path
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
@@ -28,10 +29,15 @@ def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     if not folder.is_dir():
         raise HandSimError(f"{folder}: no such folder of photographs")
     files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
-    good = tuple(file for file in files if cv2.haveImageReader(str(file)))
+    good = tuple(filter(_begins_as_picture, files))
     if not good:
         raise _no_photo(folder)
     return good, tuple(file for file in files if file not in set(good))
+
+
+def _begins_as_picture(file: Path) -> bool:
+    with plain_path(file) as plain:
+        return bool(cv2.haveImageReader(str(plain)))
 
 
 def pick_photo(folder: Path, rng: np.random.Generator) -> Path:

@@ -95,17 +95,18 @@ def _hand(
     pixels = np.floor(np.nan_to_num(camera.project(vertices), nan=-9.0)).astype(int)
     depth = camera.local(vertices)[:, 2]
     mine = np.zeros(camera.size[::-1], dtype=bool)
-    for vertex in np.argsort(-depth):  # the nearest last
-        column, row = pixels[vertex]
-        if not (1 <= column < camera.size[0] - 1 and 1 <= row < camera.size[1] - 1):
-            continue
-        patch = np.s_[row - 1 : row + 2, column - 1 : column + 2]
-        pictures.rgb[patch] = (200, 120 + 2 * bones[vertex], 90)
-        pictures.depth[patch] = depth[vertex]
-        pictures.normals[patch] = (0.6, 0.0, -0.8)
-        pictures.parts[patch] = 1 + bones[vertex] + PARTS_A_HAND * place
-        pictures.instances[patch] = 1 + place
-        mine[patch] = True
+    inside = ((pixels >= 1) & (pixels < np.array(camera.size) - 1)).all(axis=1)
+    drawn = np.argsort(np.where(inside, -depth, np.inf))[: inside.sum()]  # the nearest last, which stays
+    columns, rows = pixels[drawn].T[..., None, None]
+    square = np.arange(-1, 2)
+    patch = rows + square[:, None], columns + square
+    bone = bones[drawn][:, None, None]
+    pictures.rgb[patch] = np.stack(np.broadcast_arrays(200, 120 + 2 * bone, 90), axis=-1)
+    pictures.depth[patch] = depth[drawn][:, None, None]
+    pictures.normals[patch] = (0.6, 0.0, -0.8)
+    pictures.parts[patch] = 1 + bone + PARTS_A_HAND * place
+    pictures.instances[patch] = 1 + place
+    mine[patch] = True
     rows, columns = np.nonzero(mine)
     box = np.full(4, np.nan)
     if rows.size:

@@ -153,8 +153,10 @@ def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
     config = dataclasses.replace(
         PLAIN, view=ViewConfig("anywhere"), every=1, frames_per_shard=64, vary="frame"
     )
-    render_take(path, tmp_path / "out", ["png"], config, workers=1)
-    for frame in draw(path, config=config, frames=[0, 7, 30]):
+    short = tmp_path / "short.truth.npz"
+    load_take(path).cut(0, 10).save(short)
+    render_take(short, tmp_path / "out", ["png"], config, workers=1)
+    for frame in draw(short, config=config, frames=[0, 7, 9]):
         (file,) = (tmp_path / "out").glob(f"images/shard-*/{frame.key}.png")
         written = cv2.imread(str(file))
         np.testing.assert_array_equal(written[..., ::-1], frame.rgb)

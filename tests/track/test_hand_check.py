@@ -9,9 +9,15 @@ import pytest
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning
+from track import hand_check
 from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
+from track.hand_check import check_scale
+from track.hand_size import sample_frames
 from track.setup import measure_hands
+from track.streams.frame_source import checked_frames
+from track.user import nominal_user
+from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 90
@@ -58,10 +64,25 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
         (3.2808, "at 3.28 of their size"),
     ],
 )
-def test_another_unit_is_named(scale, said):
-    both = simulate_take("single-hand", num_frames=FRAMES).capture()
+def test_another_unit_is_named(scale, said, monkeypatch):
+    few = [(name, load_layout(name)) for name in ("sparse13", "tips8")]  # of all that are shipped
+    monkeypatch.setattr(hand_check, "_gloves", lambda: few)
+    both = simulate_take("single-hand", num_frames=20).capture()
     with pytest.raises(ArgumentError, match=said):
         track_capture(dataclasses.replace(both, positions=scale * both.positions))
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0, 1 / 0.0254])
+def test_a_unit_that_is_far_off_is_named_before_hands_are_measured(scale):
+    layout = load_layout("dense19")
+    both = simulate_take("hand-hand", num_frames=FRAMES).capture()
+    frames = sample_frames(checked_frames(dataclasses.replace(both, positions=scale * both.positions)))
+    user, labeler = nominal_user(layout, "M", ("right", "left")), load_labeler(layout, None)
+    if scale == 1.0:
+        check_scale(frames, user, labeler)
+        return
+    with pytest.raises(ArgumentError, match=f"the points fit hands at {scale:.3g} of their size"):
+        check_scale(frames, user, labeler)
 
 
 def test_measured_hands_are_not_told_of_what_they_lack(capture):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import signal
+import threading
 
 import numpy as np
 import pytest
@@ -19,7 +21,9 @@ from render.subject import load_subject
 from track import recorder as module
 from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
+from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
+from track.streams.natnet_server import ReplayServer
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
@@ -149,3 +153,25 @@ def test_a_take_that_cannot_be_written_keeps_the_recording(tmp_path):
         recorder.finish(COUNTS)
     with pytest.warns(CutOffWarning):
         assert load_take(recorder.part).num_frames == FRAMES
+
+
+def test_ctrl_c_in_a_loop_of_one_s_own_writes_the_take(tmp_path):
+    tracker = tracked()[0]
+    with (
+        pytest.raises(KeyboardInterrupt),
+        ReplayServer(simulate_take(kind="hand-controller", num_frames=FRAMES), loop=True) as server,
+        open_source(server.url) as source,
+        Recorder(tmp_path / "take.npz", tracker) as recorder,
+    ):
+        for frame in source:
+            recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
+            if recorder.num_frames == FRAMES:
+                threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert os.listdir(tmp_path) == ["take.npz"]
+    assert load_take(tmp_path / "take.npz").num_frames >= FRAMES
+
+
+def test_ctrl_c_in_compiled_code_writes_the_take(tmp_path):
+    with pytest.raises(KeyboardInterrupt), recorded(tmp_path):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+    assert_equal(load_take(tmp_path / "new" / "take.npz"), in_memory())

@@ -1,11 +1,22 @@
-"""What tests of labelers share: gloves that are learned in a cache of their own, from little."""
+"""What tests of labelers share: pages without pictures, and gloves learned from little, in an own cache."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.learned_gloves import fine_tuned_labeler
+
+
+@pytest.fixture(scope="module", autouse=True)
+def pages_without_pictures() -> Iterator[None]:
+    """A run of a small network draws for longer than it learns; tests of pages draw (tests/train/reports)."""
+    with pytest.MonkeyPatch.context() as patch:
+        for page in ("run_page", "dataset_page"):
+            patch.setattr(f"train.reports.{page}.picture", lambda size, draw: "data:,")
+        yield
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ def network(rows):
 
 
 def test_no_other_costs_are_better(network, rows):
-    few = rows[:8]
+    few = rows[:4]
     network.config = CNNConfig()
     chosen = choose_costs(network, NAMES, few)
     assert network.config == chosen and None not in (chosen.reject, chosen.spread)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.page import Section, write_page
-from handsim.files.atomic import atomic_writes
+from handsim.files.atomic import written_together
 from handsim.files.outputs import check_ending
 from handsim.hand.topology import JOINTS
 from track.config import Size
@@ -61,12 +61,12 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
     for hand in hands:
         sections += _hand_sections(take, hand)
     sections.append(_doubts_section(take, doubts, source))
-    paths = (out, *table_paths(out))
-    with atomic_writes(*paths) as (page, *tables):
-        write_page(page, sections, title=f"Take {Path(source).name}", lead=_lead(take))
+    tables = table_paths(out)
+    with written_together():
+        write_page(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, table in zip(tables, tables_of(take, hands, doubts), strict=True):
             write_table(path, table)
-    return paths
+    return out, *tables
 
 
 def _lead(take: Take) -> str:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gloves.takes.take import STATUSES, Take
+from handsim.files.atomic import atomic_write
 from handsim.hand.topology import JOINT_NAMES, JOINTS
 from track.reports.hand_figures import RANGE, HandFigures
 from track.take_summary import Doubt
@@ -40,12 +41,12 @@ def tables_of(take: Take, hands: Sequence[HandFigures], doubts: Sequence[Doubt])
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table, UTF-8.
+    """Write a table, UTF-8, whole or not at all.
 
     Raises:
         OSError: The file cannot be written.
     """
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table.header)
         writer.writerows(table.rows)

@@ -39,7 +39,8 @@ def open_source(
     Args:
         address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own.
         silence: Time without a frame after which the stream yields a silent frame [s].
-        ended: The stream ends when this is true; it is asked several times a second.
+        ended: The stream ends when this is true; it is asked before each frame, and several times a second
+            while none comes.
 
     Raises:
         ArgumentError: The address is invalid, or there is no such source.

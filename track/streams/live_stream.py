@@ -95,7 +95,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
     Args:
         frames: The frames as they arrive.
         silence: Time without a frame after which the stream yields a silent frame [s].
-        ended: The stream ends when this is true, after what has arrived; it is asked several times a second.
+        ended: The stream ends when this is true, after what has arrived; it is asked before each frame, and
+            several times a second while none comes.
     """
 
     def __init__(
@@ -153,6 +154,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         quiet = time.monotonic() + self._silence
         self._line_up(0.0)
         while not self._closed:
+            if self._end_at == math.inf and self._ended():
+                self.end()
             if not self._ready:
                 self._kept_up = time.monotonic()
                 self._line_up(min(quiet, self.order.deadline) - self._kept_up)
@@ -161,8 +164,6 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
                 return self._continue(self._ready.popleft()[0])
             if self._over:
                 break
-            if self._end_at == math.inf and self._ended():
-                self.end()
             if time.monotonic() >= quiet and self.order.deadline == math.inf:
                 return self._silent()
         if self._frames.error is not None and not self._failed:
@@ -305,11 +306,14 @@ class SourceStream:
         """Take every frame as it arrives, in a thread of its own."""
         try:
             for frame in self._source:
-                if not self._put(_checked(frame)):
-                    return
+                if self._ended or not self._put(_checked(frame)):
+                    break
         except Exception as error:  # of the user's code: any
-            self.error = CaptureError(f"{self._name}: the stream failed ({type(error).__name__}: {error})")
-            self.error.__cause__ = error
+            if not self._ended:  # one that is closed while it waits may fail
+                self.error = CaptureError(
+                    f"{self._name}: the stream failed ({type(error).__name__}: {error})"
+                )
+                self.error.__cause__ = error
         with self._changed:
             self._read_all = True
             self._changed.notify_all()

@@ -21,7 +21,7 @@ from torch import Tensor
 from gloves.layout import MarkerLayout
 from handsim._version import __version__
 from handsim.errors import WeightsError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, written_together
 from handsim.files.json_files import save_json
 from handsim.hand.topology import SIDES
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
@@ -151,9 +151,10 @@ def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -
         "handsim": __version__,
         "license": "apache-2.0",
     }
-    with atomic_write(folder / WEIGHTS) as temporary:
-        temporary.write_bytes(save(tensors))
-    save_json(folder / CARD, card)
+    with written_together():
+        with atomic_write(folder / WEIGHTS) as temporary:
+            temporary.write_bytes(save(tensors))
+        save_json(folder / CARD, card)
 
 
 def sample_worn_markers(

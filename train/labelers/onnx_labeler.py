@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from handsim._version import __version__
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
+from handsim.files.names import plain_path
 from train.config import CNNConfig
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.protocol import Labeling, checked_names, label_by_scores, label_in_batches, pad_clouds
@@ -196,20 +197,20 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             network, outputs = PairedScores(network), [*outputs, *_PAIRED]
             axes |= {name: {0: "frames", 1: "points"} for name in _PAIRED}
             axes[_PAIRED[1]][2] = "markers_and_points"
-    with atomic_write(path) as temporary, warnings.catch_warnings():
+    with atomic_write(path) as temporary, plain_path(temporary) as plain, warnings.catch_warnings():
         # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network.eval(),
             example,
-            str(temporary),
+            str(plain),
             input_names=inputs,
             output_names=outputs,
             dynamic_axes=axes,
             opset_version=_OPSET,
             dynamo=False,
         )
-        model = onnx.load(str(temporary))
+        model = onnx.load(str(plain))
         _describe(model, properties)
         onnx.checker.check_model(model, full_check=True)
         temporary.write_bytes(sign_model(model.SerializeToString()))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
@@ -221,10 +221,11 @@ def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None
     prior = getattr(network, "prior", None)
     if isinstance(prior, PosePrior):
         tensors |= {_PRIOR + name: torch.from_numpy(table) for name, table in prior.tensors().items()}
-    with atomic_write(folder / WEIGHTS) as temporary:
-        # safetensors' own writing hides that a disk is full
-        temporary.write_bytes(_with_metadata(save(tensors), weights_metadata(card)))
-    save_json(folder / CARD, card)
+    with written_together():
+        with atomic_write(folder / WEIGHTS) as temporary:
+            # safetensors' own writing hides that a disk is full
+            temporary.write_bytes(_with_metadata(save(tensors), weights_metadata(card)))
+        save_json(folder / CARD, card)
 
 
 def weights_metadata(card: dict[str, Any]) -> dict[str, str]:

@@ -19,7 +19,7 @@ from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_type, make_settings
 from handsim._plugins import plugin_name
-from handsim.app.interrupts import Stopped
+from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
@@ -205,9 +205,10 @@ def _make_shards(
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
     try:
         job = output.job(functools.partial(make_shard, config), last=["rows-*"])
-        for shard in run_jobs(job, todo, workers):
-            done += _shard_size(config, shard)
-            progress(done, config.num_frames)
+        with interrupts_bare():
+            for shard in run_jobs(job, todo, workers):
+                done += _shard_size(config, shard)
+                progress(done, config.num_frames)
     except KeyboardInterrupt as stop:
         kept = f"{done} of {config.num_frames} frames are in {output}"
         raise Stopped.again(stop, f"{kept}, and the same command goes on after them") from stop

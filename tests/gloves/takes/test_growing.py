@@ -19,6 +19,7 @@ from gloves.takes.growing import (
     is_growing,
 )
 from handsim.errors import CaptureError
+from handsim.files import arrays
 from handsim.files.arrays import read_npz, write_npz
 
 COLUMNS = (
@@ -50,15 +51,15 @@ def record(path, rng, counts, *, every: int = 4) -> list[dict]:
     return rows
 
 
-def check(arrays, rows) -> None:
-    np.testing.assert_array_equal(arrays["times"], [row["times"] for row in rows])
-    np.testing.assert_array_equal(arrays["point_counts"], [len(row["ids"]) for row in rows])
-    assert arrays["nothing"].shape == (len(rows), 0, 7)
+def check(read, rows) -> None:
+    np.testing.assert_array_equal(read["times"], [row["times"] for row in rows])
+    np.testing.assert_array_equal(read["point_counts"], [len(row["ids"]) for row in rows])
+    assert read["nothing"].shape == (len(rows), 0, 7)
     points = np.concatenate([np.zeros((0, 3)), *(row["points"] for row in rows)])
-    np.testing.assert_array_equal(arrays["points"], points)
-    np.testing.assert_array_equal(arrays["ids"], np.concatenate([[], *(row["ids"] for row in rows)]))
+    np.testing.assert_array_equal(read["points"], points)
+    np.testing.assert_array_equal(read["ids"], np.concatenate([[], *(row["ids"] for row in rows)]))
     for name, array in FIXED.items():
-        np.testing.assert_array_equal(arrays[name], array)
+        np.testing.assert_array_equal(read[name], array)
 
 
 def test_what_was_added_is_read_and_finished(rng, tmp_path):
@@ -182,14 +183,19 @@ def test_a_crowded_frame_makes_nothing_larger(rng, tmp_path):
     check(read_npz(tmp_path / "take.npz"), rows)
 
 
-def test_hours_in_which_nothing_moves_are_read(tmp_path):
+def test_hours_in_which_nothing_moves_are_read(tmp_path, monkeypatch):
     """What compresses far better than the reader allows is written without compression."""
-    columns = (Column("qpos", "<f8", ("T", 20_000)),)
+    monkeypatch.setattr(arrays, "_ALWAYS", 1 << 16)
+    columns = (Column("qpos", "<f8", ("T", 50)),)
     with GrowingArchive(tmp_path / "x.part", {}, {}, columns) as archive:
         for _ in range(2000):
-            archive.add({"qpos": np.full(20_000, np.nan)}, 0)
+            archive.add({"qpos": np.full(50, np.nan)}, 0)
     finish_archive(GrownArchive(tmp_path / "x.part"), tmp_path / "x.npz", {})
     assert np.isnan(read_npz(tmp_path / "x.npz")["qpos"]).all()
+    with (tmp_path / "small.npz").open("wb") as file:
+        np.savez_compressed(file, qpos=np.full((2000, 50), np.nan))
+    with pytest.raises(ValueError, match="expected at most"):
+        read_npz(tmp_path / "small.npz")
 
 
 def test_what_cannot_be_read_back_is_not_written(rng, tmp_path, monkeypatch):

@@ -45,6 +45,8 @@ def take(rng) -> Take:
     gone = rng.random((FRAMES, COLUMNS)) < 0.2
     points[gone], labels[gone] = np.nan, -1
     body_status = rng.integers(len(STATUSES), size=(FRAMES, 1)).astype(np.int8)
+    body_poses = np.where((body_status == LOST)[..., None], np.nan, rng.normal(size=(FRAMES, 1, 7)))
+    body_poses[..., 3:7] /= np.linalg.norm(body_poses[..., 3:7], axis=-1, keepdims=True)
     return Take(
         rate=120.0,
         times=np.cumsum(rng.uniform(0.005, 0.02, size=FRAMES)),
@@ -57,7 +59,7 @@ def take(rng) -> Take:
         labels=labels,
         confidence=np.where(gone, np.nan, rng.random(gone.shape)),
         bodies=(PEN,),
-        body_poses=np.where((body_status == LOST)[..., None], np.nan, rng.normal(size=(FRAMES, 1, 7))),
+        body_poses=body_poses,
         body_status=body_status,
         body_rms=rng.random((FRAMES, 1)),
         settings={"glove": "dense19"},

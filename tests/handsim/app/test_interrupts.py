@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import threading
@@ -10,7 +11,7 @@ import time
 import pytest
 
 import handsim.cli.main as command
-from handsim.app.interrupts import Stopped, interrupt_flag, signals_raise
+from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare, signals_raise
 from tests.waiting import LONG
 
 
@@ -82,11 +83,60 @@ def test_a_signal_whose_exception_is_lost_comes_again():
     assert caught.value.number == signal.SIGTERM
 
 
+def test_a_signal_that_is_lost_where_nothing_can_be_raised_comes_again_without_a_traceback(capsys):
+    class Swallowing:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped), signals_raise():
+        Swallowing()
+        time.sleep(LONG)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("levels", [1, 4])
 @pytest.mark.parametrize("error", [SystemError("returned a result"), ImportError("initialization failed")])
-def test_an_interrupt_in_compiled_code_is_no_mistake_of_ours(error, monkeypatch, capsys):
+def test_an_interrupt_in_compiled_code_is_no_mistake_of_ours(error, levels, monkeypatch, capsys):
     def interrupted(*_: object) -> int:
-        raise error from KeyboardInterrupt()
+        cause: BaseException = KeyboardInterrupt()
+        for _ in range(levels - 1):
+            inner = SystemError("returned a result")
+            inner.__cause__ = cause
+            cause = inner
+        raise error from cause
 
     monkeypatch.setattr(command, "_dispatch", interrupted)
     assert command.run({}, []) == 130
     assert capsys.readouterr().err == "handsim: interrupted\n"
+
+
+def test_what_fails_because_an_interrupt_was_kept_is_no_mistake_of_ours(monkeypatch, capsys):
+    def interrupted(*_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except BaseException as error:  # as trimesh does while it loads
+            kept = error
+        return kept | None  # type: ignore[operator]
+
+    monkeypatch.setattr(command, "_dispatch", interrupted)
+    assert command.run({}, []) == 143
+    assert capsys.readouterr().err == "handsim: ended by SIGTERM\n"
+
+
+def test_a_full_disk_that_an_interrupt_met_is_told(monkeypatch, capsys):
+    def interrupted(*_: object) -> int:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise OSError(errno.ENOSPC, "no space", "take.npz")
+
+    monkeypatch.setattr(command, "_dispatch", interrupted)
+    assert command.run({}, []) == 1
+    assert "take.npz: the disk is full" in capsys.readouterr().err
+
+
+def test_an_interrupt_that_was_wrapped_leaves_as_itself():
+    stop = Stopped(signal.SIGTERM, "3 of 8")
+    with pytest.raises(Stopped) as caught, interrupts_bare():
+        raise SystemError("returned a result") from stop
+    assert caught.value is stop

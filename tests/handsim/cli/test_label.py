@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
 from handsim.cli.main import main
+from track.kinematics import pose_solver
 from train.simulation.takes import simulate_take
 
 FRAMES = 40
@@ -71,3 +73,31 @@ def test_a_capture_without_a_hand_is_told(take, tmp_path, capsys, rng):
             said.out
         )
         assert words in said.err
+
+
+def test_ctrl_c_in_compiled_code_is_no_mistake_of_ours(take, tmp_path, capsys, monkeypatch):
+    """Compiled code that is interrupted returns a SystemError."""
+    wrapped: list[SystemError] = []
+    compiled = pose_solver.fit_frames
+
+    def interrupted(*args: object) -> object:
+        signal.setitimer(signal.ITIMER_REAL, 1e-4)
+        try:
+            return compiled(*args)
+        except SystemError as error:
+            wrapped.append(error)
+            raise
+
+    monkeypatch.setattr(pose_solver, "fit_frames", interrupted)
+    write_capture(tmp_path / "in.c3d", take.capture())
+    before = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        for _ in range(50):  # a busy machine may interrupt Python instead
+            assert main(["label", str(tmp_path / "in.c3d"), "--out", str(tmp_path / "out.trc")]) == 130
+            assert capsys.readouterr().err == "handsim label: interrupted\n"
+            if wrapped:
+                break
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert wrapped and not (tmp_path / "out.trc").exists()

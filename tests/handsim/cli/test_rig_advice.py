@@ -8,6 +8,7 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.space.cameras import load_rig
+from train.rig_advice import planning
 from train.simulation.takes import simulate_take
 
 
@@ -46,7 +47,10 @@ def test_mistakes_are_told(options, sentence, tmp_path, monkeypatch, capsys):
     assert sentence in capsys.readouterr().err
 
 
-def test_a_planned_rig_is_written_and_told(tmp_path, capsys):
+def test_a_planned_rig_is_written_and_told(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(planning, "_PEOPLE", 1)
+    monkeypatch.setattr(planning, "_FRAMES", 120)
+    monkeypatch.setattr(planning, "_JUDGED", 120)
     out = tmp_path / "mine.toml"
     options = ["--cameras", "2", "--room", "2.4", "1.8", "2.2", "--mounts", "truss", "--glove", "tips8"]
     assert main(["rig", "plan", *options, "--out", str(out)]) == 0

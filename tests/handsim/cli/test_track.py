@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,10 +32,11 @@ from handsim.cli.main import main
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
-from tests.waiting import wait_for
+from tests.waiting import LONG, wait_for
 from track import capture_tracking
 from track.bodies.body_file import load_body
 from track.capture_tracking import track_capture
+from track.recorder import Recorder
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user
@@ -280,7 +282,7 @@ def test_the_command_and_python_track_alike(capture, tmp_path):
 def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=20.0))
     out = tmp_path / "live.npz"
-    with ReplayServer(capture.with_suffix(".truth.npz")) as server:
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
         assert main(["track", "--live", server.url, "--seconds", "0.3", "--out", str(out)]) == 0
     take = load_take(out)
     assert 2 <= take.num_frames <= FRAMES and take.rate == pytest.approx(120.0, rel=1e-3)
@@ -325,51 +327,103 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     assert load_take(out).num_frames == 30, "not from the first silence"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupt_writes_what_there_is(number, capture, tmp_path):
-    out, before = tmp_path / "live.npz", signal.getsignal(number)
-    with ReplayServer(capture.with_suffix(".truth.npz")) as server:
-
-        def interrupt() -> None:
-            try:
-                wait_for(lambda: server.sent > FRAMES // 2 and signal.getsignal(number) is not before)
-            finally:
-                os.kill(os.getpid(), number)
-
-        thread = threading.Thread(target=interrupt, daemon=True)
-        thread.start()
-        assert main(["track", "--live", server.url, "--out", str(out)]) == 0
-        thread.join()
-    assert 2 <= load_take(out).num_frames <= FRAMES
-    assert signal.getsignal(number) is before and os.listdir(tmp_path) == ["live.npz"]
-
-
 def _numbers_in(part):
     """The numbers of the frames that are in a recording; none before its first bytes are written."""
-    return GrownArchive(part).read()["numbers"] if part.exists() and part.stat().st_size else np.empty(0)
+    try:
+        return GrownArchive(part).read()["numbers"]
+    except (OSError, ValueError):
+        return np.empty(0)
 
 
-def test_a_kill_leaves_all_that_was_written(capture, tmp_path):
-    out, take = tmp_path / "live.npz", load_take(capture.with_suffix(".truth.npz"))
-    long = SimpleNamespace(
-        points=np.tile(take.points, (40, 1, 1)), ids=np.tile(take.ids, (40, 1)), rate=120.0
-    )
-    with ReplayServer(long) as server:
-        run = "import sys; from handsim.cli.main import main; main(sys.argv[1:])"
+@contextlib.contextmanager
+def recording(capture, out):
+    """The command in a process of its own, which records a stream that never ends, and what is on disk."""
+    run = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
         live = ["track", "--live", server.url, "--size", "M", "--out", str(out)]
-        process = subprocess.Popen([sys.executable, "-c", run, *live], stderr=subprocess.DEVNULL)
-        part = tmp_path / "live.npz.part"
+        process = subprocess.Popen([sys.executable, "-c", run, *live], stderr=subprocess.PIPE, text=True)
+        part = out.with_name(f"{out.name}.part")
         try:
             wait_for(lambda: len(_numbers_in(part)) > 60 or process.poll() is not None)
-            there = _numbers_in(part)
+            yield process, _numbers_in(part)
         finally:
             process.kill()
             process.wait()
-    assert os.listdir(tmp_path) == ["live.npz.part"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_recording_while_frames_arrive(number, capture, tmp_path):
+    with recording(capture, tmp_path / "live.npz") as (process, there):
+        process.send_signal(number)
+        _, said = process.communicate(timeout=LONG)
+    assert process.returncode == 0, said
+    assert os.listdir(tmp_path) == ["live.npz"]
+    numbers = load_take(tmp_path / "live.npz").numbers
+    assert len(there) > 60 and (np.diff(numbers) > 0).all()
+    np.testing.assert_array_equal(numbers[: len(there)], there)
+
+
+def test_a_kill_leaves_all_that_was_written(capture, tmp_path):
+    with recording(capture, tmp_path / "live.npz") as (process, there):
+        process.kill()
+    part = tmp_path / "live.npz.part"
+    assert os.listdir(tmp_path) == [part.name]
     with pytest.warns(CutOffWarning):
         numbers = load_take(part).numbers
     assert len(there) > 60 and (np.diff(numbers) > 0).all()
     np.testing.assert_array_equal(numbers[: len(there)], there)
+
+
+@pytest.fixture
+def interrupt():
+    """Sends a signal to this process once a condition holds and the command handles signals."""
+    threads = []
+
+    def send(number, condition):
+        before = signal.getsignal(number)
+
+        def when_it_holds():
+            try:
+                wait_for(lambda: condition() and signal.getsignal(number) is not before)
+            finally:
+                os.kill(os.getpid(), number)
+
+        threads.append(threading.Thread(target=when_it_holds, daemon=True))
+        threads[-1].start()
+
+    yield send
+    for thread in threads:
+        thread.join()
+
+
+def test_a_second_signal_keeps_the_recording(capture, tmp_path, capsys, monkeypatch, interrupt):
+    out, part, writes = tmp_path / "live.npz", tmp_path / "live.npz.part", threading.Event()
+
+    def slow(*_, **__):
+        writes.set()
+        time.sleep(LONG)
+
+    monkeypatch.setattr(Recorder, "finish", slow)
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
+        interrupt(signal.SIGINT, lambda: len(_numbers_in(part)) > 60)
+        interrupt(signal.SIGTERM, writes.is_set)
+        assert main(["track", "--live", server.url, "--size", "M", "--out", str(out)]) == 143
+    said = capsys.readouterr().err
+    assert said.endswith(f"\nhandsim track: ended by SIGTERM; the recording is kept in {part}\n")
+    assert os.listdir(tmp_path) == [part.name]
+    with pytest.warns(CutOffWarning):
+        assert load_take(part).num_frames > 60
+
+
+def test_a_signal_while_hands_are_awaited_leaves_nothing(capture, tmp_path, capsys, interrupt):
+    take = load_take(capture.with_suffix(".truth.npz"))
+    few = SimpleNamespace(points=take.points[:, :2], ids=take.ids[:, :2], rate=120.0)
+    with ReplayServer(few, loop=True) as server:
+        interrupt(signal.SIGTERM, lambda: server.sent > 10)
+        assert main(["track", "--live", server.url, "--out", str(tmp_path / "live.npz")]) == 143
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["waiting for hands, to measure their size", "handsim track: ended by SIGTERM"]
+    assert not os.listdir(tmp_path)
 
 
 def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):

@@ -78,7 +78,7 @@ def test_a_live_tracker_is_shown_and_recorded_and_frames_are_never_dropped(
         plain(self, frame, tracked)
 
     monkeypatch.setattr(live_view.LiveView, "offer", offer)
-    with ReplayServer(capture.with_suffix(".truth.npz")) as server:
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
         thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
         out = tmp_path / "take.npz"
         assert main(["view", "--live", server.url, "--size", "L", "--port", "0", "--out", str(out)]) == 0

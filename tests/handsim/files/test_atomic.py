@@ -2,13 +2,21 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from handsim.files.atomic import atomic_write, atomic_writes, temporary_beside
+from handsim.app.interrupts import Stopped, signals_raise
+from handsim.files.atomic import atomic_write, temporary_beside, written_together
+from handsim.files.signals import ENDING
+from tests.renames import fails_at
 
 
 def entries(folder: Path) -> list[str]:
@@ -89,18 +97,114 @@ def test_a_write_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
 
 def test_files_that_belong_together_come_together(tmp_path: Path) -> None:
     first, second = tmp_path / "a.trc", tmp_path / "b" / "a.npz"
-    with pytest.raises(OSError, match="full"), atomic_writes(first, second) as (one, two):
-        one.write_text("whole")
-        two.write_text("half")
-        raise OSError("full")
+    with pytest.raises(OSError, match="full"), written_together():
+        write(first, "whole")
+        with atomic_write(second) as two:
+            two.write_text("half")
+            raise OSError("full")
     assert entries(tmp_path) == ["b"] and entries(tmp_path / "b") == []
-    with pytest.raises(FileNotFoundError), atomic_writes(first, second) as (one, two):
-        one.write_text("whole")  # and nothing else
-    assert entries(tmp_path) == ["b"]
-    with atomic_writes(first, second) as (one, two):
-        one.write_text("whole")
-        two.write_text("whole")
+    with written_together():
+        write(first, "whole")
+        with written_together():
+            write(second, "whole")
+        assert not first.exists() and not second.exists(), "they wait for the outer block"
     assert first.read_text() == second.read_text() == "whole"
+    assert entries(tmp_path) == ["a.trc", "b"] and entries(tmp_path / "b") == ["a.npz"]
+
+
+def write(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text)
+
+
+@given(
+    old=st.lists(st.booleans(), min_size=2, max_size=4),
+    at=st.integers(0, 4),
+    number=st.sampled_from([None, *ENDING]),
+    links=st.booleans(),
+)
+def test_all_new_or_all_old(old: list[bool], at: int, number: int | None, links: bool) -> None:
+    """Whichever files were there, a rename fails or a signal comes at one of them."""
+    with tempfile.TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
+        folder = Path(name)
+        files = [folder / f"take.{kind}" for kind in ("c3d", "truth.npz", "trc", "html")[: len(old)]]
+        for file, is_there in zip(files, old, strict=True):
+            if is_there:
+                file.write_text(f"old {file.name}")
+        before = contents(folder)
+        fails_at(patch, at, number)
+        if not links:
+            patch.setattr(os, "link", refuse)
+        came: list[int] = []
+        handlers = {one: signal.signal(one, lambda one, _: came.append(one)) for one in ENDING}
+        try:
+            with suppress(OSError), written_together():
+                for file in files:
+                    write(file, f"new {file.name}")
+        finally:
+            for one, handler in handlers.items():
+                signal.signal(one, handler)
+        if at >= len(files) or number is not None:
+            assert contents(folder) == {file.name: f"new {file.name}" for file in files}
+            assert came == [number] * (at < len(files))
+        else:
+            assert contents(folder) == before and not came
+
+
+def refuse(source: object, target: object) -> None:
+    """As a file system without hard links."""
+    raise OSError(errno.EPERM, "Operation not permitted", str(source), None, str(target))
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {entry.name: entry.read_text() for entry in folder.iterdir()}
+
+
+def test_signals_wait_for_the_renames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fails_at(monkeypatch, 0, signal.SIGTERM)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Stopped) as caught, signals_raise(), written_together():
+        write(tmp_path / "a.trc", "new")
+        write(tmp_path / "a.npz", "new")
+    assert caught.value.number == signal.SIGTERM and signal.getsignal(signal.SIGTERM) is before
+    assert contents(tmp_path) == {"a.trc": "new", "a.npz": "new"}
+
+
+def test_one_file_that_is_replaced_outlives_a_signal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "a.trc", "old")
+    fails_at(monkeypatch, 0, signal.SIGINT)
+    with pytest.raises(Stopped), signals_raise():
+        write(tmp_path / "a.trc", "new")
+    assert contents(tmp_path) == {"a.trc": "new"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_what_a_process_that_was_killed_between_renames_left_is_removed(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from handsim.files.atomic import atomic_write, written_together\n"
+        "rename = os.replace\n"
+        "def last(source, target):\n"
+        "    rename(source, target)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "os.replace = last\n"
+        "with written_together():\n"
+        "    for name in sys.argv[1:]:\n"
+        "        with atomic_write(name) as temporary:\n"
+        "            temporary.write_text('newer')\n"
+    )
+    files = [tmp_path / "take.c3d", tmp_path / "take.truth.npz"]
+    for file in files:
+        write(file, "old")
+    done = subprocess.run([sys.executable, "-c", script, *map(str, files)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert [file.read_text() for file in files] == ["newer", "old"]
+    assert len(entries(tmp_path)) == 5, "a temporary file and two older ones"
+    with written_together():
+        for file in files:
+            write(file, "new")
+    assert contents(tmp_path) == {"take.c3d": "new", "take.truth.npz": "new"}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no modes")
@@ -142,9 +246,10 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path)
 
 
 def test_an_error_names_the_file_that_was_asked_for(tmp_path):
-    with pytest.raises(OSError) as caught, atomic_write(tmp_path / "take.c3d") as temporary:
-        raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
-    assert caught.value.filename == str(tmp_path / "take.c3d")
+    for named in (True, False):
+        with pytest.raises(OSError) as caught, atomic_write(tmp_path / "take.c3d") as temporary:
+            raise OSError(errno.ENOSPC, "No space left on device", *[str(temporary)] * named)
+        assert caught.value.filename == str(tmp_path / "take.c3d")
 
 
 def test_a_link_is_written_through(tmp_path):

@@ -36,6 +36,24 @@ def test_an_output_below_a_file_is_refused_before_the_work(tmp_path, monkeypatch
     check_outputs([], [tmp_path / "new" / "folder" / "x.npz"])
 
 
+def test_links_that_lead_nowhere_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "self.c3d").symlink_to("self.c3d")
+    (tmp_path / "one").symlink_to("two")
+    (tmp_path / "two").symlink_to("one")
+    (tmp_path / "gone").symlink_to("nothing")
+    for name, link in (("self.c3d", "self.c3d"), ("one/a.c3d", "one"), ("./two", "two")):
+        with pytest.raises(
+            ArgumentError, match=rf"{name} cannot be written: .*{link} is a link that leads to itself"
+        ):
+            check_outputs([], [tmp_path / name])
+    with pytest.raises(ArgumentError, match=r"gone is a link to a folder that is not there"):
+        check_outputs([], [tmp_path / "gone" / "a.c3d"])
+    check_outputs([], [tmp_path / "gone"])  # the file that it points to will be written
+    assert main(["label", "take.c3d", "--out", "self.c3d"]) == 1
+    assert "self.c3d is a link that leads to itself" in capsys.readouterr().err
+
+
 def test_commands_refuse_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "take.c3d").write_text("x")

@@ -60,7 +60,7 @@ def test_places_are_found_with_a_ruler_and_names_say_the_bone():
     layout = load_layout("tips8")
     search = search_of(layout)
     search.resize(11)
-    search.search(6.0, lambda worth: None)
+    search.search(3.0, lambda worth: None)
     found, old = search.layout, {marker.name: marker for marker in layout.markers}
     model = HandModel.named("M")
     for marker in found.markers:

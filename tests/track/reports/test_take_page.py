@@ -48,12 +48,18 @@ def written(folder: Path, take: Take, source: str = "my take.npz") -> tuple[str,
     return paths[0].read_text(encoding="utf-8"), tables
 
 
+@pytest.fixture(scope="module")
+def report(take, tmp_path_factory):
+    """The page on the take and its tables, written once."""
+    return written(tmp_path_factory.mktemp("report"), take)
+
+
 def numbers(rows: list[dict[str, str]], column: str) -> np.ndarray:
     return np.array([float(row[column] or "nan") for row in rows])
 
 
-def test_the_table_of_frames_has_the_numbers_of_the_take(take, tmp_path):
-    _, (frames, *_) = written(tmp_path, take)
+def test_the_table_of_frames_has_the_numbers_of_the_take(take, report):
+    _, (frames, *_) = report
     assert len(frames) == FRAMES * len(take.hands)
     for number, side in enumerate(take.sides):
         rows = [row for row in frames if row["hand"] == side]
@@ -67,8 +73,8 @@ def test_the_table_of_frames_has_the_numbers_of_the_take(take, tmp_path):
     assert np.isnan(angles).sum() == 0 and frames[2 * 25]["thumb_IP_flexion_deg"] == ""
 
 
-def test_the_range_of_motion_is_that_of_the_fitted_poses(take, tmp_path):
-    page, (_, joints, *_) = written(tmp_path, take)
+def test_the_range_of_motion_is_that_of_the_fitted_poses(take, report):
+    page, (_, joints, *_) = report
     fitted = np.r_[0:20, 30:FRAMES]  # neither coasting nor lost
     for number, side in enumerate(take.sides):
         rows = [row for row in joints if row["hand"] == side]
@@ -89,8 +95,8 @@ def test_the_range_of_motion_is_that_of_the_fitted_poses(take, tmp_path):
     assert "Over the 50 frames" in page and "<td>-25 to 95</td>" in page
 
 
-def test_markers_have_their_gaps_and_residuals(take, tmp_path):
-    _, (_, _, markers, _) = written(tmp_path, take)
+def test_markers_have_their_gaps_and_residuals(take, report):
+    _, (_, _, markers, _) = report
     for number, (hand, side) in enumerate(zip(take.hands, take.sides, strict=True)):
         rows = [row for row in markers if row["hand"] == side]
         assert [row["marker"] for row in rows] == list(hand.layout.names)
@@ -114,8 +120,8 @@ def test_markers_have_their_gaps_and_residuals(take, tmp_path):
             assert (longest >= 8).all(), "it was lost for eight frames"
 
 
-def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, tmp_path):
-    page, (*_, doubts) = written(tmp_path, take)
+def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
+    page, (*_, doubts) = report
     side = take.sides[0]
     (doubt,) = doubts
     assert (doubt["first_frame"], doubt["last_frame"]) == ("19", "32"), (

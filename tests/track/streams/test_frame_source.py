@@ -89,6 +89,25 @@ def test_it_ends_when_it_is_to_end_after_what_has_come():
     stream.close()
 
 
+@pytest.mark.parametrize("error", [None, OSError("bad file descriptor")])
+def test_it_ends_while_frames_keep_coming(error):
+    """Closed while it waits for the network, a source may fail; that is no failure of the stream."""
+    over = threading.Event()
+
+    class Endless(Listed):
+        def __iter__(self):
+            for number in itertools.count():
+                if error is not None and self.closed.is_set():
+                    raise error
+                yield frame(number)
+
+    stream = live(Endless(), ended=over.is_set)
+    assert next(stream).number == 0
+    over.set()
+    assert len(list(itertools.islice(stream, 10_000))) < 10_000, "what waits, and no more"
+    stream.close()
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [

@@ -377,6 +377,18 @@ def test_one_wild_time_does_not_end_a_stream():
         assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
 
 
+def test_a_stream_ends_while_frames_arrive():
+    ended = threading.Event()
+    with (
+        ReplayServer(twin(), rate=1000.0, loop=True) as server,
+        opened(server.url, ended=ended.is_set) as stream,
+    ):
+        list(itertools.islice(stream, 10))
+        ended.set()
+        end = time.monotonic() + LONG
+        assert all(time.monotonic() < end for _ in stream)
+
+
 def test_a_stream_ends_when_it_is_told_to():
     ended = threading.Event()
     with (

@@ -11,7 +11,6 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import starter_layout
-from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig
@@ -21,13 +20,13 @@ from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings import CaptureRecording, DatasetRecording, TakeRecording
 from track.viewer.stage import box_edges, camera_counts
 from train.data.shards import Dataset
+from train.simulation.generation import generate_dataset
 
 
 @pytest.fixture(scope="module")
 def training_set(tmp_path_factory):
     out = tmp_path_factory.mktemp("set") / "set"
-    assert main(["generate", "--glove", "sparse13", "--num-frames", "40", "--out", str(out), "--workers", "1",
-                 "--frames-per-hand", "16"]) == 0  # fmt: skip
+    generate_dataset(out, glove="sparse13", num_frames=40, frames_per_hand=16, workers=1)
     return out
 
 

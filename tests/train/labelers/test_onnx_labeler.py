@@ -93,7 +93,7 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
     labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(3)
     for size, side in itertools.product(("XS", "S", "M", "L", "XL"), ("right", "left")):
         model = HandModel.named(size, side=side)
-        markers, _ = attach("dense19", model).markers(sample_poses(model, 100, rng=rng))
+        markers, _ = attach("dense19", model).markers(sample_poses(model, 20, rng=rng))
         cloud = corrupt(markers, Corruption(occlude=5, ghosts=2), rng=rng)
         clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
     expected = load_labeler("dense19").label_frames(clouds)
@@ -101,7 +101,7 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
         np.array_equal(page["label"](cloud, *labeler), one.labels)
         for cloud, one in zip(clouds, expected, strict=True)
     ]
-    assert len(same) == 1000 and np.mean(same) >= 0.999
+    assert len(same) == 200 and np.mean(same) >= 0.995
 
 
 def test_damaged_files_are_told(exported, tmp_path):

@@ -14,11 +14,13 @@ import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.topology import BONES
+from tests.renames import fails_at
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
 from train.history import History
 from train.labeler_evaluation import Report
+from train.labelers.storage import CARD, WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
 from train.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.reports.model_card import MODEL_CARD
@@ -50,7 +52,12 @@ def run(dataset, tmp_path_factory):
     return out, train_labeler(dataset, out, SMALL)
 
 
-def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path):
+@pytest.fixture
+def without_pictures(monkeypatch):
+    monkeypatch.setattr("train.reports.run_page.picture", lambda size, draw: "data:,")
+
+
+def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path, without_pictures):
     told = []
     train_labeler(dataset, tmp_path / "run", dataclasses.replace(SMALL, samples=256), told=told.append)
     assert told[0] == "training set"
@@ -77,6 +84,20 @@ def test_a_run_has_a_model_card_of_what_was_trained(run):
     text = (out / MODEL_CARD).read_text("utf-8")
     assert text.startswith("---\nlicense: unknown\n")
     assert "400 of them, from `handsim generate` with\nseed 3, of which training saw 2,560 clouds" in text
+
+
+def test_weights_card_and_page_are_all_new_or_all_old(dataset, tmp_path, monkeypatch):
+    config = dataclasses.replace(SMALL, samples=256)
+    train_labeler(dataset, tmp_path, config)
+    names = [WEIGHTS, CARD, PAGE]
+    for name in names:
+        (tmp_path / name).write_text(f"older {name}")
+    with monkeypatch.context() as patch:
+        renamed = fails_at(patch, 3)
+        with pytest.raises(OSError, match=PAGE):
+            train_labeler(dataset, tmp_path, config)
+    assert [file.name for file in renamed] == [CHECKPOINT, *names]
+    assert [(tmp_path / name).read_text() for name in names] == [f"older {name}" for name in names]
 
 
 def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
@@ -110,7 +131,9 @@ def test_the_last_look_agrees_with_the_card(run):
     assert accuracies[-1][-1] == card["held_out_simulated"]["occlude 5, ghosts 2"]["slot_accuracy"]
 
 
-def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
+def test_looking_at_held_out_frames_leaves_the_training_alone(
+    dataset, run, tmp_path, monkeypatch, without_pictures
+):
     monkeypatch.setattr(TrainingState, "evaluate", lambda state, rows, names: None)
     train_labeler(dataset, tmp_path / "blind", SMALL)
     one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
