@@ -49,9 +49,9 @@ from render.frames import RenderedFrame
 from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
-from render.scenery.backgrounds import BackgroundConfig
+from render.scenery.backgrounds import Backgrounds
 
-FEW_BACKGROUNDS: Final = BackgroundConfig(plain=1, gradient=1, noise=0, clutter=0, room=0)
+FEW_BACKGROUNDS: Final = Backgrounds({"plain": 1, "gradient": 1})
 LEARNED, HELD_OUT = 1, 2  # seeds of the pictures
 SKINS: Final = (
     (60, 42, 34),

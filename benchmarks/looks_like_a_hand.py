@@ -40,7 +40,7 @@ from poses.shapes.validity import make_valid
 from render.formats.writer import open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import Background, BackgroundConfig
+from render.scenery.backgrounds import Background, Backgrounds
 from render.scenery.lights import Lighting, expose_for, sample_surroundings
 from render.sensors.exposure import ExposureConfig, sample_exposure
 from render.skin.look import TONES
@@ -58,8 +58,8 @@ POSES: Final[dict[str, tuple[str, ...]]] = {
 }
 VIEWS: Final = {"palm": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0), "edge": (0.0, -1.0, 0.0)}
 SETS: Final = {
-    "clean": BackgroundConfig(plain=1, gradient=1, noise=0, clutter=0, room=0),
-    "mixed": BackgroundConfig(plain=0, gradient=0, noise=1, clutter=1, room=2),
+    "clean": Backgrounds({"plain": 1, "gradient": 1}),
+    "mixed": Backgrounds({"noise": 1, "clutter": 1, "room": 2}),
 }
 FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way

@@ -11,19 +11,27 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from gloves.attachment import Attachment
     from gloves.captures.capture import Capture
     from gloves.captures.formats import read_capture, write_capture
-    from gloves.fit import GloveFit, attach
+    from gloves.fit import GlovedHand, GloveFit, attach
     from gloves.layout import MarkerLayout, MarkerPlace, load_layout
-    from gloves.takes.take import Take, load_take
+    from gloves.takes.points import PointList
+    from gloves.takes.status import Status
+    from gloves.takes.take import RigidBody, Take, load_take
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Attachment": "gloves.attachment",
         "Capture": "gloves.captures.capture",
         "GloveFit": "gloves.fit",
+        "GlovedHand": "gloves.fit",
         "MarkerLayout": "gloves.layout",
         "MarkerPlace": "gloves.layout",
+        "PointList": "gloves.takes.points",
+        "RigidBody": "gloves.takes.take",
+        "Status": "gloves.takes.status",
         "Take": "gloves.takes.take",
         "attach": "gloves.fit",
         "load_layout": "gloves.layout",
@@ -34,10 +42,15 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
+    "Attachment",
     "Capture",
     "GloveFit",
+    "GlovedHand",
     "MarkerLayout",
     "MarkerPlace",
+    "PointList",
+    "RigidBody",
+    "Status",
     "Take",
     "__version__",
     "attach",

@@ -15,17 +15,30 @@ if TYPE_CHECKING:
     from render.config import RenderConfig
     from render.drawing import draw
     from render.formats.merging import merge_renderings
-    from render.frames import RenderedFrame
+    from render.frames import BodyTruth, HandTruth, Pictures, RenderedFrame
+    from render.scenery.backgrounds import Backgrounds
+    from render.sensors.depth_noise import DepthSensor
+    from render.sensors.exposure import ExposureConfig
+    from render.sensors.shutter import ShutterConfig
     from render.session import render_take
     from render.skin.look import SkinLook
     from render.stream import PictureStream
+    from render.subject import PoseFile
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Backgrounds": "render.scenery.backgrounds",
+        "BodyTruth": "render.frames",
+        "DepthSensor": "render.sensors.depth_noise",
+        "ExposureConfig": "render.sensors.exposure",
+        "HandTruth": "render.frames",
         "PictureStream": "render.stream",
+        "Pictures": "render.frames",
+        "PoseFile": "render.subject",
         "RenderConfig": "render.config",
         "RenderedFrame": "render.frames",
+        "ShutterConfig": "render.sensors.shutter",
         "SkinLook": "render.skin.look",
         "ViewConfig": "render.cameras.viewpoints",
         "draw": "render.drawing",
@@ -35,9 +48,17 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
+    "Backgrounds",
+    "BodyTruth",
+    "DepthSensor",
+    "ExposureConfig",
+    "HandTruth",
     "PictureStream",
+    "Pictures",
+    "PoseFile",
     "RenderConfig",
     "RenderedFrame",
+    "ShutterConfig",
     "SkinLook",
     "ViewConfig",
     "__version__",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -14,8 +15,8 @@ from handsim.errors import ArgumentError
 from render.cameras.viewpoints import ViewConfig
 from render.frames import PASSES
 from render.painting.painter import PainterChoice, choose_painter
-from render.scenery.backgrounds import BackgroundConfig
-from render.sensors.depth_noise import DepthNoiseConfig
+from render.scenery.backgrounds import KINDS, Backgrounds
+from render.sensors.depth_noise import DepthSensor
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.skin.look import ALL_TONES, TONES, check_tones, hyphened, named_tones
@@ -24,6 +25,7 @@ NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
 """Depth sensor of rigs, and of others at a set distance of 0.6 m or more; it measures from 0.5 m on."""
+_AUTO: Final = "auto"  # in the place of a depth sensor
 _FAR: Final = 0.6  # [m] from the center of the hands
 
 
@@ -61,14 +63,14 @@ class RenderConfig:
     tones: tuple[float, ...] = ALL_TONES
     """Ranges of individual typology angles that skins are drawn from [deg], the ends of each one after the
     other; names of classes, as very-light, brown, stand for those of `render.skin.look.TONES`."""
-    background: BackgroundConfig = field(default_factory=BackgroundConfig)
-    """Shares of the kinds of background; a name of a kind or several, as `("room", "plain")`, are equal
-    shares."""
+    background: Backgrounds = field(default_factory=Backgrounds)
+    """Kinds of background and their shares, as `{"room": 3, "plain": 1}`, and beside them the folder `photos`
+    of photographs; names of kinds have equal shares, and what is not named has none."""
     vary: Literal["shard", "frame"] = "shard"
     """Whether light and background change with every shard or every frame; people change with every shard."""
-    depth_sensor: DepthNoiseConfig | Literal["auto"] | None = "auto"
-    """Sensors that add noise to depth; auto: one whose range fits the placement, see `NEAR_SENSOR`; None:
-    perfect depth alone."""
+    depth_sensor: DepthSensor | str | None = _AUTO
+    """Sensor that adds noise to depth, or its name; auto: one whose range fits the placement, see
+    `NEAR_SENSOR`; None: perfect depth alone."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
     """Exposure and noise of colors; None: perfect colors alone."""
     painter: PainterChoice = "auto"
@@ -77,6 +79,8 @@ class RenderConfig:
     """Motion blur and rolling shutters, which take a drawing per sub-frame; None: pictures of an instant."""
     every: int = 1
     """Step between the frames that are drawn."""
+    num_frames: int | None = None
+    """Number of these frames at most, spread evenly over the take; all when None."""
     frames_per_shard: int = 64
     """Frames that are written together."""
     seed: int = 0
@@ -87,8 +91,11 @@ class RenderConfig:
         if isinstance(self.passes, str):
             object.__setattr__(self, "passes", (self.passes,))
         check_type("tones", self.tones, (str, tuple, list), "names of skin tones", map(hyphened, TONES))
-        if isinstance(self.background, str | tuple | list):
-            object.__setattr__(self, "background", BackgroundConfig.of_kinds(self.background))
+        kinds = (Backgrounds, Mapping, str, tuple, list)
+        check_type("background", self.background, kinds, "kinds of background or their shares", KINDS)
+        object.__setattr__(self, "background", Backgrounds.of(self.background))
+        if isinstance(self.depth_sensor, str) and self.depth_sensor != _AUTO:
+            object.__setattr__(self, "depth_sensor", DepthSensor((self.depth_sensor,)))
         fill_settings(self)
         tones = (self.tones,) if isinstance(self.tones, str) else tuple(self.tones)
         if any(isinstance(tone, str) for tone in tones):
@@ -99,18 +106,20 @@ class RenderConfig:
         if not self.passes:
             raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
         check_count("every", self.every, 1)
+        if self.num_frames is not None:
+            check_count("num_frames", self.num_frames, 1)
         check_count("frames_per_shard", self.frames_per_shard, 1)
         check_count("seed", self.seed, 0)
 
     @property
-    def chosen_depth_sensor(self) -> DepthNoiseConfig | None:
+    def chosen_depth_sensor(self) -> DepthSensor | None:
         """`depth_sensor`, or in the place of auto the one that fits the placement."""
-        if self.depth_sensor != "auto":
+        if not isinstance(self.depth_sensor, str):
             return self.depth_sensor
         view = self.view
         set_far = view.distance is not None and view.distance[0] >= _FAR and view.placement != "head"
         far = view.cameras is None and (view.placement == "rig" or set_far)
-        return DepthNoiseConfig((FAR_SENSOR if far else NEAR_SENSOR,))
+        return DepthSensor((FAR_SENSOR if far else NEAR_SENSOR,))
 
     def settled(self) -> RenderConfig:
         """The same without auto: the painter of this machine, and the depth sensor of the placement."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
-from handsim._checks import check_type
+from handsim._checks import check_type, make_settings
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
 from handsim.space.cameras import CameraRig
@@ -46,7 +46,7 @@ def draw(
     camera: Cameras | None = None,
     frames: Iterable[int] | None = None,
     config: RenderConfig | None = None,
-    seed: int | None = None,
+    **settings: Any,
 ) -> Iterator[RenderedFrame]:
     """Draw frames of a take or poses of your own, in memory.
 
@@ -61,7 +61,7 @@ def draw(
             Without it, viewpoints are drawn as `RenderConfig.view` says.
         frames: Numbers of the frames; all that have a hand, every `RenderConfig.every`, when not given.
         config: What to draw.
-        seed: Seed of all random choices; the config's when not given.
+        settings: Settings of `RenderConfig` that differ from `config`, as `seed=1` or `background="room"`.
 
     Yields:
         Each frame once per camera: `rgb` (H, W, 3), `depth` (H, W) [m], `normals`, `ids`, and for each hand
@@ -70,20 +70,20 @@ def draw(
     Raises:
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
-    config = configured(config, camera, seed)
+    config = configured(config, camera, settings)
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
     drawing.check_view()
     return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
 
 
-def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | None) -> RenderConfig:
-    """A configuration with the camera and the seed that were named beside it."""
+def configured(
+    config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
+) -> RenderConfig:
+    """A configuration with the camera and the settings that were named beside it."""
     config = RenderConfig() if config is None else config
     check_type("config", config, RenderConfig, "a RenderConfig")
-    if seed is not None:
-        check_type("seed", seed, (int, np.integer), "a whole number")
-        config = dataclasses.replace(config, seed=int(seed))
+    config = make_settings(RenderConfig, "setting of a rendering", settings, default=config)
     if camera is None:
         return config
     if isinstance(camera, str):
@@ -124,7 +124,9 @@ class Drawing:
         """Numbers of frames as asked for; else those with a hand."""
         if frames is None:
             present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
-            return [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]
+            found = [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]
+            most = len(found) if self.config.num_frames is None else self.config.num_frames
+            return [found[n * len(found) // most] for n in range(most)] if most < len(found) else found
         check_type("frames", frames, Iterable, "numbers of frames")
         numbers = list(frames)
         for number in numbers:

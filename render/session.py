@@ -7,7 +7,7 @@ import functools
 import hashlib
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,7 @@ from handsim._checks import check_choice, check_type
 from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
@@ -40,9 +41,6 @@ from render.illustrations.contact_sheet import contact_sheet
 from render.scenery.photographs import photo_files
 from render.subject import Model, PoseFile, Source, load_subject, source_of
 
-Progress = Callable[[int, int], None]
-"""Called with the numbers of finished pictures and of all pictures: first with what is there already, then
-about every second, from a thread of its own."""
 SHEET: Final = "contact_sheet.png"
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
@@ -66,7 +64,8 @@ def render_take(
     glove: MarkerLayout | str | None = None,
     camera: Cameras | None = None,
     workers: int | Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
+    **settings: Any,
 ) -> int:
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
@@ -87,7 +86,9 @@ def render_take(
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
-        progress: Called while pictures are drawn.
+        progress: Called with the numbers of finished pictures and of all pictures: first with what is there
+            already, then about every second, from a thread of its own.
+        settings: Settings of `RenderConfig` that differ from `config`, as `seed=1` or `num_frames=100`.
 
     Returns:
         Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
@@ -100,7 +101,7 @@ def render_take(
     """
     check_type("formats", formats, (str, list, tuple), "names of formats", FORMATS)
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    config = configured(config, camera, None).settled()
+    config = configured(config, camera, settings).settled()
     _check_formats(formats, config)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
     if not isinstance(place, Path) and _RENAMES in formats:
@@ -116,9 +117,9 @@ def render_take(
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
-    settings = _settings(drawing, kept) | {"formats": list(formats)}
+    record = _settings(drawing, kept) | {"formats": list(formats)}
     with open_output(place) as output:
-        output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
+        output.claim(CONFIG, record, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
         drew = _draw_shards(output, formats, make, counts, workers, progress)
         output.fetch(INDEX, _LEFT_OUT.format("*"))
@@ -145,7 +146,7 @@ def _draw_shards(
     make: Make,
     counts: Sequence[int],
     workers: int | Executor,
-    progress: Progress | None,
+    progress: Progress,
 ) -> bool:
     """Have the shards drawn that are not there, each of a count of pictures; whether there were any."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
@@ -175,7 +176,7 @@ class _Telling:
         count: Pictures that are there already.
     """
 
-    def __init__(self, folder: Path, count: int, total: int, progress: Progress | None) -> None:
+    def __init__(self, folder: Path, count: int, total: int, progress: Progress) -> None:
         self._folder, self._count, self._total, self._progress = folder, count, total, progress
         self._told = -1
         self._lock, self._ended = threading.Lock(), threading.Event()
@@ -208,7 +209,7 @@ class _Telling:
         with self._lock:
             parts = [file.stat().st_size for file in self._folder.glob(_DRAWN.format("*")) if file.is_file()]
             count = min(self._count + sum(parts), self._total)
-            if self._progress is not None and count > self._told:
+            if count > self._told:
                 self._told = count
                 self._progress(count, self._total)
 
@@ -219,7 +220,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
     settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
-    if drawing.config.background.photo > 0.0:
+    if drawing.config.background.shares["photo"] > 0.0:
         files, _ = photo_files(Path(str(drawing.config.background.photos)))
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # they need not be text

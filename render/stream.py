@@ -29,7 +29,7 @@ from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.drawing import configured, open_studio, sample_choices
 from render.frames import HandTruth, RenderedFrame
 from render.labeled_photographs import cut_out, load_labeled_hands
-from render.sensors.depth_noise import DepthNoiseConfig
+from render.sensors.depth_noise import DepthSensor
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
 
@@ -149,9 +149,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             check_number(name, count, 0 if name == "start" else 1)
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
-        config = configured(config, None, seed)
+        config = configured(config, None, {} if seed is None else {"seed": seed})
         if config.depth_sensor == "auto":  # of a stream it measures near hands
-            config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
+            config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
         self.config = config.settled()
         self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)

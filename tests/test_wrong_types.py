@@ -42,7 +42,7 @@ VALID: dict[str, dict[str, object]] = {
     "train.generate_dataset": {"out": "set", "glove": "tips8", "rig": "six", "num_frames": 10, "seed": 0},
     "train.load_labeler": {"glove": "dense19"},
     "train.plan_rig": {"cameras": 2, "room": (2.4, 1.8, 2.2), "glove": "tips8", "seed": 0},
-    "train.score_rig": {"rig": "six", "glove": "tips8", "frames": 60, "seed": 0},
+    "train.score_rig": {"rig": "six", "glove": "tips8", "num_frames": 60, "seed": 0},
     "train.simulate_take": {"kind": "free", "glove": "tips8", "rig": "six", "num_frames": 2, "seed": 0},
     "train.train_labeler": {"dataset": "set", "out": "run"},
 }  # fmt: skip

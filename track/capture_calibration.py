@@ -9,15 +9,17 @@ from pathlib import Path
 
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
+from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import HandSimWarning
 from track.capture_tracking import record_frames
-from track.config import BOTH, Size, TrackerConfig
+from track.config import BOTH, Size
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands, check_scale
 from track.hand_size import sample_frames
-from track.setup import AnyHands, TrackerSetup, as_designed, found_user
+from track.settings import AnyHands, TrackSettings
+from track.setup import TrackerSetup, as_designed, found_user
 from track.streams.frame_source import checked_frames
-from track.take_calibration import CalibrationProgress, calibrate_take, kept_user, leaves_markers
+from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.tracker import Tracker
 from track.user import MEASURED, User
 
@@ -29,7 +31,8 @@ def calibrate(
     hands: AnyHands = BOTH,
     size: Size = "auto",
     labeler: AnyLabeler = None,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
+    on_step: OnStep = no_step,
 ) -> User:
     """Fit hands and gloves to their user, from any capture; one in which every joint moves tells most.
 
@@ -45,7 +48,8 @@ def calibrate(
         hands: Which hands may be in the capture; or hands to begin with, as `track_capture` takes them.
         size: The size to begin with: XS, S, M, L, XL, or auto, which measures it in the capture.
         labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
-        progress: Called with what is done, such as "frames", how much of it, and of how much.
+        progress: Called with what is done of a step, and all there is to do in it.
+        on_step: Called with the name of each step, such as "frames".
 
     Returns:
         The hands that are in the capture; its `calibrations` tell of each how it was found: `held_out`,
@@ -58,8 +62,12 @@ def calibrate(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    told = progress if progress is not None else _untold
-    setup = TrackerSetup.of(glove, hands, size, labeler, (), TrackerConfig())
+
+    def told(what: str, done: int, total: int) -> None:
+        on_step(what)
+        progress(done, total)
+
+    setup = TrackerSetup.of(TrackSettings(glove=glove, hands=hands, size=size, labeler=labeler))
     source = capture_of(capture)
     frames, user, network = checked_frames(source), setup.user, setup.labeler
     sample = sample_frames(frames)
@@ -84,7 +92,3 @@ def calibrate(
         if not one.is_better:
             warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
     return found
-
-
-def _untold(what: str, done: int, total: int) -> None:
-    """Nobody asks how far it is."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -17,6 +17,7 @@ import numpy as np
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimWarning
 from handsim.hand.topology import NUM_QPOS
 from track.association.initialization import FEWEST_POINTS
@@ -27,7 +28,8 @@ from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.hand_check import check_hands, check_scale
 from track.hand_size import sample_frames
-from track.setup import AnyHands, choose_user, found_user
+from track.settings import AnyHands
+from track.setup import choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_summary import no_points
 from train.glove_labeler import load_labeler
@@ -43,7 +45,7 @@ def label_capture(
     *,
     hands: AnyHands | None = None,
     labeler: AnyLabeler = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = no_progress,
 ) -> Take:
     """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
 
@@ -82,7 +84,10 @@ def label_capture(
     if is_measured:
         user = found_user(sample, layout, user.sides, network) or user
     check_hands(sample, user, network, options=("--glove",))
-    told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
+
+    def told(count: int) -> None:
+        progress(count, len(frames))
+
     present = np.isfinite(source.positions[..., 0])
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     settings["glove"] = str(glove) if isinstance(glove, str | Path) else layout.name

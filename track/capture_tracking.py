@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic, sleep
+from typing import Any
 
 import numpy as np
 
@@ -15,16 +16,16 @@ from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import CaptureError, HandSimWarning
-from track.bodies.body_file import AnyBody
 from track.calibration.frames import CalibrationError
-from track.config import BOTH, Size, TrackerConfig
 from track.corrected_take import correct_take
-from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.given import AnyCapture, capture_of
 from track.hand_size import sample_frames
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
-from track.setup import AnyHands, TrackerSetup, as_designed
+from track.settings import TrackSettings
+from track.setup import TrackerSetup, as_designed
 from track.sinks.addresses import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user
@@ -32,44 +33,31 @@ from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.user import MEASURED
 
-Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 
 
 def track_capture(
     capture: AnyCapture,
-    glove: AnyGlove | None = None,
+    settings: TrackSettings | None = None,
     *,
-    hands: AnyHands = BOTH,
-    size: Size = "auto",
-    labeler: AnyLabeler = None,
-    bodies: Sequence[AnyBody] = (),
-    config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     corrections: str | Path | None = None,
-    calibrate: bool = False,
     sinks: SinkGroup | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     on_frame: OnFrame | None = None,
+    **options: Any,
 ) -> Take:
     """Track the hands of a capture, as `handsim track` does.
 
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
-        glove: Marker layout, or its shipped name or the path of its .toml file; when not given that of
-            `hands`, or dense19 for hands that are measured.
-        hands: A user, hands in their gloves or the path of a user's file; or sides.
-        size: Size of hands of which only the sides are given: XS, S, M, L, XL, or auto, which measures it,
-            and the proportions, in the capture.
-        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
-        bodies: Rigid bodies beside the hands: templates, names of handsim's objects, or .toml files.
-        config: All settings of the tracker.
+        settings: How to track; as `TrackSettings()` when not given.
         corrections: A file of labels that a person corrected, as `handsim view` saves it beside a take.
-        calibrate: Track twice: hands are calibrated on the first take, as `track.calibrate` does it, and the
-            second is made with those that fit better so.
         sinks: Take every frame as it is tracked, from `open_sinks`; the capture is then played at its own
             rate.
         progress: Called after each frame with the number of tracked frames and of all frames.
         on_frame: Called with each frame, its time in [s], and what the tracker made of it.
+        options: Fields of `TrackSettings` that differ from `settings`, as `glove="dense19"`, `size="M"`,
+            `hands="user.json"`, `bodies=["mug"]` or `calibrate=True`.
 
     Returns:
         Poses (T, H, 27) [m, rad], labels (T, N) and status of every frame.
@@ -82,21 +70,21 @@ def track_capture(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    setup = TrackerSetup.of(glove, hands, size, labeler, bodies, config)
+    settings = TrackSettings.of(settings, options)
+    setup = TrackerSetup.of(settings)
     source = capture_of(capture)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     frames = checked_frames(source)
     is_measured = setup.is_measured
     setup = setup.measured(sample_frames(frames))
-    if calibrate:
+    if settings.calibrate:
         recorder = record_frames(frames, setup.tracker(), progress=progress)
         setup = _calibrated(recorder.take(source), setup, is_measured=is_measured)
     recorder = record_frames(frames, setup.tracker(), sinks, on_frame, progress)
     take = recorder.take(source)
-    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
-    settings = {**take.settings, **settings, **setup.settings}
+    named = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
-    take = dataclasses.replace(take, point_list=points, settings=settings)
+    take = dataclasses.replace(take, point_list=points, settings={**take.settings, **named, **setup.settings})
     return take if corrections is None else _corrected(take, Path(corrections), pins)
 
 
@@ -105,7 +93,7 @@ def record_frames(
     tracker: Tracker,
     sinks: SinkGroup | None = None,
     on_frame: OnFrame | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> TakeRecorder:
     """Track all frames; sinks take them at the capture's own rate."""
     recorder = TakeRecorder(tracker)
@@ -120,8 +108,7 @@ def record_frames(
         if on_frame is not None:
             on_frame(frame, tracked)
         recorder.add(frame, tracked)
-        if progress is not None:
-            progress(recorder.num_frames, len(frames))
+        progress(recorder.num_frames, len(frames))
     return recorder
 
 

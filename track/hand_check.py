@@ -19,6 +19,7 @@ from jaxtyping import Float
 from gloves.captures.plausibility import spacing
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
+from gloves.takes.status import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.topology import Side
 from track.association.hand_state import HandState
@@ -27,7 +28,6 @@ from track.association.point_groups import distances_to_nearest
 from track.given import designed_glove
 from track.hand_size import fit_size
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.glove_labeler import labeler_at_once
 from train.labelers.protocol import Labeler, Labeling

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
+from gloves.takes.status import Status
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
@@ -27,7 +28,7 @@ from track.calibration.solver import levenberg_marquardt, shared_covariance, use
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status, TrackedHand
+from track.tracked_frame import TrackedHand
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

@@ -300,8 +300,8 @@ def _status_line(
         if foreign := counts.get(_FOREIGN):
             return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
         return "no frames arrive; is the server playing?"
-    words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
-    words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
+    words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
+    words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]
     words += [f"RMS {1e3 * max(rms):.1f} mm"] if rms else []
     words += [str(now)] if str(now) else []

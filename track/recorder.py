@@ -20,7 +20,6 @@ from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL, POINTS
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.take import (
     RATED_FRAMES,
-    STATUSES,
     Take,
     keypoints_of,
     take_header,
@@ -34,10 +33,9 @@ from handsim.errors import ArgumentError, CaptureError
 from handsim.files.atomic import remove_abandoned
 from track.intake import FARTHEST, LATEST_TIME
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status, TrackedFrame
+from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 
-_NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
 _MOST_ID: Final = (1 << 31) - 1  # as takes store them; longer IDs keep their last bits
 
@@ -87,12 +85,12 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "times": np.array(frame.time),
         "numbers": np.array(frame.number),
         "qpos": np.array([hand.qpos for hand in hands]),
-        "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
+        "status": np.array([hand.status for hand in hands], dtype=np.int8),
         "rms": np.array([hand.rms for hand in hands]),
         "angle_spread": np.array([hand.angle_spread for hand in hands], dtype=np.float32),
         "keypoint_spread": np.array([hand.keypoint_spread for hand in hands], dtype=np.float32),
         "body_poses": np.array(poses).reshape(len(bodies), 7),
-        "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
+        "body_status": np.array([body.status for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
         "points": frame.points,
         "ids": np.where(frame.ids < 0, -1, frame.ids & _MOST_ID).astype(np.int32),

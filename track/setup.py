@@ -16,20 +16,19 @@ from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
-from track.bodies.body_file import AnyBody, load_bodies
+from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.hand_check import check_hands, check_scale
 from track.hand_size import fit_size, sample_frames
+from track.settings import AnyHands, TrackSettings
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
 from track.user import MEASURED, User, as_user, checked_sides, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
-AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
-"""A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""
 USUAL_GLOVE: Final = "dense19"
 USUAL_SIZE: Final = "M"
 """The size of hands that could not be measured."""
@@ -55,16 +54,8 @@ class TrackerSetup:
     """What makes a take, as JSON."""
 
     @classmethod
-    def of(
-        cls,
-        glove: AnyGlove | None,
-        hands: AnyHands,
-        size: Size,
-        labeler: AnyLabeler,
-        bodies: Sequence[AnyBody],
-        config: TrackerConfig,
-    ) -> Self:
-        """The setup that arguments of `track_capture` name.
+    def of(cls, settings: TrackSettings) -> Self:
+        """The setup that settings name.
 
         Raises:
             ArgumentError: Hands and size do not go together, a hand wears another glove, a size or a body is
@@ -73,12 +64,12 @@ class TrackerSetup:
             LayoutError: The glove is unknown, or does not fit a hand.
             WeightsError: The labeler is unknown, or knows other markers.
         """
-        user, is_measured = choose_user(glove, hands, size)
-        templates = load_bodies(bodies)
-        network = load_labeler(designed_glove(user.layout), labeler)
-        name = user.layout.name if glove is None or not isinstance(glove, str | Path) else str(glove)
-        settings = {"glove": name, "user": user.notes or str(user), "labeler": _name_of(labeler, name)}
-        return cls(user, is_measured, network, templates, config, settings)
+        user, is_measured = choose_user(settings.glove, settings.hands, settings.size)
+        templates = load_bodies(settings.bodies)
+        network = load_labeler(designed_glove(user.layout), settings.labeler)
+        record = settings.record()
+        record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}
+        return cls(user, is_measured, network, templates, settings.tracker, record)
 
     @property
     def fewest_points(self) -> float:
@@ -227,10 +218,3 @@ def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
             f"{', '.join(expected)}"
         )
     return user
-
-
-def _name_of(labeler: AnyLabeler, glove: str) -> str:
-    """What a take's settings call a labeler."""
-    if labeler is None:
-        return glove
-    return str(labeler) if isinstance(labeler, str | Path) else type(labeler).__name__

@@ -162,7 +162,7 @@ def _steps(side: Side, progress: CalibrationProgress | None) -> Progress | None:
     """The progress of one hand."""
     if progress is None:
         return None
-    return lambda step, rms, gap: progress(f"steps for the {side} hand", step, MOST_STEPS)
+    return lambda step, rms, gap: progress(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
 
 
 def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from gloves.takes.status import Status
 from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
-
-
-class Status(Enum):
-    """How far a hand's pose can be relied on."""
-
-    TRACKED = "tracked"
-    """It continues the pose of the frame before."""
-    INITIALIZED = "found"
-    """It was initialized from the points, without history."""
-    COASTING = "coasting"
-    """Too few markers are visible: the pose is the predicted one; it is given for a few frames only."""
-    LOST = "lost"
-    """There is no pose."""
-
 
 Spreads = tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]
 """Standard deviation of each joint angle [rad], and of each keypoint in each direction [m]."""

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from handsim._checks import check_type
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
@@ -32,7 +33,7 @@ from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.given import AnyLabeler, designed_glove
 from track.intake import IncomingFrame, Intake
-from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from track.tracked_frame import TrackedBody, TrackedFrame, TrackedHand
 from track.user import User, as_user
 from train.glove_labeler import load_labeler
 

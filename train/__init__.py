@@ -12,18 +12,19 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from train.config import TrainConfig
+    from train.config import CNNConfig, SetLabelerConfig, TrainConfig
     from train.data.augmentation import Cloud, Corruption, corrupt
     from train.data.cloud_stream import CloudStream
     from train.data.own_corruption import OwnCorruption
-    from train.data.shards import Dataset
+    from train.data.shards import Dataset, MappedRows
     from train.evaluate import evaluate_labeler
     from train.glove_labeler import load_labeler
     from train.labeler_evaluation import Report
     from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
+    from train.rig_advice.forecast import CameraLoss, ErrorEllipsoid, Forecast
     from train.rig_advice.planning import RigPlan, plan_rig
-    from train.rig_advice.rig_score import RigScore
+    from train.rig_advice.rig_score import RigScore, VolumeMap
     from train.rig_advice.scoring import score_rig
     from train.simulation.generation import generate_dataset
     from train.simulation.takes import simulate_take
@@ -31,17 +32,24 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "CNNConfig": "train.config",
+        "CameraLoss": "train.rig_advice.forecast",
         "Cloud": "train.data.augmentation",
-        "OwnCorruption": "train.data.own_corruption",
-        "Report": "train.labeler_evaluation",
-        "Labeling": "train.labelers.protocol",
         "CloudStream": "train.data.cloud_stream",
         "Corruption": "train.data.augmentation",
         "Dataset": "train.data.shards",
+        "ErrorEllipsoid": "train.rig_advice.forecast",
+        "Forecast": "train.rig_advice.forecast",
         "Labeler": "train.labelers.protocol",
+        "Labeling": "train.labelers.protocol",
+        "MappedRows": "train.data.shards",
+        "OwnCorruption": "train.data.own_corruption",
+        "Report": "train.labeler_evaluation",
         "RigPlan": "train.rig_advice.planning",
         "RigScore": "train.rig_advice.rig_score",
+        "SetLabelerConfig": "train.config",
         "TrainConfig": "train.config",
+        "VolumeMap": "train.rig_advice.rig_score",
         "corrupt": "train.data.augmentation",
         "evaluate_labeler": "train.evaluate",
         "generate_dataset": "train.simulation.generation",
@@ -54,17 +62,24 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
+    "CNNConfig",
+    "CameraLoss",
     "Cloud",
     "CloudStream",
     "Corruption",
     "Dataset",
+    "ErrorEllipsoid",
+    "Forecast",
     "Labeler",
     "Labeling",
+    "MappedRows",
     "OwnCorruption",
     "Report",
     "RigPlan",
     "RigScore",
+    "SetLabelerConfig",
     "TrainConfig",
+    "VolumeMap",
     "__version__",
     "corrupt",
     "evaluate_labeler",

@@ -73,7 +73,7 @@ def evaluate_labeler(
         )
     for one in takes:
         take = one if isinstance(one, Take) else load_take(one)
-        if take.is_tracked:
+        if take.made_by_tracker:
             raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
         if corruption != CLEAN or every > 1:
             raise CaptureError(

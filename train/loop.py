@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from lightning_fabric import Fabric
 
 from handsim._checks import check_type, make_settings
 from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare
+from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
 from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
@@ -25,7 +26,7 @@ from train.data.own_corruption import check_corruption
 from train.data.shards import Dataset, MappedRows, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric
-from train.devices.local_processes import Progress, Tell, in_local_processes
+from train.devices.local_processes import LossProgress, Tell, in_local_processes
 from train.devices.world import world_of
 from train.run_result import MOST_HELD_OUT, few, finish_run
 from train.threads import TrainingThreads, check_threads
@@ -44,8 +45,8 @@ def train_labeler(
     config: TrainConfig | None = None,
     *,
     threads: int | None = None,
-    progress: Callable[[int, int, float], None] | None = None,
-    told: Callable[[str], None] | None = None,
+    progress: Progress = no_progress,
+    on_step: OnStep = no_step,
     save_every: float = 60.0,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -65,8 +66,9 @@ def train_labeler(
         config: How to train; as the shipped labelers when not given.
         threads: Threads of each process on a CPU; one or all when not given, whichever a few steps show to be
             faster, and one on several devices. Weights differ in their last bits with it.
-        progress: Called after every step with samples done, samples expected and the loss.
-        told: Called with what is done beside the steps, such as "pose prior", when it begins.
+        progress: Called after every step with samples done and samples expected.
+        on_step: Called with what is done, such as "pose prior", when it begins; and after every step of
+            training with the loss.
         save_every: Time between checkpoints [s].
         settings: Settings of `TrainConfig` that differ from `config`: `samples=300_000`; `labeler="cnn"`
             stands for the settings that the paper's network is trained with.
@@ -84,15 +86,20 @@ def train_labeler(
     """
     check_type("out", out, (str, Path), "the path of a folder")
     config, out = _chosen_config(config, settings), Path(out)
+
+    def report(done: int, total: int, loss: float) -> None:
+        on_step(f"loss {loss:.3f}")
+        progress(done, total)
+
     if config.devices == 1 or world_of().size > 1:
         return _train(
-            dataset, config, out, threads=threads, progress=progress, told=told, save_every=save_every
+            dataset, config, out, threads=threads, progress=report, told=on_step, save_every=save_every
         )
     check_threads(threads)
     check_devices(config, config.devices, config.devices)
     checked = load_dataset(dataset)
     job = functools.partial(_train, checked, config, out, threads=threads, save_every=save_every)
-    card: dict[str, Any] = in_local_processes(job, config.devices, progress=progress, told=told)
+    card: dict[str, Any] = in_local_processes(job, config.devices, progress=report, told=on_step)
     return card
 
 
@@ -111,7 +118,7 @@ def _train(
     out: Path,
     *,
     threads: int | None,
-    progress: Progress | None,
+    progress: LossProgress | None,
     told: Tell | None,
     save_every: float,
 ) -> dict[str, Any]:
@@ -141,7 +148,7 @@ def _do_steps(
     run: _Run,
     chosen: TrainingThreads,
     checkpoint: Path,
-    progress: Progress | None,
+    progress: LossProgress | None,
     tell: Tell,
     save_every: float,
 ) -> None:

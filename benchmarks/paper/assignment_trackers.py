@@ -16,9 +16,10 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from handsim.errors import ArgumentError
 from handsim.kernels.integration import move, velocity_of
-from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from track.tracked_frame import TrackedFrame, TrackedHand
 
 NEAR: Final = 0.01
 """Upper bound of the distance of a new point from the predicted position of a lost marker [m]."""

@@ -109,9 +109,8 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
             dataset,
             run,
             config,
-            progress=lambda done, total, loss: bar.update(
-                task, completed=done, total=total, description=f"{kind} {name}, loss {loss:.3f}"
-            ),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            on_step=lambda step: bar.update(task, description=f"{kind} {name}, {step}"),
         )
 
 

@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
 from gloves.fit import GloveFit
-from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from gloves.takes.status import Status
+from track.tracked_frame import TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
 
 RADIUS: Final = 0.2

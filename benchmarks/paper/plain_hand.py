@@ -10,9 +10,10 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from handsim.hand.topology import NUM_QPOS
 from track.kinematics.pose_solver import PoseFit, PoseSolver
-from track.tracked_frame import Status, TrackedHand
+from track.tracked_frame import TrackedHand
 
 MOST_RMS: Final = 0.008
 """RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""

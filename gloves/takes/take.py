@@ -40,6 +40,7 @@ from gloves.takes.columns import (
 )
 from gloves.takes.formats import motion_format
 from gloves.takes.points import PointList
+from gloves.takes.status import Status
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending
@@ -47,15 +48,15 @@ from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
 from handsim.hand.shape import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.hand.topology import NUM_KEYPOINTS, Side
+from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import UpAxis
 
 SUFFIX: Final = ".truth.npz"
 """How the names of simulated takes end that lie beside their captures."""
-STATUSES: Final = ("lost", "coasting", "found", "tracked")
-"""Names of the status numbers as files hold them ("found": initialized); only a lost hand has no pose."""
-LOST, COASTING, INITIALIZED, TRACKED = range(4)
+STATUSES: Final = tuple(map(str, Status))
+"""Words of the status numbers, as files hold them; only a lost hand has no pose."""
+LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Frames of a stream that its rate is measured on."""
 _LARGEST: Final = 1e9  # [m], of anything
@@ -118,7 +119,7 @@ class Take:
     qpos: Float[np.ndarray, "T H 27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand has no pose."""
     status: Int[np.ndarray, "T H"]
-    """Indices into `STATUSES`; true poses are tracked."""
+    """Numbers of `Status`; true poses are tracked."""
     rms: Float[np.ndarray, "T H"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     point_list: PointList
@@ -128,7 +129,7 @@ class Take:
     body_poses: Float[np.ndarray, "T B 7"]
     """Position [m] and orientation (wxyz) in the world, NaN where a body has no pose."""
     body_status: Int[np.ndarray, "T B"]
-    """Indices into `STATUSES`."""
+    """Numbers of `Status`."""
     body_rms: Float[np.ndarray, "T B"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     settings: dict[str, Any]
@@ -347,9 +348,42 @@ class Take:
         return len(self.times)
 
     @property
-    def is_tracked(self) -> bool:
+    def made_by_tracker(self) -> bool:
         """Whether a tracker made it, whose labels may be wrong; its settings are among those of the take."""
         return "tracker" in self.settings
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the twenty joint angles of a hand, in their order in `qpos`."""
+        return JOINT_NAMES
+
+    def angles(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
+        """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        return dict(zip(JOINT_NAMES, self.qpos[:, self.hand(side), 7:].T, strict=True))
+
+    def angle_spreads(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
+        """The standard deviation of each joint's angle over time [rad]; NaN where it is not known.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        spread = self.angle_spread
+        if spread is None:
+            spread = np.full((*self.status.shape, NUM_JOINTS), np.nan, dtype=np.float32)
+        return dict(zip(JOINT_NAMES, spread[:, self.hand(side)].T, strict=True))
+
+    def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
+        """In which frames a hand's pose follows from the points; it coasts or is lost in the others.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        tracked: NDArray[np.bool_] = self.status[:, self.hand(side)] >= INITIALIZED
+        return tracked
 
     @property
     def sides(self) -> tuple[Side, ...]:

@@ -52,9 +52,8 @@ def calibrate(
             hands=hands,
             size=size,
             labeler=labeler,
-            progress=lambda what, done, total: bar.update(
-                task, description=what, completed=done, total=total
-            ),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            on_step=lambda what: bar.update(task, description=what),
         )
     user.save(out)
     print_line(f"{out}: {len(user)} hands in glove {glove}")

@@ -16,7 +16,7 @@ from handsim.app.progress import named_steps, print_above, progress_bar
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
 from train.data.shards import Dataset
-from train.reports.dataset_page import write_report
+from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
 from train.simulation.room_settings import SimulatedKind
@@ -66,6 +66,8 @@ def _report(config: DatasetConfig, out: Path) -> Path:
         )
         rig = as_rig(config.rig)
         if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
-            return write_report(Dataset(out))  # a small rig stands where hands of captures move
+            return write_dataset_page(
+                out / REPORT, Dataset(out)
+            )  # a small rig stands where hands of captures move
         take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=rig)
-        return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
+        return write_dataset_page(out / REPORT, Dataset(out), present=take.markers_present(), rate=take.rate)

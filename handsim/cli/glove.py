@@ -156,7 +156,7 @@ def score_glove(
     rig: str = "figure5",
     motion: str = "poses",
     out: Path | None = None,
-    frames: int = 1500,
+    num_frames: Annotated[int, tyro.conf.arg(aliases=["--frames"])] = 1500,
     labeler: str | None = None,
     captures: int = 3,
     seed: int = 0,
@@ -172,7 +172,7 @@ def score_glove(
         motion: What hands do: poses (random people and poses), twins (simulated motion of one hand and of
             two) or a take (.npz) of `handsim track` or `handsim simulate`.
         out: The page, an .html file; named after the glove when not given.
-        frames: Frames of hands, of a take those of each hand.
+        num_frames: Frames of hands, of a take those of each hand.
         labeler: Folder of a labeler trained on the layout, or an exported .onnx file; the network for any
             layout when not given.
         captures: Captures of each kind of work that are tried, of different people; 0 for none.
@@ -190,15 +190,15 @@ def score_glove(
             rig,
             motion=motion,
             labeler=labeler,
-            frames=frames,
+            num_frames=num_frames,
             captures=captures,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     _tell(score)
     for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
-    write_score_page(page, score, trained=labeler is not None)
+    write_score_page(page, score)
     print_line(f"{page}: the hand with its confusions, markers and joints")
 
 
@@ -276,7 +276,7 @@ def improve_glove(
             captures=captures,
             name=as_text(out.stem),
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     layout, found = improved.start, improved.layout
     found.save(out)

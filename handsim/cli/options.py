@@ -11,7 +11,7 @@ from handsim.hand.topology import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:
-    from track.setup import AnyHands
+    from track.settings import AnyHands
 
 
 def check_take_file(out: Path, *, live: bool) -> None:

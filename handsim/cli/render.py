@@ -14,7 +14,7 @@ from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import Place, place_of
 from handsim.app.progress import print_above, progress_bar
-from handsim.errors import HandSimError, choices
+from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from render.cameras.viewpoints import Placement, ViewConfig
@@ -22,9 +22,9 @@ from render.config import RenderConfig
 from render.formats.merging import merge_renderings
 from render.painting.painter import PainterChoice
 from render.pose_file import CSV
-from render.scenery.backgrounds import BackgroundConfig, BackgroundKind
+from render.scenery.backgrounds import BackgroundKind, Backgrounds
 from render.scenery.photographs import photo_files
-from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
+from render.sensors.depth_noise import DepthSensor
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
@@ -36,7 +36,16 @@ _AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
 _VIEW: Final = ViewConfig()
 _AS_IN_VIEW: Final = ("placement", "camera", "views", "share", "distance", "rig", "cameras")
-_AS_IN_CONFIG: Final = ("passes", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
+_AS_IN_CONFIG: Final = (
+    "passes",
+    "dress",
+    "vary",
+    "painter",
+    "every",
+    "num_frames",
+    "frames_per_shard",
+    "seed",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +96,8 @@ class RenderOptions:
     """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
     every: int = _DEFAULT.every
     """Step between the frames that are drawn."""
+    num_frames: int | None = _DEFAULT.num_frames
+    """Number of these frames at most, spread evenly over the take; all when not given."""
     frames_per_shard: int = _DEFAULT.frames_per_shard
     """Frames that are written together."""
     seed: int = _DEFAULT.seed
@@ -102,11 +113,18 @@ class RenderOptions:
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
             view=ViewConfig(**{name: getattr(self, name) for name in _AS_IN_VIEW}),
             tones=named_tones(self.tones) if self.tones else ALL_TONES,
-            background=BackgroundConfig.of_kinds(self.background, self.photos),
+            background=self._backgrounds(),
             depth_sensor=_sensors(self.depth_sensor),
             color_sensor=ExposureConfig() if self.color_sensor else None,
             shutter=ShutterConfig() if self.motion_blur else None,
         )
+
+    def _backgrounds(self) -> Backgrounds:
+        """Kinds in equal shares; without any, photographs where there is a folder, else the usual mixture."""
+        if not self.background and self.photos is None:
+            return Backgrounds()
+        photos = None if self.photos is None else str(self.photos)
+        return Backgrounds(dict.fromkeys(self.background or ("photo",), 1.0), photos)
 
 
 def render(
@@ -227,12 +245,9 @@ def _print_left_out(photos: Path) -> None:
         )
 
 
-def _sensors(names: tuple[str, ...]) -> DepthNoiseConfig | Literal["auto"] | None:
+def _sensors(names: tuple[str, ...]) -> DepthSensor | Literal["auto"] | None:
     if names == (_AUTO_SENSOR,):
         return "auto"
     if names == (_NO_SENSOR,) or not names:
         return None
-    for name in names:
-        if name not in SENSORS:
-            raise HandSimError(choices(name, (*SENSORS, _NO_SENSOR), noun="depth sensor"))
-    return DepthNoiseConfig(sensors=names)
+    return DepthSensor(names)

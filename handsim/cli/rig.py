@@ -172,7 +172,7 @@ def score_rig_file(
     glove: str | None = None,
     out: Path | None = None,
     json: Path | None = None,
-    frames: int = 900,
+    num_frames: Annotated[int, tyro.conf.arg(aliases=["--frames"])] = 900,
     seed: int = 0,
 ) -> None:
     """Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is recorded.
@@ -187,7 +187,7 @@ def score_rig_file(
             not given.
         out: The page, an .html file; named after the rig when not given.
         json: File for the figures.
-        frames: Frames of every person and kind of work, or of the take.
+        num_frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
     """
     cameras = load_rig(rig)
@@ -207,9 +207,9 @@ def score_rig_file(
             center=center,
             take=take,
             glove=glove,
-            frames=frames,
+            num_frames=num_frames,
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     _print(work_table(score))
     _print(camera_table(score))
@@ -273,7 +273,7 @@ def plan_rig(
             glove=glove,
             name=as_text(out.stem),
             seed=seed,
-            progress=step,
+            on_step=step,
         )
     table = Table("camera", box=None, pad_edge=False)
     table.add_column(Text("position [m]"), justify="right")

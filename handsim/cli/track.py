@@ -17,13 +17,13 @@ from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.atomic import written_together
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from track.config import Size, TrackerConfig
+from track.config import Size
 from track.tracked_frame import TrackedFrame
 
 if TYPE_CHECKING:
     from track.capture_tracking import OnFrame
     from track.live import LiveTake
-    from track.setup import AnyHands
+    from track.settings import TrackSettings
     from track.sinks.addresses import SinkGroup
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
@@ -79,13 +79,15 @@ def track(
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
     from track.live import track_live
+    from track.settings import TrackSettings
     from track.setup import TrackerSetup, warm_up
     from track.sinks.addresses import open_sinks
     from track.streams.frame_source import StreamedFrame
 
     _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
-    chosen, chosen_size = chosen_hands(shape, hands, size)
+    worn, worn_size = chosen_hands(shape, hands, size)
+    settings = TrackSettings(glove, worn, worn_size, labeler, body, calibrate)
     times: deque[float] = deque(maxlen=_TIMED)  # [s]
 
     def on_frame(frame: StreamedFrame, tracked: TrackedFrame) -> None:
@@ -93,12 +95,9 @@ def track(
 
     with open_sinks(send) as sinks:
         if capture is not None:
-            tracked = _track_file(
-                capture, out, labeled, glove, chosen, chosen_size, labeler, body, sinks, on_frame,
-                calibrate=calibrate,
-            )  # fmt: skip
+            tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
-            setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
+            setup = TrackerSetup.of(settings)
             with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
@@ -115,15 +114,9 @@ def _track_file(
     capture: Path,
     out: Path,
     labeled: Path | None,
-    glove: str | None,
-    hands: AnyHands,
-    size: Size,
-    labeler: str | None,
-    bodies: tuple[str, ...],
+    settings: TrackSettings,
     sinks: SinkGroup,
     on_frame: OnFrame,
-    *,
-    calibrate: bool,
 ) -> LiveTake:
     """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
     from gloves.captures.formats import write_capture
@@ -135,19 +128,14 @@ def _track_file(
     with progress_bar("frames") as (bar, task):
         take = track_capture(
             capture,
-            glove,
-            hands=hands,
-            size=size,
-            labeler=labeler,
-            bodies=bodies,
+            settings,
             corrections=corrections if corrections.exists() else None,
-            calibrate=calibrate,
             sinks=sinks,
             progress=lambda done, total: bar.update(
                 task,
                 completed=done,
                 total=total,
-                description="calibrating" if calibrate and done == total else "",
+                description="calibrating" if settings.calibrate and done == total else "",
             ),
             on_frame=on_frame,
         )

@@ -51,14 +51,14 @@ def _train(
             _train_silently(dataset, out, config, threads)
             return
         with progress_bar("samples") as (bar, task):
-
-            def report(done: int, total: int, loss: float) -> None:
-                bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
-
-            def name_step(step: str) -> None:
-                bar.update(task, description=step, refresh=True)
-
-            card = train_labeler(dataset, out, config, threads=threads, progress=report, told=name_step)
+            card = train_labeler(
+                dataset,
+                out,
+                config,
+                threads=threads,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+                on_step=lambda step: bar.update(task, description=step),
+            )
     except PeerError as error:  # another process has told it
         raise SystemExit(1) from error
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")

@@ -15,7 +15,7 @@ from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from track.config import Size, TrackerConfig
+from track.config import Size
 from track.network_address import LOOPBACK
 from track.viewer.server import address_of, opened_server
 
@@ -66,6 +66,7 @@ def view(
         time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
     """
     from handsim.cli.options import check_take_file, chosen_hands
+    from track.settings import TrackSettings
     from track.setup import USUAL_SIZE, TrackerSetup
     from track.viewer.contents import open_content
 
@@ -80,7 +81,10 @@ def view(
         if out is not None:
             check_take_file(out, live=True)
             check_outputs((shape, glove, labeler, rig, *body), (out,))
-        setup = TrackerSetup.of(glove, *chosen_hands(shape, hands, size), labeler, body, TrackerConfig())
+        worn, worn_size = chosen_hands(shape, hands, size)
+        setup = TrackerSetup.of(
+            TrackSettings(glove=glove, hands=worn, size=worn_size, labeler=labeler, bodies=body)
+        )
         _view_live(live, setup, host, port, rig, out)
         return
     content = open_content(

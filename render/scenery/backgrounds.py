@@ -7,8 +7,8 @@ picture.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -31,6 +31,7 @@ _STEEPEST: Final = 0.35  # slope of a backdrop against the picture's plane
 _SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
+_USUAL_SHARES: Final = {"plain": 0.1, "gradient": 0.1, "noise": 0.15, "clutter": 0.15, "room": 0.5}
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
 _OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # drawn at half of the picture's resolution
 _GAMMA: Final = 2.2
@@ -60,50 +61,42 @@ def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
 
 
 @dataclass(frozen=True, slots=True)
-class BackgroundConfig:
-    """Which backgrounds to draw, and how often each: shares, of any sum.
+class Backgrounds:
+    """Which kinds of background are drawn, and how often each.
 
     Raises:
-        HandSimError: A share is negative, none is positive, or photographs are requested without a folder.
+        HandSimError: A kind is unknown, a share is negative, none is positive, or photographs are asked for
+            without a folder.
     """
 
-    plain: float = 0.1
-    gradient: float = 0.1
-    noise: float = 0.15
-    clutter: float = 0.15
-    room: float = 0.5
-    photo: float = 0.0
+    shares: Mapping[str, float] = field(default_factory=lambda: dict(_USUAL_SHARES), hash=False)
+    """Share of each kind of `KINDS`, of any sum; a kind that is not named has none. A name, or several, have
+    equal shares."""
     photos: str | None = None
     """Folder of photographs, its subfolders included."""
 
     def __post_init__(self) -> None:
-        shares = self.shares()
-        if min(shares) < 0.0 or not sum(shares) > 0.0:
+        given = (self.shares,) if isinstance(self.shares, str) else self.shares
+        shares = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        for kind in shares:
+            check_choice(kind, KINDS, noun="background")
+        every = {kind: float(shares.get(kind, 0.0)) for kind in KINDS}
+        if min(every.values()) < 0.0 or not sum(every.values()) > 0.0:
             raise HandSimError(f"shares of backgrounds are {shares}, expected none negative and one positive")
-        if self.photo > 0.0 and self.photos is None:
+        if every["photo"] > 0.0 and self.photos is None:
             raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in")
+        object.__setattr__(self, "shares", every)
+        object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
 
     @classmethod
-    def of_kinds(cls, kinds: str | Sequence[str] = (), photos: str | Path | None = None) -> BackgroundConfig:
-        """Equal shares of some kinds of `KINDS`; of none, the usual mixture, or photographs where there are.
-
-        Args:
-            photos: Folder of photographs, its subfolders included.
-
-        Raises:
-            HandSimError: A kind is unknown, or photographs are requested without a folder.
-        """
-        chosen = (kinds,) if isinstance(kinds, str) else tuple(kinds)
-        folder = None if photos is None else str(photos)
-        if not chosen and folder is None:
-            return cls()
-        for kind in chosen:
-            check_choice(kind, KINDS, noun="background")
-        return cls(**{kind: float(kind in (chosen or ("photo",))) for kind in KINDS}, photos=folder)
-
-    def shares(self) -> tuple[float, ...]:
-        """The shares in the order of `KINDS`."""
-        return self.plain, self.gradient, self.noise, self.clutter, self.room, self.photo
+    def of(cls, given: Backgrounds | Mapping[str, Any] | str | Sequence[str]) -> Backgrounds:
+        """The backgrounds that a user names: kinds, or shares by kind and beside them the folder `photos`."""
+        if isinstance(given, Backgrounds):
+            return given
+        if not isinstance(given, Mapping):
+            return cls(given)  # type: ignore[arg-type]  # names are made shares
+        shares = {kind: share for kind, share in given.items() if kind != "photos"}
+        return cls(shares, given.get("photos"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,13 +115,13 @@ class Background:
     """What the hands' shadows fall on; None where the background is far away."""
 
 
-def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> Background:
+def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:
     """A random background.
 
     Raises:
         HandSimError: Photographs are requested, and the folder holds none that can be read.
     """
-    shares = np.array(config.shares())
+    shares = np.array(list(config.shares.values()))
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
     first, second = _color(rng), _color(rng)
     blur = float(rng.uniform(0.0, 0.01)) if kind in ("room", "clutter", "photo") else 0.0

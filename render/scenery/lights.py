@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from render.scenery.backgrounds import Background, BackgroundConfig, kept_background, sample_background
+from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
 from render.skin.look import SkinLook
 
 _MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
@@ -123,7 +123,7 @@ def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def sample_surroundings(
-    config: BackgroundConfig,
+    config: Backgrounds,
     skin: SkinLook | None,
     size: tuple[int, int] = _SIZE,
     *,

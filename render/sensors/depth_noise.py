@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice
+from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera, camera_matrix
@@ -48,16 +48,34 @@ _SENSORS: Final[dict[str, DepthNoise]] = {
 SENSORS: Final = tuple(_SENSORS)
 
 
+_OTHER_NAMES: Final = {"realsense_d435": "d435"}
+
+
 @dataclass(frozen=True, slots=True)
-class DepthNoiseConfig:
-    """Depth sensors to choose from, and the spread of copies of one."""
+class DepthSensor:
+    """A depth sensor whose noise is added to depth, or several, one of which is drawn each time.
+
+    Raises:
+        ArgumentError: A sensor is unknown, or a number is negative.
+    """
 
     sensors: tuple[str, ...] = ("kinect2",)
-    """One of them is drawn, see `SENSORS`; none: depth stays perfect."""
+    """Some of `SENSORS`; a name stands for itself alone."""
+    noise: float = 1.0
+    """Factor of the noise that was published of it."""
     spread: float = 0.2
     """Standard deviation of the logarithm of a copy's noise."""
     offset: float = 0.0035
     """Standard deviation of a time-of-flight camera's own offset [m]."""
+
+    def __post_init__(self) -> None:
+        given = (self.sensors,) if isinstance(self.sensors, str) else tuple(self.sensors)
+        names = tuple(_OTHER_NAMES.get(name, name) for name in given)
+        for name in names:
+            check_choice(name, SENSORS, noun="depth sensor")
+        for name in ("noise", "spread", "offset"):
+            check_number(name, getattr(self, name), 0.0)
+        object.__setattr__(self, "sensors", names)
 
 
 def named_sensor(name: str) -> DepthNoise:
@@ -66,17 +84,14 @@ def named_sensor(name: str) -> DepthNoise:
     return _SENSORS[name]
 
 
-def sample_depth_noise(config: DepthNoiseConfig, *, rng: np.random.Generator) -> DepthNoise | None:
-    """One copy of one of the sensors; None if there are none.
-
-    Raises:
-        ArgumentError: A sensor is unknown.
-    """
+def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> DepthNoise | None:
+    """One copy of one of the sensors; None if there are none."""
     sensors = [named_sensor(name) for name in config.sensors]
     if not sensors:
         return None
     noise = sensors[int(rng.integers(len(sensors)))]
-    louder, offset = float(np.exp(config.spread * rng.standard_normal())), float(rng.standard_normal())
+    louder = config.noise * float(np.exp(config.spread * rng.standard_normal()))
+    offset = float(rng.standard_normal())
     if isinstance(noise, StructuredLight):
         return dataclasses.replace(noise, disparity_noise=louder * noise.disparity_noise)
     c0, c1, c2 = (louder * c for c in noise.sigma)

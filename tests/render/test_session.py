@@ -21,7 +21,7 @@ from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import Drawing, draw
 from render.scenery.photographs import photo_files
-from render.sensors.depth_noise import DepthNoiseConfig
+from render.sensors.depth_noise import DepthSensor
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import TONES
 from render.subject import subject_of_take
@@ -177,7 +177,7 @@ def test_pictures_that_lack_a_hand_are_told(path, tmp_path):
 def test_depth_sensors_see_hands_of_all_tones_alike(path):
     seen = []
     for tone in ("very light", "dark"):
-        sensor, view = DepthNoiseConfig(("azure_kinect",)), ViewConfig(distance=(0.6, 0.8))
+        sensor, view = DepthSensor(("azure_kinect",)), ViewConfig(distance=(0.6, 0.8))
         config = dataclasses.replace(PLAIN, tones=TONES[tone], depth_sensor=sensor, view=view)
         frame = drawn(path, config)[0]
         hands = (frame.ideal.instances == 1) | (frame.ideal.instances == 2)

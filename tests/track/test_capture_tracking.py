@@ -14,6 +14,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from gloves.takes.take import (
     LOST,
     STATUSES,
@@ -31,7 +32,6 @@ from track.recorder import TakeRecorder
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
-from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

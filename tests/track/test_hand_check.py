@@ -54,7 +54,7 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     worn = simulate_take("free", glove=own, num_frames=FRAMES, hands="left", seed=4).capture()
     with pytest.warns(HandSimWarning, match="a left hand in glove 'mine.toml' better"):
-        track_capture(worn, "sparse13")
+        track_capture(worn, glove="sparse13")
 
 
 @pytest.mark.parametrize(

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
+from gloves.takes.status import Status
 from gloves.takes.take import LOST, STATUSES, TRACKED, RigidBody, Take, load_take
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.model import join_qpos
 from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from track.tracked_frame import TrackedBody, TrackedFrame, TrackedHand
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 
@@ -81,8 +82,7 @@ def pairs_of(take: Take) -> list[tuple[StreamedFrame, TrackedFrame]]:
     for row, time in enumerate(take.times.tolist()):
         own = points.of(row)
         status, pens = (
-            [Status(STATUSES[number]) for number in numbers[row]]
-            for numbers in (take.status, take.body_status)
+            [Status(number) for number in numbers[row]] for numbers in (take.status, take.body_status)
         )
         hand = partial(TrackedHand, markers=np.empty((0, 3)), filled=np.empty(0, dtype=int))
         hands = tuple(map(hand, take.sides, status, take.qpos[row], take.rms[row]))

@@ -117,7 +117,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
     class Killed(Exception):
         pass
 
-    def kill(done, total, loss):
+    def kill(done, total):
         if done == 1280:
             raise Killed
 

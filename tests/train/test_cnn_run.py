@@ -39,7 +39,7 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(dataset, tmp_path):
     class Stopped(Exception):
         pass
 
-    def stop(done, total, loss):
+    def stop(done, total):
         if done == 2 * CONFIG.batch:
             raise Stopped
 

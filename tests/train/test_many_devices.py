@@ -83,7 +83,7 @@ def check_same_run(run, other):
 def stop_at(samples):
     """A progress that interrupts this process, as Ctrl-C does."""
 
-    def progress(done, expected, loss):
+    def progress(done, expected):
         if done == samples:
             os.kill(os.getpid(), signal.SIGINT)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.takes.status import Status
 from gloves.takes.take import RigidBody
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
@@ -34,7 +35,6 @@ from track.bodies.constellation import (
     write_transform,
 )
 from track.bodies.constellation_search import search_constellation
-from track.tracked_frame import Status
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""

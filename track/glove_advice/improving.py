@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,6 +12,7 @@ import numpy as np
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, load_layout
 from handsim._checks import check_count, check_number
+from handsim.callbacks import OnStep, no_step
 from handsim.space.cameras import CameraRig, as_rig
 from track.given import AnyGlove
 from track.glove_advice.improvement import Improvement, Worth
@@ -51,7 +52,7 @@ def improve_glove(
     captures: int = CAPTURES,
     name: str = "improved",
     seed: int = 0,
-    progress: Callable[[str], None] = lambda step: None,
+    on_step: OnStep = no_step,
 ) -> ImprovedGlove:
     """Look for a better layout near a given one, as `handsim glove improve` does.
 
@@ -65,7 +66,7 @@ def improve_glove(
             `score_glove` tries one; 0 for none.
         name: Name of the new layout.
         seed: Seed of people, poses and tries.
-        progress: Called with the name of each step.
+        on_step: Called with the name of each step.
 
     Raises:
         ArgumentError: A number is out of range.
@@ -79,27 +80,25 @@ def improve_glove(
     check_count("captures", captures, 0)
     check_number("minutes", minutes, 0.0)
     check_count("seed", seed, 0)
-    progress("putting the glove on")
+    on_step("putting the glove on")
     search = Improvement(layout, cameras, kept, rng=np.random.default_rng(seed))
     before = search.worth
     search.resize(count)
-    search.search(60.0 * minutes, lambda worth: progress(str(worth)))
-    progress("dropping one marker at a time, to compare")
+    search.search(60.0 * minutes, lambda worth: on_step(str(worth)))
+    on_step("dropping one marker at a time, to compare")
     fewer = search.smaller(max(FEWEST_MARKERS, len(kept), count - _FEWER))
     found = dataclasses.replace(search.layout, name=name)
     trials = {
-        when: _tried(tried, cameras, captures, when, progress)
+        when: _tried(tried, cameras, captures, when, on_step)
         for when, tried in (("before", layout), ("after", found))
         if captures
     }
     return ImprovedGlove(layout, found, before, search.worth, fewer, trials)
 
 
-def _tried(
-    layout: MarkerLayout, rig: CameraRig, count: int, when: str, progress: Callable[[str], None]
-) -> dict[str, Trial]:
-    progress(f"learning the layout {when}, about a minute")
+def _tried(layout: MarkerLayout, rig: CameraRig, count: int, when: str, on_step: OnStep) -> dict[str, Trial]:
+    on_step(f"learning the layout {when}, about a minute")
     labeler = learned_labeler(layout, rig)
     return try_layout(
-        layout, rig, labeler, count=count, told=lambda words: progress(f"trying captures {when}: {words}")
+        layout, rig, labeler, count=count, told=lambda words: on_step(f"trying captures {when}: {words}")
     )

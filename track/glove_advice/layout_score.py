@@ -50,6 +50,8 @@ class LayoutScore:
     """Share of the frames in which left and right are told apart by the labeled markers."""
     trials: Mapping[str, Trial] = field(default_factory=dict)
     """What became of simulated captures of each kind of work; empty where none was tried."""
+    is_trained: bool = False
+    """Whether the labeler was trained on the layout; else it is the network for any layout."""
     seen_by: str = ""
     """Whose motion was seen by which rig, in words."""
     advice: tuple[str, ...] = ()

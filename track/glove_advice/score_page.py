@@ -34,7 +34,7 @@ _DOT: Final = 15.0  # [points]
 _MARKER: Final = 5.0
 
 
-def write_score_page(path: Path, score: LayoutScore, *, trained: bool = False) -> None:
+def write_score_page(path: Path, score: LayoutScore) -> None:
     """Write the page: one HTML file with its pictures inside."""
     layout, frames = score.layout, score.observed.num_frames
     sections = [
@@ -46,7 +46,7 @@ def write_score_page(path: Path, score: LayoutScore, *, trained: bool = False) -
     ]
     network = (
         "a labeler trained on it"
-        if trained
+        if score.is_trained
         else "the network for any layout, after a minute of learning this one"
     )
     lead = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +11,7 @@ import numpy as np
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_type
+from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.cameras import CameraRig, as_rig
 from track.given import AnyGlove, AnyLabeler
@@ -35,10 +35,10 @@ def score_glove(
     *,
     motion: Take | str | Path = _POSES,
     labeler: AnyLabeler = None,
-    frames: int = 1500,
+    num_frames: int = 1500,
     captures: int = CAPTURES,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda step: None,
+    on_step: OnStep = no_step,
 ) -> LayoutScore:
     """Score a layout as `handsim glove score` does; nothing is trained.
 
@@ -49,11 +49,11 @@ def score_glove(
             two), or a take or the path of one (.npz).
         labeler: A labeler trained on the layout, or what `load_labeler` reads; the network for any layout
             when not given.
-        frames: Frames of hands, of a take those of each hand.
+        num_frames: Frames of hands, of a take those of each hand.
         captures: Simulated captures of each kind of work that are labeled and tracked with nothing
             calibrated, of different people; 0 for none.
         seed: Seed of people, poses and cameras' losses; captures have their own.
-        progress: Called with the name of each step.
+        on_step: Called with the name of each step.
 
     Returns:
         Shares of labels that are right, standard deviations of joints [rad], what became of the captures, and
@@ -65,20 +65,22 @@ def score_glove(
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     layout, cameras = load_layout(glove), as_rig(rig)
-    check_count("frames", frames, _FEWEST_FRAMES)
+    check_count("num_frames", num_frames, _FEWEST_FRAMES)
     check_count("captures", captures, 0)
     check_count("seed", seed, 0)
     rng = np.random.default_rng(seed)
-    progress("simulating hands")
-    hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-    progress("learning the layout, about a minute the first time")
+    on_step("simulating hands")
+    hands, seen = _hands(motion, layout, cameras, num_frames, seed, rng)
+    on_step("learning the layout, about a minute the first time")
     known = learned_labeler(layout, cameras) if labeler is None else load_labeler(layout, labeler)
-    progress("labeling")
+    on_step("labeling")
     score = score_layout(layout, hands, known, rng=rng)
     trials = try_layout(
-        layout, cameras, known, count=captures, told=lambda words: progress(f"trying captures: {words}")
+        layout, cameras, known, count=captures, told=lambda words: on_step(f"trying captures: {words}")
     )
-    score = dataclasses.replace(score, trials=trials, seen_by=f"{seen}, seen by rig {cameras.name}")
+    score = dataclasses.replace(
+        score, trials=trials, is_trained=labeler is not None, seen_by=f"{seen}, seen by rig {cameras.name}"
+    )
     return dataclasses.replace(score, advice=tuple(advice(score)))
 
 

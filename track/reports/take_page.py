@@ -90,12 +90,12 @@ def _user(take: Take) -> str:
 
 
 def _summary_section(take: Take) -> Section:
-    told = suspicions(take) if take.is_tracked else []
+    told = suspicions(take) if take.made_by_tracker else []
     items = "".join(f"<li>{escape(line[0].upper() + line[1:])}</li>" for line in summarize(take))
     kind = (
         "Found: the frame in which a hand is initialized. Tracked: its pose follows from the frame before. "
         "Coasting: for up to a tenth of a second its pose is predicted. Lost: it has no pose."
-        if take.is_tracked
+        if take.made_by_tracker
         else "The take is not of a tracker: its poses and labels are what was simulated or given."
     )
     return Section("The take", f"{kind}<ul>{items}</ul>", notes=told)
@@ -104,7 +104,7 @@ def _summary_section(take: Take) -> Section:
 def _calibration_section(take: Take) -> Section:
     """Whether the hands are calibrated, and what that means for the angles; HTML."""
     notes = str(take.settings.get("user", ""))
-    if not take.is_tracked:
+    if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
     elif notes.startswith(MEASURED):
         text = "The hands are not calibrated: their size and proportions were measured in the capture. "

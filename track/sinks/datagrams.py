@@ -58,14 +58,14 @@ class OscEncoder:
             contents.append(("/handsim/lag", "f", [message.lag]))
         for hand in message.hands:
             address = f"/handsim/{hand.side}"
-            contents.append(_strings(f"{address}/status", [hand.status.value]))
+            contents.append(_strings(f"{address}/status", [str(hand.status)]))
             if hand.has_pose:
                 contents.append(_floats(f"{address}/wrist", hand.position, hand.quaternion))
                 contents.append(_floats(f"{address}/angles", hand.angles))
                 contents.append(_floats(f"{address}/positions", hand.positions.ravel()))
         for body in message.bodies:
             address = f"/handsim/body/{_part(body.name)}"
-            contents.append(_strings(f"{address}/status", [body.status.value]))
+            contents.append(_strings(f"{address}/status", [str(body.status)]))
             if body.has_pose:
                 contents.append(_floats(f"{address}/pose", body.position, body.quaternion))
         return self._bundle(contents)

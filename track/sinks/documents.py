@@ -80,7 +80,7 @@ def _hand(hand: LiveHand) -> dict[str, Any]:
     there = hand.has_pose
     return {
         "side": hand.side,
-        "status": hand.status.value,
+        "status": str(hand.status),
         "wrist": _pose(hand.position, hand.quaternion) if there else None,
         "angles": np.round(hand.angles, _DECIMALS).tolist() if there else None,
         "positions": np.round(hand.positions, _DECIMALS).tolist() if there else None,
@@ -96,7 +96,7 @@ def _numbers(values: Float[np.ndarray, "N"]) -> list[float] | None:
 
 def _body(body: LiveBody) -> dict[str, Any]:
     pose = _pose(body.position, body.quaternion) if body.has_pose else None
-    return {"name": body.name, "status": body.status.value, "pose": pose}
+    return {"name": body.name, "status": str(body.status), "pose": pose}
 
 
 def _pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> dict[str, list[float]]:

@@ -7,11 +7,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from gloves.takes.status import Status
 from handsim._extras import import_extra
 from track.sinks.message import SCHEMA, LiveHeader, LiveMessage
-from track.tracked_frame import Status
 
-STATUSES: Final = tuple(Status)
+STATUSES: Final = tuple(reversed(Status))
 """The value of a status channel is an index into these."""
 _AXES: Final = ("x", "y", "z")
 _POSE: Final = (*[(f"position_{axis}", "meters") for axis in _AXES], *[(f"rotation_{c}", "") for c in "wxyz"])
@@ -60,7 +60,7 @@ class LabStreamingSink:
         description = info.desc()
         description.append_child_value("manufacturer", "handsim")
         description.append_child_value("schema", str(SCHEMA))
-        description.append_child_value("statuses", " ".join(status.value for status in STATUSES))
+        description.append_child_value("statuses", " ".join(str(status) for status in STATUSES))
         listed = description.append_child("channels")
         for channel in channels:
             one = listed.append_child("channel")

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from gloves.takes.take import label_names
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from track.tracked_frame import TrackedFrame, TrackedHand
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""

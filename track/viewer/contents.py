@@ -128,7 +128,7 @@ def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector 
         return CaptureRecording(read_capture(path), rig), None
     if path.suffix.lower() == ".npz" or is_growing(path):
         take = load_take(path)
-        if is_growing(path) or not take.is_tracked:
+        if is_growing(path) or not take.made_by_tracker:
             return TakeRecording(take, rig), None
         corrector = Corrector(path, take)
         for sentence in told(corrections_path(path), corrector.unfitting):

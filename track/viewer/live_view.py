@@ -54,11 +54,11 @@ class LiveRecording(Recording):
         bodies = [np.concatenate([body.translation, body.rotation]) for body in tracked.bodies]
         count = len(frame.points)
         words = [
-            f"**{hand.side}** {hand.status.value}"
+            f"**{hand.side}** {hand.status}"
             + (f", RMS {1e3 * hand.rms:.2f} mm" if np.isfinite(hand.rms) else "")
             for hand in tracked.hands
         ]
-        words += [f"**{body.name}** {body.status.value}" for body in tracked.bodies]
+        words += [f"**{body.name}** {body.status}" for body in tracked.bodies]
         return ShownFrame(
             time=frame.time,
             words=(*words, f"{count} points", *tracked.notes),

@@ -27,7 +27,7 @@ _LOOK: Final = 0.2  # [s] between two looks for a signal
 _PATIENCE: Final = 5.0  # [s] that the other processes have when one has failed
 
 
-Progress = Callable[[int, int, float], None]
+LossProgress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
 Tell = Callable[[str], None]
 """Called with what is done beside the steps, when it begins."""
@@ -36,11 +36,13 @@ Tell = Callable[[str], None]
 class Job(Protocol):
     """What every process does; the first one's result counts."""
 
-    def __call__(self, *, progress: Progress, told: Tell) -> Any:
+    def __call__(self, *, progress: LossProgress, told: Tell) -> Any:
         """Do it, and report the progress; the result must survive a pipe."""
 
 
-def in_local_processes(job: Job, count: int, *, progress: Progress | None, told: Tell | None = None) -> Any:
+def in_local_processes(
+    job: Job, count: int, *, progress: LossProgress | None, told: Tell | None = None
+) -> Any:
     """Have each of some processes do a job together and return the result of the first.
 
     The environment tells each of them its number as torchrun does. A signal to end goes on to all of them.
@@ -87,7 +89,7 @@ def _terminate(started: ProcessContext) -> None:
 def _listen(
     pipes: list[tuple[Connection, Connection]],
     words: dict[int, Any],
-    progress: Progress | None,
+    progress: LossProgress | None,
     told: Tell | None,
 ) -> None:
     """Hand on the progress that there is, and keep the last word of each process."""

@@ -28,14 +28,14 @@ _LOW: Final = np.array([joint.low for joint in JOINTS])
 _HIGH: Final = np.array([joint.high for joint in JOINTS])
 
 
-def write_report(
-    dataset: Dataset, path: Path | None = None, *, present: Bool[np.ndarray, "T M"] | None = None,
-    rate: float = 120.0,
-) -> Path:  # fmt: skip
-    """Write the report of a training set: one HTML file with its pictures inside, complete or not at all.
+def write_dataset_page(
+    path: Path, dataset: Dataset, *, present: Bool[np.ndarray, "T M"] | None = None, rate: float = 120.0
+) -> Path:
+    """Write the page on a training set: one HTML file with its pictures inside, complete or not at all.
 
     Args:
-        path: The page; `report.html` in the set's folder when not given. An older one is replaced.
+        path: The page; an older one is replaced.
+        dataset: The set.
         present: Which markers a continuous take of this glove and rig holds, for the lengths of gaps; a
             training set's frames are independent and have none.
         rate: Frames per second of that take [Hz].
@@ -46,7 +46,6 @@ def write_report(
     Raises:
         DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
     """
-    path = dataset.path / REPORT if path is None else path
     rows, manifest = sample_rows(dataset), dataset.manifest
     sections = [
         _figures_section(dataset, rows),

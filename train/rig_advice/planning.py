@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim._checks import check_choice, check_count
+from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, CameraRig, as_rig
@@ -250,7 +251,7 @@ def plan_rig(
     glove: MarkerLayout | str | Path = GLOVE,
     name: str = "planned",
     seed: int = 0,
-    progress: Callable[[str], None] = lambda step: None,
+    on_step: OnStep = no_step,
 ) -> RigPlan:
     """Look for the best places of cameras, as `handsim rig plan` does.
 
@@ -267,7 +268,7 @@ def plan_rig(
         glove: Marker layout, or its shipped name or the path of its .toml file.
         name: Name of the rig.
         seed: Seed of people and motion.
-        progress: Called with the name of each step.
+        on_step: Called with the name of each step.
 
     Raises:
         ArgumentError: A number is out of range, or there is no room for so many cameras.
@@ -288,23 +289,23 @@ def plan_rig(
     candidates = [*old, *(one_of_new.at(pose) for pose in free.T_world_camera)]
     ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
     targets = np.array([*ahead, *free.targets])
-    progress("simulating hands")
+    on_step("simulating hands")
     rng = np.random.default_rng(seed)
     work = sample_work(layout, middle, sides, _FRAMES, _PEOPLE, rng=rng)
     scenes = [one.faster(_SKIPPED) for part in work.values() for one in part]
-    progress(f"what cameras at {len(free.targets)} places would see")
+    on_step(f"what cameras at {len(free.targets)} places would see")
     views = view_candidates(scenes, candidates, rng=rng)
     positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
     search = Planning(views, positions, range(len(old)))
     search.grow(cameras)
-    search.exchange(lambda value: progress(f"moving cameras: {value:.4f}"))
+    search.exchange(lambda value: on_step(f"moving cameras: {value:.4f}"))
     chosen = [candidates[number] for number in search.chosen]
     new = [
         dataclasses.replace(one, name=f"camera{number}")
         for number, one in enumerate(chosen[len(old) :], len(old) + 1)
     ]
     rig = CameraRig(name, [*old, *new])
-    progress("forecasting")
+    on_step("forecasting")
     fresh = sample_work(layout, middle, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
     before = None if kept is None else _forecast(fresh, kept, seed)
     return RigPlan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))

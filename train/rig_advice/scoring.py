@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_type
+from handsim.callbacks import OnStep, no_step
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig
 from train.rig_advice.rig_score import RigScore, score_work
 from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work, work_of_take
@@ -28,9 +29,9 @@ def score_rig(
     center: Sequence[float] | None = None,
     take: Take | str | Path | None = None,
     glove: MarkerLayout | str | Path | None = None,
-    frames: int = 900,
+    num_frames: int = 900,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda step: None,
+    on_step: OnStep = no_step,
 ) -> RigScore:
     """Score a rig as `handsim rig score` does; nothing is recorded.
 
@@ -42,9 +43,9 @@ def score_rig(
             given.
         glove: Marker layout, or its shipped name or the path of its .toml file; dense19 or that of the take
             when not given.
-        frames: Frames of every person and kind of work, or of the take.
+        num_frames: Frames of every person and kind of work, or of the take.
         seed: Seed of people, motion and cameras' losses.
-        progress: Called with the name of each step.
+        on_step: Called with the name of each step.
 
     Returns:
         Forecasts of all work, of each kind and without each camera, a map of the volume, and advice in
@@ -56,23 +57,23 @@ def score_rig(
         LayoutError, RigError: The glove or the rig is unknown.
     """
     cameras = as_rig(rig)
-    check_count("frames", frames, _FEWEST_FRAMES)
+    check_count("num_frames", num_frames, _FEWEST_FRAMES)
     check_count("seed", seed, 0)
     sides = checked_sides("volume", volume)
     middle = None if center is None else checked_center(center)
-    progress("simulating hands")
+    on_step("simulating hands")
     if take is None:
         middle = np.array(ROOM_CENTER) if middle is None else middle
         layout = load_layout(GLOVE if glove is None else glove)
-        work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=np.random.default_rng(seed))
+        work = sample_work(layout, middle, sides, num_frames, _PEOPLE, rng=np.random.default_rng(seed))
         told = f"simulated people in the glove {layout.name}"
     else:
         check_type("take", take, (Take, str, Path), "a Take, or the path of one")
         told = "a take" if isinstance(take, Take) else f"the take {Path(take).name}"
         given = take if isinstance(take, Take) else load_take(take)
-        work = work_of_take(given, None if glove is None else load_layout(glove), frames)
+        work = work_of_take(given, None if glove is None else load_layout(glove), num_frames)
         middle = _middle(work.values()) if middle is None else middle
-    progress("forecasting")
+    on_step("forecasting")
     return score_work(cameras, work, middle, sides, told=told, seed=seed)
 
 

@@ -8,7 +8,6 @@ import pickle
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +22,7 @@ from handsim._plugins import plugin_name
 from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
@@ -51,7 +51,6 @@ from train.simulation.training_frames import simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
 _SMALL: Final = 50_000_000  # bytes that no disk is asked for
-Progress = Callable[[int, int], None]
 """Called with frames done and frames expected."""
 
 
@@ -64,7 +63,7 @@ def generate_dataset(
     num_frames: int = 170_330,
     seed: int = 0,
     workers: int | Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = no_progress,
     **settings: Any,
 ) -> Dataset:
     """Make a training set, finish a stopped one, or let one grow.
@@ -108,7 +107,7 @@ def make_dataset(
     out: str | Place,
     *,
     workers: int | Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Manifest:
     """As `generate_dataset`.
 
@@ -198,7 +197,7 @@ def _make_shards(
     output: Output,
     num_markers: int,
     workers: int | Executor,
-    progress: Progress | None,
+    progress: Progress,
 ) -> None:
     """Have the shards made that are not there."""
     there = output.sizes()
@@ -209,8 +208,7 @@ def _make_shards(
         with interrupts_bare():
             for shard in run_jobs(job, todo, workers):
                 done += _shard_size(config, shard)
-                if progress is not None:
-                    progress(done, config.num_frames)
+                progress(done, config.num_frames)
     except KeyboardInterrupt as stop:
         kept = f"{done} of {config.num_frames} frames are in {output}"
         raise Stopped.again(stop, f"{kept}, and the same command goes on after them") from stop

@@ -11,9 +11,9 @@ from benchmarks.paper.assignment_trackers import GATE, NEAR, HungarianTracker, N
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from track.tracked_frame import Status
 from train.simulation.takes import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])

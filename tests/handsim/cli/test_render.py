@@ -14,8 +14,8 @@ from handsim.cli.render import RenderOptions
 from handsim.errors import HandSimError
 from render.config import RenderConfig
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import BackgroundConfig
-from render.sensors.depth_noise import DepthNoiseConfig
+from render.scenery.backgrounds import Backgrounds
+from render.sensors.depth_noise import DepthSensor
 from render.skin.look import TONES
 
 
@@ -46,7 +46,7 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
     assert dataclasses.astuple(config.view) == ("rig", "sr300", 2, 0.4, (0.5, 0.6), "eight", None)
     assert (config.passes, config.dress, config.tones) == (("depth",), "glove", (-52.0, 10.0))
-    assert config.background == BackgroundConfig(plain=1, gradient=0, noise=0, clutter=0, room=1)
+    assert config.background == Backgrounds({"plain": 1, "room": 1})
     assert (config.vary, config.painter, config.seed) == ("frame", "opengl", 7)
     assert (config.every, config.frames_per_shard) == (3, 5)
     assert config.depth_sensor is None and config.color_sensor is None
@@ -75,18 +75,18 @@ def test_named_tones_are_drawn_and_no_others(names: str, tones: tuple[float, ...
 
 
 def test_the_depth_sensor_fits_the_placement() -> None:
-    assert parsed("--placement", "head").settled().depth_sensor == DepthNoiseConfig(("d435",))
-    assert parsed("--placement", "orbit").settled().depth_sensor == DepthNoiseConfig(("d435",))
-    assert parsed("--distance", "0.6", "0.9").settled().depth_sensor == DepthNoiseConfig(("kinect2",))
-    assert parsed("--placement", "rig").settled().depth_sensor == DepthNoiseConfig(("kinect2",))
+    assert parsed("--placement", "head").settled().depth_sensor == DepthSensor(("d435",))
+    assert parsed("--placement", "orbit").settled().depth_sensor == DepthSensor(("d435",))
+    assert parsed("--distance", "0.6", "0.9").settled().depth_sensor == DepthSensor(("kinect2",))
+    assert parsed("--placement", "rig").settled().depth_sensor == DepthSensor(("kinect2",))
     given = parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1").settled()
-    assert given.depth_sensor == DepthNoiseConfig(("kinect2", "kinect1"))
+    assert given.depth_sensor == DepthSensor(("kinect2", "kinect1"))
 
 
 def test_photographs_alone_are_the_only_background() -> None:
     config = parsed("--photos", "folder")
     assert config.background.photos == "folder"
-    assert config.background.shares() == (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert [*config.background.shares.values()] == [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize(

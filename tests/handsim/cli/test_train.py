@@ -33,7 +33,7 @@ def config_of(dataset, tmp_path, monkeypatch):
     def config_of(*options: str) -> TrainConfig:
         configs = []
 
-        def keep(rows, out, config, *, threads, progress, told):
+        def keep(rows, out, config, *, threads, progress, on_step):
             configs.append(config)
             return {"held_out_simulated": {"random": {"accuracy": 1.0}}}
 

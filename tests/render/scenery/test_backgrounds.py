@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
-from render.scenery.backgrounds import KINDS, Background, BackgroundConfig, draw_background, sample_background
+from render.scenery.backgrounds import KINDS, Background, Backgrounds, draw_background, sample_background
 from render.scenery.photographs import photos_beside
 from render.scenery.rooms import draw_room
 
 SIZE = (160, 120)
-NOTHING = {"plain": 0.0, "gradient": 0.0, "noise": 0.0, "clutter": 0.0, "room": 0.0}
 
 
 @pytest.fixture
@@ -30,8 +29,8 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def only(kind: str, **more: str) -> BackgroundConfig:
-    return BackgroundConfig(**{**NOTHING, kind: 1.0}, **more)  # type: ignore[arg-type]
+def only(kind: str, **more: str) -> Backgrounds:
+    return Backgrounds({kind: 1.0}, **more)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "photo"])
@@ -61,7 +60,7 @@ def test_what_each_kind_is() -> None:
 
 
 def test_shares_are_kept(rng: np.random.Generator) -> None:
-    config = BackgroundConfig(plain=1.0, gradient=0.0, noise=3.0, clutter=0.0, room=0.0)
+    config = Backgrounds({"plain": 1.0, "noise": 3.0})
     kinds = [sample_background(config, rng=rng).kind for _ in range(400)]
     assert set(kinds) == {"plain", "noise"}
     assert 0.66 < kinds.count("noise") / 400 < 0.84
@@ -110,11 +109,11 @@ def test_folders_without_photographs_are_told(photos: Path, tmp_path: Path) -> N
 
 def test_impossible_configs_are_told() -> None:
     with pytest.raises(HandSimError, match="shares of backgrounds"):
-        BackgroundConfig(**NOTHING)
+        Backgrounds({"plain": 0.0})
     with pytest.raises(HandSimError, match="shares of backgrounds"):
-        BackgroundConfig(plain=-1.0)
+        Backgrounds({"plain": -1.0})
     with pytest.raises(HandSimError, match="`photos`"):
-        BackgroundConfig(photo=1.0)
+        Backgrounds({"photo": 1.0})
     with pytest.raises(HandSimError, match=r"unknown background .rom. .did you mean .room."):
         draw_background(Background("rom", ((0.1, 0.1, 0.1),) * 2, 0), SIZE)  # type: ignore[arg-type]
     gone = Background("photo", ((0.1, 0.1, 0.1),) * 2, 0, photo="/nowhere/a.jpg")  # type: ignore[arg-type]

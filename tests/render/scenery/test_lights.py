@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import HandSimError
-from render.scenery.backgrounds import BackgroundConfig
+from render.scenery.backgrounds import Backgrounds
 from render.scenery.lights import (
     Lamp,
     Lighting,
@@ -96,9 +96,7 @@ def test_a_dark_picture_gives_no_light_that_is_none() -> None:
 
 
 def test_surroundings_repeat() -> None:
-    first, again = (
-        sample_surroundings(BackgroundConfig(), None, rng=np.random.default_rng(3)) for _ in range(2)
-    )
+    first, again = (sample_surroundings(Backgrounds(), None, rng=np.random.default_rng(3)) for _ in range(2))
     assert first == again and len(first[1].surroundings) == 9
 
 

@@ -10,7 +10,7 @@ from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, pinhole
 from render.sensors.depth_noise import (
     SENSORS,
-    DepthNoiseConfig,
+    DepthSensor,
     apply_depth_noise,
     named_sensor,
     reflectance_of,
@@ -227,7 +227,7 @@ def test_flying_pixels_lie_between_and_only_at_edges():
 
 
 def test_sampling_is_plain_and_repeatable():
-    config = DepthNoiseConfig(sensors=SENSORS)
+    config = DepthSensor(sensors=SENSORS)
     kinds = set()
     for seed in range(12):
         noise, again = (sample_depth_noise(config, rng=np.random.default_rng(seed)) for _ in range(2))
@@ -235,12 +235,11 @@ def test_sampling_is_plain_and_repeatable():
         json.dumps(dataclasses.asdict(noise))
         kinds.add(noise.sensor)
     assert kinds == set(SENSORS)
-    assert sample_depth_noise(DepthNoiseConfig(sensors=()), rng=np.random.default_rng(0)) is None
+    assert sample_depth_noise(DepthSensor(sensors=()), rng=np.random.default_rng(0)) is None
 
 
 def test_mistakes_are_told():
-    rng = np.random.default_rng(0)
     with pytest.raises(ArgumentError, match="did you mean 'kinect2'"):
-        sample_depth_noise(DepthNoiseConfig(sensors=("kinect3",)), rng=rng)
+        DepthSensor("kinect3")
     with pytest.raises(ArgumentError, match="expected \\(240, 320\\)"):
         noisy(np.zeros((240, 321), np.float32), None, None)

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from gloves.takes.status import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from track.bodies.constellation import predict_pose, transform_markers, velocity_between
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
-from track.tracked_frame import Status
 from train.simulation.takes import simulate_take
 
 NAMES = ("controller", "ball", "box", "mug")

@@ -9,11 +9,12 @@ import pytest
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
+from gloves.takes.status import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from track.sinks import addresses
 from track.sinks.addresses import VALID, SinkGroup, open_sink, open_sinks
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from track.tracked_frame import TrackedFrame, TrackedHand
 
 SOURCE = """
 class Counter:

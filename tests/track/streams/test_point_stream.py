@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
+from gloves.takes.status import Status
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
@@ -25,7 +26,6 @@ from track.streams.live_stream import LiveStream
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import PointStream, open_stream
-from track.tracked_frame import Status
 from train.simulation.takes import simulate_take
 
 LOOPBACK = "127.0.0.1"

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gloves.fit import GloveFit
+from gloves.takes.status import Status
 from gloves.takes.take import Take
 from tests.track.tracker_input.fed_frames import (
     all_right,
@@ -19,7 +20,6 @@ from tests.track.tracker_input.fed_frames import (
     plain,
     statuses,
 )
-from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

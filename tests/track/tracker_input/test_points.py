@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves.takes.status import Status
 from tests.track.tracker_input.fed_frames import (
     SURE,
     Fed,
@@ -15,7 +16,6 @@ from tests.track.tracker_input.fed_frames import (
     plain,
     statuses,
 )
-from track.tracked_frame import Status
 
 
 def test_nothing_ever_comes(tracker, take):

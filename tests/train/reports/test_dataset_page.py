@@ -87,7 +87,7 @@ def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_pat
     assert "1,000 frames at 240 Hz. Of its 2 markers 2.50 % are missing, in 2 gaps" in section.text
     assert len(section.pictures) == 1
     assert report.gap_section(np.ones((9, 2), bool), 120.0).pictures == ()
-    page = report.write_report(dataset, tmp_path / "page.html", present=present, rate=240.0)
+    page = report.write_dataset_page(tmp_path / "page.html", dataset, present=present, rate=240.0)
     assert len(pictures(page)) == 5
 
 
@@ -116,7 +116,7 @@ def test_a_large_set_is_sampled_evenly_over_its_shards(dataset):
 
 
 def test_the_page_shows_the_sets_figures_and_is_the_same_every_time(dataset, tmp_path):
-    page = report.write_report(dataset, tmp_path / "one.html")
+    page = report.write_dataset_page(tmp_path / "one.html", dataset)
     text = page.read_text("utf-8")
     assert "<title>Training set small</title>" in text
     drawn = pictures(page)
@@ -138,7 +138,7 @@ def test_the_page_shows_the_sets_figures_and_is_the_same_every_time(dataset, tmp
         assert figure in text
     again = tmp_path / "two.html"
     again.write_text("an old report")
-    assert report.write_report(dataset, again).read_bytes() == page.read_bytes()
+    assert report.write_dataset_page(again, dataset).read_bytes() == page.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.html", "two.html"]
 
 

@@ -104,7 +104,7 @@ def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
     class Stopped(Exception):
         pass
 
-    def stop(done, total, loss):
+    def stop(done, total):
         if done in (896, 1792):
             raise Stopped
 

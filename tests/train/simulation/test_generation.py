@@ -26,7 +26,7 @@ from tests.rigs import mixed_rig
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
-from train.reports.dataset_page import write_report
+from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import frame_scenes, generation, people
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix
@@ -241,7 +241,7 @@ def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     dataset = Dataset(tmp_path / "set")
     assert as_rig(dataset.manifest.config["rig"]) == rig
     assert DatasetRecording(dataset).rig == rig
-    write_report(dataset)
+    write_dataset_page(dataset.path / REPORT, dataset)
     rig.save(tmp_path / "mixed.toml")  # the same cameras, whatever names them
     same = dataclasses.replace(config, rig=str(tmp_path / "mixed.toml"))
     make_dataset(same, tmp_path / "set", workers=1)
