@@ -28,6 +28,7 @@ VALID: dict[str, dict[str, object]] = {
     "handsim.load_rig": {"rig": "six"},
     "handsim.look_at": {"position": (0, 0, 1), "target": (0, 0, 0)},
     "handsim.sample_shape": {"side": "right", "rng": RNG},
+    "handsim.write_page": {"path": "page.html", "thing": None},
     "poses.load_gestures": {},
     "poses.sample_motion": {"model": "M", "duration": 0.1, "rng": RNG},
     "poses.sample_poses": {"model": "M", "num_poses": 1, "sampler": flat, "rng": RNG},

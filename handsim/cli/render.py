@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal, cast
 import tyro
 from rich.console import Console
 
+from handsim._checks import check_choice
 from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import Place, place_of
@@ -24,7 +25,7 @@ from render.painting.painter import PainterChoice
 from render.pose_file import CSV
 from render.scenery.backgrounds import BackgroundKind, Backgrounds
 from render.scenery.photographs import photo_files
-from render.sensors.depth_noise import DepthSensor
+from render.sensors.depth_noise import SENSORS, DepthSensor
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
@@ -250,4 +251,6 @@ def _sensors(names: tuple[str, ...]) -> DepthSensor | Literal["auto"] | None:
         return "auto"
     if names == (_NO_SENSOR,) or not names:
         return None
+    for name in names:
+        check_choice(name, (*SENSORS, _NO_SENSOR), noun="depth sensor")
     return DepthSensor(names)
