@@ -13,6 +13,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
+from jaxtyping import Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
@@ -37,7 +38,7 @@ from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
-_MOST_ID: Final = (1 << 31) - 1  # as takes store them; longer IDs keep their last bits
+_MOST_ID: Final = (1 << 31) - 1  # as takes store them
 
 
 class TakeRecorder:
@@ -93,10 +94,17 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "body_status": np.array([body.status for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
         "points": frame.points,
-        "ids": np.where(frame.ids < 0, -1, frame.ids & _MOST_ID).astype(np.int32),
+        "ids": _short_ids(frame.ids),
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
+
+
+def _short_ids(ids: Int[np.ndarray, "N"]) -> NDArray[np.int32]:
+    """IDs as a take stores them; those beyond 31 bits keep their last ones."""
+    if ids.max(initial=0) > _MOST_ID:
+        ids = np.where(ids < 0, -1, ids & _MOST_ID)
+    return ids.astype(np.int32)
 
 
 class Recorder:
@@ -169,9 +177,10 @@ class Recorder:
                     f"before, {last:g} s"
                 )
             values = frame_values(frame, tracked)
-            usable = np.abs(values["points"]).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not
+            usable = np.abs(values["points"]) < FARTHEST  # which NaN is not
             if not usable.all():
-                values |= {column.name: values[column.name][usable] for column in POINTS}
+                kept = usable.all(axis=1)
+                values |= {column.name: values[column.name][kept] for column in POINTS}
             keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
             self._archive.add({**values, KEYPOINTS.name: keypoints}, len(values["points"]))
         except OSError as error:
