@@ -51,8 +51,10 @@ def write_reference() -> None:
         package = importlib.import_module(name)
         lines = [f"# {name}", "", "```{eval-rst}", f".. automodule:: {name}", "   :no-members:", ""]
         for public in package.__all__:
-            if not public.startswith("__"):
-                lines += [f".. {_directive(getattr(package, public))}:: {name}.{public}", ""]
+            value = getattr(package, public)
+            owner = getattr(value, "__module__", name).partition(".")[0]
+            if not public.startswith("__") and owner == name:  # a name of two packages stands with its owner
+                lines += [f".. {_directive(value)}:: {name}.{public}", ""]
         _write(folder / f"{name}.md", [*lines, "```", ""])
 
 
