@@ -62,7 +62,7 @@ class TrackSettings:
         known = {one.name for one in dataclasses.fields(cls)}
         values = {name: value for name, value in record.items() if name in known}
         if "tracker" in values:
-            values["tracker"] = TrackerConfig(**values["tracker"])
+            values["tracker"] = make_settings(TrackerConfig, "setting of the tracker", values["tracker"])
         return cls(**values)
 
     def record(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import join_qpos
 from poses import sample_poses
-from render import RenderConfig, ViewConfig, draw
+from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw
 from render.cameras.viewpoints import PLACEMENTS, Viewpoints
 from render.drawing import open_studio
 from render.studio import Moment
@@ -51,6 +51,33 @@ def test_a_frame_does_not_depend_on_the_others(qpos):
     np.testing.assert_array_equal(alone.noisy.rgb, every[2].noisy.rgb)
     other = next(draw(qpos, model="M", config=config, seed=8, frames=[2]))
     assert (other.noisy.rgb != alone.noisy.rgb).any()
+
+
+def test_frames_are_spread_over_the_poses():
+    qpos = np.tile(np.eye(27)[3], (10, 1))
+    qpos[0, 3] = np.nan  # no hand is there
+    numbers = [frame.number for frame in draw(qpos, model=MODEL, camera=ABOVE, config=BARE, num_frames=3)]
+    assert numbers == [1, 4, 7]
+
+
+def test_settings_are_given_by_name_and_mixtures_whole(qpos):
+    assert RenderConfig(background={"plain": 1.0}).background.shares["room"] == 0.0
+    assert RenderConfig(background=("room", "plain")).background == Backgrounds({"room": 1, "plain": 1})
+    assert RenderConfig(depth_sensor="realsense_d435").depth_sensor == DepthSensor(("d435",))
+    loud, usual = (
+        next(
+            draw(
+                qpos, model=MODEL, camera=ABOVE, depth_sensor=DepthSensor("d435", noise=noise), passes="depth"
+            )
+        )
+        for noise in (5.0, 1.0)
+    )
+    off = [np.abs(frame.noisy.depth - frame.ideal.depth)[frame.noisy.depth > 0] for frame in (loud, usual)]
+    assert np.median(off[0]) > 2.0 * np.median(off[1])
+    with pytest.raises(ArgumentError, match="unknown setting of a rendering 'seeds'"):
+        draw(qpos, model=MODEL, seeds=3)
+    with pytest.raises(ArgumentError, match="unknown depth sensor 'lidar'"):
+        RenderConfig(depth_sensor="lidar")
 
 
 def test_angles_two_hands_several_cameras_and_missing_hands(qpos):

@@ -248,6 +248,20 @@ def test_parts_keep_their_times_and_numbers(take):
             take.cut(first, last)
 
 
+def test_angles_have_names_and_frames_a_status(take):
+    spread = np.linspace(0.0, 1.0, FRAMES * 40).reshape(FRAMES, 2, 20)
+    angles = take.angles("right")
+    assert tuple(angles) == take.joint_names and len(take.joint_names) == 20
+    np.testing.assert_array_equal(angles["index_PIP_flexion"], take.qpos[:, 1, 7 + 6])
+    assert np.isnan(take.angle_spreads("left")["thumb_CMC_flexion"]).all(), "not known"
+    known = dataclasses.replace(take, angle_spread=spread).angle_spreads("left")
+    np.testing.assert_allclose(known["thumb_CMC_flexion"], spread[:, 0, 1], rtol=1e-6)
+    np.testing.assert_array_equal(take.is_tracked("left"), take.status[:, 0] >= INITIALIZED)
+    assert not take.made_by_tracker
+    with pytest.raises(ArgumentError, match="unknown hand 'middle'"):
+        take.angles("middle")
+
+
 def test_what_does_not_fit_together_is_no_take(take):
     for change in (
         {"rate": 0.0},
