@@ -130,7 +130,9 @@ def main() -> None:
             table.setdefault(key, []).append(score(take, truth))
         if options.fit:
             evidence = evidence_of(take)
-            wrong = evidence.labels != truth[evidence.frames, evidence.columns]
+            points = take.point_list
+            true = truth[points.frames[evidence.points], points.columns[evidence.points]]
+            wrong = evidence.labels != true
             labeled.append((evidence.labeled, wrong[evidence.labels >= 0]))
             others.append((evidence.unlabeled, wrong[evidence.labels < 0]))
     figures: Figures = {}

@@ -50,5 +50,6 @@ def real_takes(data: Path, frames: int) -> Iterator[tuple[str, Take, np.ndarray]
             for frame in stream:
                 recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
             take = recorder.take(scene.capture())
-            take = dataclasses.replace(take, confidence=label_confidence(take))
+            sure = dataclasses.replace(take.point_list, confidence=label_confidence(take))
+            take = dataclasses.replace(take, point_list=sure)
             yield f"{folder.parent.name} {condition}", take, np.where(there, true_labels(scene), -1)
