@@ -44,7 +44,7 @@ def simulated_takes(options: argparse.Namespace) -> Iterator[tuple[str, Take, np
     make = label_capture if options.label else track_capture
     for glove, seed, kind in product(options.gloves, options.seeds, KINDS):
         truth = simulate(glove, kind, seed, options.frames)
-        yield f"{glove} {kind}", make(truth, glove), truth.labels
+        yield f"{glove} {kind}", make(truth, glove=glove), truth.labels
 
 
 def error_runs(take: Take, truth: np.ndarray) -> list[tuple[int, int]]:
