@@ -9,6 +9,8 @@ DEVELOPER := $(VENV)/.developer
 DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Two test processes whose matrices are small lose a third of their time to OpenBLAS's threads, which wait for one another.
+export OPENBLAS_NUM_THREADS ?= 1
 # Commands that tests start would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
