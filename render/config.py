@@ -25,7 +25,7 @@ NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
 """Depth sensor of rigs, and of others at a set distance of 0.6 m or more; it measures from 0.5 m on."""
-_AUTO: Final = "auto"  # in the place of a depth sensor
+_AUTO: Final = "auto"  # chooses the depth sensor by the placement of the camera
 _FAR: Final = 0.6  # [m] from the center of the hands
 
 

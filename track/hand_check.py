@@ -48,7 +48,7 @@ _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inche
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
 _WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
 _FAR_OFF: Final = 4.0  # times the distance between a glove's neighbors, on a flat hand, which no hand has
-_LEAST_SPACING: Final = 1e-9  # [m]
+_LEAST_SPACING: Final = 1e-9  # [m] between points, so that nothing is divided by zero
 _MOST_OWN: Final = 16  # gloves of the working folder that are tried
 
 

@@ -1,4 +1,4 @@
-"""The points of a take as they came: one list over all frames, and how many of them each frame has.
+"""The points of a take: one list over all frames, and the number of points of each frame.
 
 The size of the list goes with the number of points. A table with a row per frame is as wide as its fullest
 frame, so a single crowded frame, as when a camera sees the sun, can make it larger than memory.
@@ -164,14 +164,13 @@ class PointList:
         entries = {name: getattr(self, name)[~gone] for name in _PER_POINT}
         return dataclasses.replace(self, counts=counts, **entries)
 
-    def stored(self) -> dict[str, NDArray[Any]]:
-        """The arrays of a file; points of a stream have no columns there."""
-        columns = {} if self.is_in_order else {POINT_COLUMNS.name: self.columns}
-        return {
-            POINT_COUNTS.name: self.counts,
-            **{column.name: getattr(self, column.name) for column in POINTS},
-            **columns,
-        }
+    def stored(self) -> tuple[dict[str, NDArray[Any]], int | None]:
+        """The arrays of a file and the number of columns; points of a stream have no columns there."""
+        arrays = {POINT_COUNTS.name: self.counts}
+        arrays |= {column.name: getattr(self, column.name) for column in POINTS}
+        if self.is_in_order:
+            return arrays, None
+        return {**arrays, POINT_COLUMNS.name: self.columns}, self.num_columns
 
 
 _PER_POINT = (*(column.name for column in POINTS), "columns")

@@ -119,7 +119,7 @@ class Take:
     qpos: Float[np.ndarray, "T H 27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand has no pose."""
     status: Int[np.ndarray, "T H"]
-    """Numbers of `Status`; true poses are tracked."""
+    """The `Status` of each hand, as its number; true poses count as tracked."""
     rms: Float[np.ndarray, "T H"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     point_list: PointList
@@ -129,7 +129,7 @@ class Take:
     body_poses: Float[np.ndarray, "T B 7"]
     """Position [m] and orientation (wxyz) in the world, NaN where a body has no pose."""
     body_status: Int[np.ndarray, "T B"]
-    """Numbers of `Status`."""
+    """The `Status` of each rigid body, as its number."""
     body_rms: Float[np.ndarray, "T B"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     settings: dict[str, Any]
@@ -640,10 +640,11 @@ class Take:
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
         check_ending(Path(path), ".npz", option="path")
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
-        arrays |= self.point_list.stored()
+        points, num_columns = self.point_list.stored()
+        arrays |= points
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
-        header["num_columns"] = None if self.point_list.is_in_order else self.point_list.num_columns
+        header["num_columns"] = num_columns
         write_archive(Path(path), header, arrays)
 
     def _known(self) -> tuple[Column, ...]:
@@ -762,9 +763,9 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
 def _list_points(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """Replace the tables of points that files had until schema 3 by a list of points."""
     if POINT_COUNTS.name not in arrays:
-        points = PointList.of_tables(**{column.name: arrays[column.name] for column in POINTS})
-        arrays.update(points.stored())
-        header["num_columns"] = None if points.is_in_order else points.num_columns
+        tables = {column.name: arrays[column.name] for column in POINTS}
+        points, header["num_columns"] = PointList.of_tables(**tables).stored()
+        arrays.update(points)
 
 
 def _stored_points(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> PointList:

@@ -66,8 +66,7 @@ def _report(config: DatasetConfig, out: Path) -> Path:
         )
         rig = as_rig(config.rig)
         if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
-            return write_dataset_page(
-                out / REPORT, Dataset(out)
-            )  # a small rig stands where hands of captures move
+            # A small rig stands where the hands of a simulated capture would move.
+            return write_dataset_page(out / REPORT, Dataset(out))
         take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=rig)
         return write_dataset_page(out / REPORT, Dataset(out), present=take.markers_present(), rate=take.rate)

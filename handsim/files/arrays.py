@@ -30,7 +30,7 @@ _DAMAGE: Final = (
 
 
 class Member(NamedTuple):
-    """An array of an archive, which need not be in memory as a whole."""
+    """An array of an archive; it may be larger than memory, because it is given part by part."""
 
     name: str
     dtype: np.dtype[Any]

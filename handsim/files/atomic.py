@@ -115,7 +115,11 @@ def written_together() -> Iterator[None]:
 
 
 def _name(files: Mapping[Path, Path]) -> None:
-    """Rename temporary files, which come by their final names; all of them, or none."""
+    """Rename all temporary files, or none.
+
+    Args:
+        files: The temporary file of each final name.
+    """
     older: dict[Path, Path] = {}
     named: list[Path] = []
     with signals_wait():
