@@ -1,0 +1,235 @@
+"""`Settings`: the options of a verb, checked by their annotations wherever they come from.
+
+A verb has one frozen dataclass of them. It is the options of its command, the keyword arguments of its
+function, and the JSON beside its output.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import types
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from handsim._checks import check_choice, check_count, check_number, check_type, shown_value
+from handsim._plugins import plugin_name
+from handsim.errors import ArgumentError
+
+_UNIONS: Final = (Union, types.UnionType)
+_NO_CHANGE: Final[Mapping[str, Any]] = types.MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Bounds of a number, or of every number of a tuple: `Annotated[int, Limits(0)]`."""
+
+    low: float
+    high: float = np.inf
+    above: bool = False
+    """Whether `low` itself is refused."""
+    ascends: bool = False
+    """Whether the numbers of a tuple must not fall."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What errors say of a field of several types: `Annotated[A | str, Expected("an A, or its name")]`."""
+
+    words: str
+    names: Callable[[], Iterable[str]] = tuple
+    """The valid names."""
+
+
+class Settings:
+    """Base of the frozen dataclasses of settings.
+
+    Each field is checked by its annotation when an object is made: numbers by their `Limits`, names by their
+    `Literal`, other types by what they are, `Expected` telling errors what to say. A group of settings may be
+    given as a mapping of the fields that differ from its default, a tuple as a list or as its only item, a
+    path as a string.
+
+    Raises:
+        ArgumentError: A field has another type, is out of range, or is none of the valid names.
+    """
+
+    __slots__ = ()
+    noun: ClassVar[str] = "setting"
+    """What errors call a field that is unknown."""
+
+    def __post_init__(self) -> None:
+        hints = _hints(type(self))  # type: ignore[arg-type]  # a class is hashable
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            value = getattr(self, field.name)
+            checked = _checked(field.name, value, hints[field.name], field)
+            if checked is not value:
+                object.__setattr__(self, field.name, checked)
+        self.check()
+
+    def check(self) -> None:
+        """Refuse fields that contradict each other."""
+
+    @classmethod
+    def of(cls, settings: Self | None = None, options: Mapping[str, Any] = _NO_CHANGE) -> Self:
+        """Settings, or the usual ones, with some fields given by name.
+
+        Raises:
+            ArgumentError: It is no such object, a name is unknown, or a field is refused.
+        """
+        if settings is not None:
+            check_type("settings", settings, cls, f"a {cls.__name__}; its fields can be given by name")
+        known = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+        for name in options:
+            check_choice(name, known, noun=cls.noun)
+        return cls(**options) if settings is None else dataclasses.replace(settings, **options)  # type: ignore[type-var]
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> Self:
+        """The settings in a record, which may hold more than them.
+
+        What was given as an object is recorded by its name, and is the thing of that name here.
+        """
+        known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+        return cls(**{name: value for name, value in record.items() if name in known})
+
+    def record(self) -> dict[str, Any]:
+        """The settings as JSON, objects by their names."""
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return {field.name: _json_of(getattr(self, field.name)) for field in fields}
+
+
+def _json_of(value: Any) -> Any:
+    """A field's value as JSON; an object by its name."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Settings):
+        return value.record()
+    if isinstance(value, Mapping):
+        return {key: _json_of(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_json_of(item) for item in value]
+    name = getattr(value, "name", None)
+    return name if isinstance(name, str) else plugin_name(value)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | None = None) -> Any:
+    """A value as its annotation has it, or an error."""
+    limits, expected = None, None
+    while get_origin(hint) is Annotated:
+        hint, *extras = get_args(hint)
+        limits = next((one for one in extras if isinstance(one, Limits)), limits)
+        expected = next((one for one in extras if isinstance(one, Expected)), expected)
+    origin = get_origin(hint)
+    if origin in _UNIONS:
+        return _checked_union(name, value, get_args(hint), limits, expected, field)
+    if origin is Literal:
+        check_choice(value, get_args(hint), noun=name.replace("_", " "))
+        return value
+    if origin is tuple:
+        return _checked_tuple(name, value, get_args(hint), limits)
+    if hint in (int, float):
+        return _checked_number(name, value, hint, limits)
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        return _group_of(name, value, hint, field)
+    return _checked_object(name, value, hint, expected)
+
+
+def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None) -> Any:
+    """A value of one type; a path may be a string, and a protocol is anything that can be called."""
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if getattr(kind, "_is_protocol", False):
+        if not callable(value):
+            raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
+    elif isinstance(kind, type) and get_origin(kind) is None:
+        check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())
+    return value  # of a generic type, such as a sequence of several types, `check` of the class refuses some
+
+
+def _checked_union(
+    name: str,
+    value: Any,
+    arms: tuple[Any, ...],
+    limits: Limits | None,
+    expected: Expected | None,
+    field: dataclasses.Field[Any] | None,
+) -> Any:
+    """A value of one of several types."""
+    if value is None and types.NoneType in arms:
+        return None
+    others = [arm for arm in arms if arm is not types.NoneType]
+    if len(others) == 1:
+        return _checked(name, value, Annotated[others[0], limits, expected], field)
+    for arm in others:
+        try:
+            return _checked(name, value, Annotated[arm, limits], field)
+        except ArgumentError:
+            continue
+    words = " or ".join(_words(arm, None) for arm in others) if expected is None else expected.words
+    names = ", ".join(() if expected is None else expected.names())
+    told = f"{name} is {shown_value(value)}, expected {words}"
+    raise ArgumentError(f"{told}; valid names: {names}" if names else told)
+
+
+def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits | None) -> tuple[Any, ...]:
+    """A tuple of any length, or of a set one; a single string is a tuple of it."""
+    any_length = len(arms) == 2 and arms[1] is Ellipsis
+    items = (value,) if isinstance(value, str) and any_length else value
+    check_type(name, items, (tuple, list), "a tuple" if any_length else f"{len(arms)} values")
+    if not any_length and len(items) != len(arms):
+        raise ArgumentError(f"{name} is {shown_value(value)}, expected {len(arms)} values")
+    kinds = arms[:1] * len(items) if any_length else arms
+    found = tuple(
+        _checked(name, item, Annotated[kind, limits]) for item, kind in zip(items, kinds, strict=True)
+    )
+    if limits is not None and limits.ascends and list(found) != sorted(found):
+        raise ArgumentError(f"{name} is {shown_value(value)}, expected the smaller number first")
+    return found
+
+
+def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) -> Any:
+    if kind is int:
+        number = value.item() if isinstance(value, np.integer) else value
+        if limits is None:
+            check_type(name, number, int, "a whole number")
+        else:
+            check_count(name, number, int(limits.low), limits.high)
+        return number
+    bounds = Limits(-np.inf) if limits is None else limits
+    check_number(name, value, bounds.low, bounds.high, above=bounds.above)
+    return value
+
+
+def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
+    """A group of settings from the fields that differ from its default."""
+    known = [one.name for one in dataclasses.fields(kind) if one.init]
+    for change in changes:
+        check_choice(change, known, noun=f"setting of {name}")
+    usual = None
+    if field is not None and field.default_factory is not dataclasses.MISSING:
+        usual = field.default_factory()
+    return dataclasses.replace(usual, **changes) if isinstance(usual, kind) else kind(**changes)
+
+
+def _words(kind: Any, expected: Expected | None) -> str:
+    """What errors call a type."""
+    if expected is not None:
+        return expected.words
+    plain = {str: "a string", bool: "True or False", int: "a whole number", float: "a number", Path: "a path"}
+    if kind in plain:
+        return plain[kind]
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(str, get_args(kind)))}"
+    name = getattr(kind, "__name__", str(kind))
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"

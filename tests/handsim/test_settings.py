@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pytest
+
+from handsim.errors import ArgumentError
+from handsim.settings import Expected, Limits, Settings
+
+
+class Thing:
+    name = "a thing"
+
+
+@dataclass(frozen=True, slots=True)
+class Group(Settings):
+    noise: Annotated[float, Limits(0.0, above=True)] = 1.0
+    bits: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Options(Settings):
+    num_frames: Annotated[int, Limits(1)] = 1
+    kind: Literal["one", "two"] = "one"
+    hands: tuple[Literal["right", "left"], ...] = ("right", "left")
+    chances: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.5)
+    thing: Annotated[Thing | str | Path, Expected("a Thing, or its name", lambda: ("dense19",))] = "dense19"
+    out: Path | None = None
+    group: Group = field(default_factory=lambda: Group(bits=9))
+
+    def check(self) -> None:
+        if self.kind == "two" and self.num_frames < 2:
+            raise ArgumentError("kind is two and num_frames 1, expected two frames")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"num_frames": 0}, ("num_frames", "0", "at least 1")),
+        ({"num_frames": 1.5}, ("num_frames", "1.5", "whole number")),
+        ({"num_frames": True}, ("num_frames", "True", "whole number")),
+        ({"kind": "tow"}, ("kind", "tow", "two", "one")),
+        ({"kind": "two"}, ("two frames",)),
+        ({"hands": ("up",)}, ("hands", "up", "right, left")),
+        ({"hands": 5}, ("hands", "5", "tuple")),
+        ({"chances": (0.5, 0.25)}, ("chances", "0.5", "smaller")),
+        ({"chances": (0.5,)}, ("chances", "2 values")),
+        ({"chances": (0.5, np.nan)}, ("chances", "nan", "0 to 1")),
+        ({"thing": 5}, ("thing", "5", "a Thing, or its name", "dense19")),
+        ({"out": 5}, ("out", "5", "path")),
+        ({"group": 5}, ("group", "5", "Group")),
+        ({"group": {"nose": 5}}, ("group", "nose", "noise")),
+        ({"group": {"noise": 0.0}}, ("noise", "0", "above 0")),
+        ({"frames": 5}, ("frames", "num_frames")),
+    ],
+)
+def test_a_mistake_ends_in_a_sentence_that_names_it(options, words):
+    with pytest.raises(ArgumentError) as told:
+        Options.of(None, options)
+    assert all(word in str(told.value) for word in words), str(told.value)
+
+
+def test_what_is_given_simply_becomes_what_the_annotation_says():
+    options = Options(num_frames=np.int64(3), hands="left", chances=[0.0, 1.0], out="a", group={"noise": 2})
+    assert options.hands == ("left",)
+    assert options.chances == (0.0, 1.0)
+    assert options.out == Path("a")
+    assert options.group == Group(2, 9)  # the mapping says what differs from the field's default
+    assert type(options.num_frames) is int
+
+
+def test_settings_come_back_from_their_record():
+    options = Options(num_frames=7, hands=("left",), out=Path("a"), group=Group(2.0))
+    record = json.loads(json.dumps(options.record()))
+    assert Options.from_json({**record, "more": 1}) == options
+    assert Options(thing=Thing()).record()["thing"] == "a thing"
+
+
+def test_options_change_settings():
+    assert Options.of(Options(num_frames=7), {"kind": "two"}) == Options(num_frames=7, kind="two")
+    with pytest.raises(ArgumentError, match="settings is {.num_frames.: 7}"):
+        Options.of({"num_frames": 7})
