@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _WRITERS: Final = {
     "gloves.takes.take.Take": "track.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
-    "track.glove_advice.glove_score.LayoutScore": "track.glove_advice.score_page:write_score_page",
+    "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
 INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"

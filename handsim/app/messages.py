@@ -6,12 +6,15 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final, TextIO
+from typing import TYPE_CHECKING, Final, TextIO
 
 from handsim._closing import Closing
 from handsim.errors import HandSimWarning
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
 _PRINTED: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
@@ -24,6 +27,23 @@ def print_line(line: str) -> None:
 
     printable = line.encode("utf-8", "backslashreplace").decode("utf-8")
     Console().print(printable, highlight=False, soft_wrap=True, markup=False)
+
+
+def print_table(
+    rows: Sequence[Sequence[str | Text]], *, left: int = 1, wraps: bool = False, title: str | None = None
+) -> None:
+    """Print rows of cells, the header first; the first columns, `left` of them, are words, others numbers."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, title=None if title is None else Text(title))
+    for number, column in enumerate(rows[0]):
+        justify = "left" if number < left else "right"
+        table.add_column(Text(column) if isinstance(column, str) else column, justify=justify, no_wrap=not wraps)
+    for row in rows[1:]:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    Console().print(table)
 
 
 @contextmanager

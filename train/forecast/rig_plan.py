@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
-from gloves.layout import MarkerLayout, list_layouts, load_layout
+from gloves.layout import load_layout
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim._checks import check_array, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
-from handsim.settings import Expected, Limits, Settings
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.cameras import (
     FEWEST_CAMERAS,
@@ -29,16 +27,13 @@ from handsim.space.cameras import (
     ROOM_CENTER,
     CameraRig,
     as_rig,
-    list_rigs,
 )
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
-from train.forecast.rig_score import LONGEST_SIDE
+from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
 
-Mount = Literal["walls", "truss", "tripods"]
-MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)
 _MOST: Final = 400  # places; the step between them grows with the room
 _STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # between places [m]
 _OFF: Final = 0.1  # distance of a lens from wall, ceiling or beam [m]
@@ -63,39 +58,6 @@ _PEOPLE: Final = 3  # of each kind of work
 _FRAMES: Final = 900  # of each
 _SKIPPED: Final = 12  # every so many frames count
 _JUDGED: Final = 600  # frames of a person that the plan did not see
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class PlanRigSettings(Settings):
-    """For what a rig is planned: options of `handsim rig plan`, arguments of `plan_rig`."""
-
-    mounts: tuple[Mount, ...] = MOUNTS
-    """What cameras can hang on: walls, a truss along the room's edges (four beams above and four posts),
-    tripods."""
-    volume: Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)] = (0.6, 0.6, 0.6)
-    """Sides of the space that hands work in [m]."""
-    center: Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)] = ROOM_CENTER
-    """Its middle [m]."""
-    keep: Annotated[
-        CameraRig | str | Path | None, Expected("a CameraRig, or the name or path of one", list_rigs)
-    ] = None
-    """A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like its
-    first."""
-    size: Annotated[tuple[int, int], Limits(1)] = (1280, 1280)
-    """Width and height of the new cameras' pictures [px]."""
-    field_of_view: Annotated[float, Limits(1.0, 170.0)] = 60.0
-    """Full opening across the shorter side of these [deg]."""
-    glove: Annotated[
-        MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-    ] = "dense19"
-    """Marker layout: a shipped name or the path of a .toml file."""
-    seed: Annotated[int, Limits(0)] = 0
-    """Seed of people and motion."""
-
-    def check(self) -> None:
-        """Refuse a plan without a mount."""
-        if not self.mounts:
-            raise ArgumentError(f"mounts is empty, expected some of {', '.join(MOUNTS)}")
 
 
 class RigPlan(NamedTuple):

@@ -9,14 +9,14 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
-from gloves.layout import MarkerLayout, list_layouts, load_layout
+from gloves.layout import load_layout
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
@@ -37,7 +37,6 @@ from handsim.pages import (
     picture,
     write_sections,
 )
-from handsim.settings import Expected, Limits, Settings
 from handsim.space.cameras import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, as_rig
 from train.forecast.rig_forecast import (
     HALF_SIDE,
@@ -51,6 +50,7 @@ from train.forecast.rig_forecast import (
     sample_work,
     work_of_take,
 )
+from train.forecast.settings import ScoreRigSettings
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
@@ -59,8 +59,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LONGEST_SIDE: Final = 50.0
-"""No volume or room is longer, and no middle of one farther from the origin [m]."""
 GRID: Final = 5
 """Points of the map along each side of the volume."""
 _GLOVE: Final = "dense19"
@@ -82,28 +80,6 @@ _NARROW: Final = 30.0  # largest angle between two cameras [deg]
 _SMALL: Final = 2.0  # diameter of a marker in the picture [px]
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
 _UPSIDE_DOWN: Final = -0.2  # cosine of the picture's up and the world's
-
-
-@dataclass(frozen=True, slots=True)
-class ScoreRigSettings(Settings):
-    """What hands do before a rig that is scored: options of `handsim rig score`, arguments of `score_rig`."""
-
-    volume: Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)] = (0.6, 0.6, 0.6)
-    """Sides of the space that hands work in [m]."""
-    center: Annotated[tuple[float, float, float] | None, Limits(-LONGEST_SIDE, LONGEST_SIDE)] = None
-    """Its middle [m]; (0, 0, 1.1) when not given, or where the hands of the take are."""
-    take: Annotated[Take | str | Path | None, Expected("a Take, or the path of one")] = None
-    """A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are; simulated
-    people when not given."""
-    glove: Annotated[
-        MarkerLayout | str | Path | None, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-    ] = None
-    """Marker layout: a shipped name or the path of a .toml file; dense19 or that of the take when not
-    given."""
-    num_frames: Annotated[int, Limits(60)] = 900
-    """Frames of every person and kind of work, or of the take."""
-    seed: Annotated[int, Limits(0)] = 0
-    """Seed of people, motion and cameras' losses."""
 
 
 class VolumeMap(NamedTuple):
