@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from gloves.layout import load_layout
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.take import Take
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimWarning
