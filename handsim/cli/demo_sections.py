@@ -25,7 +25,7 @@ from render.captions import contact_sheet, write_png
 from render.config import RenderConfig
 from render.illustrations import PosedHand, draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.session import draw
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from train.data.augmentation import Corruption, corrupt
 from train.data.shards import Dataset
 from train.evaluate import CLEAN, evaluate_labeler
