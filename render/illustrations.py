@@ -26,8 +26,7 @@ from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONE_NAMES, NUM_QPOS
 from handsim.space.camera import Camera, pinhole
 from handsim.space.cameras import CameraRig
-from poses.shapes.library import gesture
-from poses.shapes.validity import make_valid
+from poses.shapes import gesture, make_valid
 from render.captions import (
     BACKGROUND,
     HIDDEN_COLOR,

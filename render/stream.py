@@ -26,7 +26,7 @@ from handsim.hand.shape import HandShape, pack_hand, sample_shape
 from handsim.hand.topology import NUM_KEYPOINTS, NUM_QPOS, SIDES, Side
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
-from poses.shapes.sampling import load_sampler, mixed_angles
+from poses.shapes import load_sampler, mixed_angles
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.depth_sensor import DepthSensor
 from render.frames import HandTruth, RenderedFrame

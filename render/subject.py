@@ -32,7 +32,7 @@ from handsim.hand.shape import (
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
 from handsim.motion_files.joint_table import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
-from poses.shapes.couplings import HIGH, LOW
+from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")

@@ -20,13 +20,13 @@ from handsim.app.page import Section
 from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import load_rig
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.captions import contact_sheet, write_png
 from render.config import RenderConfig
 from render.illustrations import PosedHand, draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.session import draw
 from track.captures import track_capture
-from train.data.augmentation import Corruption, corrupt
+from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset
 from train.evaluate import CLEAN, evaluate_labeler
 from train.glove_labeler import load_labeler

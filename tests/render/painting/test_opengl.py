@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.illustrations import view_along
 from render.painting import opengl as gl
 from render.painting.figures import shade_colors, skin_material

@@ -12,7 +12,7 @@ from handsim.hand.skin.surface import vertex_normals
 from handsim.space.camera import Camera, look_at, pinhole, preset
 from handsim.space.lens import Lens
 from handsim.space.transforms import euler_matrix
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")

@@ -10,7 +10,7 @@ from handsim.hand.shape import sample_shape
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side
 from handsim.space.transforms import MIRROR
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.frames import FOREARM
 from render.skin.look import CUFF, REACH, Forearm, arm_places, sample_forearm
 from render.skin.mesh import RINGS, Flexion, PosableSkin, face_parts, skin_atlas
