@@ -15,8 +15,8 @@ import numpy as np
 
 from gloves.takes.growing import check_free, growing_path
 from gloves.takes.take import Take
-from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from handsim.app.messages import LiveStatus
+from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.capture_tracking import OnFrame
 from track.intake import FARTHEST
 from track.recorder import Recorder
