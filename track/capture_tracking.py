@@ -26,7 +26,7 @@ from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.settings import TrackSettings
 from track.setup import TrackerSetup, as_designed
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user
 from track.tracked_frame import TrackedFrame

@@ -21,7 +21,7 @@ from track.capture_tracking import OnFrame
 from track.intake import FARTHEST
 from track.recorder import Recorder
 from track.setup import TrackerSetup
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.addresses import open_source
 from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream

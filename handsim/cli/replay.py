@@ -13,7 +13,7 @@ from handsim._checks import check_count
 from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
 from handsim.files.signals import interrupt_flag
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.streams.natnet import COMMAND_PORT
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from handsim.files.outputs import check_outputs
 from handsim.files.signals import InterruptFlag, interrupt_flag
 from handsim.hand.topology import Side
 from track.config import Size
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.server import address_of, opened_server
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Signals that ask a command to end: put off, as a flag that a loop reads, or as an exception with what is kept."""
+"""Signals that ask a command to end: put off, as a flag for a loop, or as an exception with what is kept."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from gloves.takes.status import Status
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.objects import named_object
 from track.bodies.rigid_body import RigidTemplate
-from track.sinks.message import LiveMessage, MessageEncoder
+from track.live_message import LiveMessage, MessageEncoder
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedBody, TrackedFrame, TrackedHand
 
