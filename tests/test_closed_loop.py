@@ -13,7 +13,7 @@ from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0

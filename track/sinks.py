@@ -30,6 +30,7 @@ from handsim._extras import import_extra
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError, HandSimWarning
 from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedFrame
 from track.live_message import (
     FORMATS,
     SCHEMA,
@@ -42,7 +43,6 @@ from track.live_message import (
 )
 from track.streams import split_address
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

@@ -18,10 +18,10 @@ from handsim.files.atomic import written_together
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.config import Size
-from track.tracked_frame import TrackedFrame
+from track.frames import TrackedFrame
 
 if TYPE_CHECKING:
-    from track.capture_tracking import OnFrame
+    from track.captures import OnFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
     from track.sinks import SinkGroup
@@ -79,8 +79,7 @@ def track(
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
     from track.live import track_live
-    from track.settings import TrackSettings
-    from track.setup import TrackerSetup, warm_up
+    from track.settings import TrackerSetup, TrackSettings, warm_up
     from track.sinks import open_sinks
     from track.streams.frame_source import StreamedFrame
 
@@ -121,7 +120,7 @@ def _track_file(
     """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
     from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
-    from track.capture_tracking import track_capture
+    from track.captures import track_capture
     from track.live import LiveTake
 
     corrections = corrections_path(out)

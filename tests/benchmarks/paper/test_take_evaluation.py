@@ -20,8 +20,8 @@ from gloves.takes.status import Status
 from gloves.takes.take import Take
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
+from track.frames import TrackedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
-from track.tracked_frame import TrackedFrame, TrackedHand
 from train.simulation.takes import simulate_take
 
 

@@ -16,7 +16,7 @@ from benchmarks.public.results import find_results, read_result
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.captures.markers import labeled_columns, unlabeled_frames
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 
 NAME = "hand-controller-hard-1"
 LABELS = label_names()

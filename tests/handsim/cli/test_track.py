@@ -35,7 +35,7 @@ from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
 from track import capture_tracking
 from track.bodies.body_file import load_body
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from track.recorder import Recorder
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
