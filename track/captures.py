@@ -16,7 +16,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names

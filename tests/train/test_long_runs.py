@@ -18,9 +18,8 @@ from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
 from train.labelers.storage import WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 from train.training_state import TrainingError
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)

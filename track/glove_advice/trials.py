@@ -26,7 +26,7 @@ from track.settings import measured_user
 from track.streams.frame_source import checked_frames
 from train.labelers.protocol import Labeler
 from train.metrics import LabelCounts
-from train.simulation.room_settings import SimulatedKind
+from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
 FRAMES: Final = 240

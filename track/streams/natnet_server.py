@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
 from handsim._closing import Closing
 from handsim.errors import CaptureError, choices
