@@ -21,7 +21,6 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.takes.take import RigidBody, Take
 from handsim._checks import check_choice, check_type, make_settings
-from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
@@ -29,6 +28,7 @@ from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
+from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.cameras import CameraRig
 from handsim.space.rig_file import check_names

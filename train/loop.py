@@ -16,10 +16,10 @@ import torch
 from lightning_fabric import Fabric
 
 from handsim._checks import check_type, make_settings
-from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
+from handsim.files.signals import Stopped, interrupt_flag, interrupts_bare
 from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
 from train.data.batches import Batch, check_corruption, draw_batch
 from train.data.shards import Dataset, MappedRows, load_dataset

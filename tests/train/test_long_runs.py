@@ -10,9 +10,9 @@ import signal
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import WeightsError
+from handsim.files.signals import Stopped
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
