@@ -45,7 +45,7 @@ from track.settings import (
     found_user,
     measured_user,
 )
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points

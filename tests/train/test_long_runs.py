@@ -10,9 +10,9 @@ import signal
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import WeightsError
+from handsim.files.signals import Stopped
 from train.data.shards import Dataset
 from train.labelers.storage import WEIGHTS, load_labeler
 from train.loop import CHECKPOINT, TrainingError, train_labeler

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
+from handsim.files.signals import Stopped
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric

@@ -18,8 +18,7 @@ from handsim._checks import check_type
 from handsim._closing import Closing
 from handsim.errors import CaptureError, choices
 from track.inputs import read_points
-from track.network_address import LOOPBACK
-from track.streams import natnet
+from track.streams import LOOPBACK, natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))

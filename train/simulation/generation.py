@@ -19,13 +19,13 @@ from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_type, make_settings
 from handsim._plugins import plugin_name
-from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
+from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES

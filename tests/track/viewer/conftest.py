@@ -24,7 +24,7 @@ from handsim.space.objects import named_object
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_poses
 from tests.waiting import wait_for
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.server import opened_server
 
 FRAMES = 30

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
+from handsim.files.signals import Stopped
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
 from handsim.space.cameras import as_rig
