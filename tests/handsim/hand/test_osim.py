@@ -20,7 +20,7 @@ from handsim.hand.shape import sample_shape
 from handsim.hand.topology import BONE_NAMES
 
 FRAMES = 12
-PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "opensim.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "other_programs.md"
 
 
 @pytest.fixture(params=["right", "left"])
