@@ -6,7 +6,7 @@ import base64
 import importlib
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -102,6 +102,11 @@ def write_page(path: str | Path, thing: Any) -> None:
         )
     module, _, name = target.partition(":")
     getattr(importlib.import_module(module), name)(Path(path), thing)
+
+
+def coordinates(point: Iterable[float], separator: str = " ") -> str:
+    """A point with two decimals."""
+    return separator.join(f"{one + 0.0:.2f}" for one in point)
 
 
 @dataclass(frozen=True, slots=True)

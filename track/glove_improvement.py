@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import Attachment, attach_markers, wear
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit, attach_markers, wear
 from gloves.layout import (
     ACROSS_RANGE,
     ALONG_RANGE,
@@ -43,16 +42,14 @@ from track.glove_score import (
     try_layout,
 )
 from track.inputs import AnyGlove
-from train.any_layout.layout_labeler import mean_features, shipped_network
-from train.any_layout.learned_gloves import learned_labeler
-from train.any_layout.skin_bank import sample_places
-from train.data.augmentation import Corruption, corrupt
+from train.data.batches import Corruption, corrupt
+from train.evaluation import LabelCounts
 from train.forecast.settings import ImproveGloveSettings
-from train.matching.assignment import match_probabilities, pair_probabilities
-from train.metrics import LabelCounts
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import sample_single_hand
-from train.simulation.people import sample_hands
+from train.labelers.layout_labeler import learned_labeler, mean_features, shipped_network
+from train.labelers.layout_training import sample_places
+from train.labelers.matching import match_probabilities, pair_probabilities
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, sample_single_hand
 from train.threads import labeling_threads
 
 _PEOPLE, _POSES_EACH = 40, 40
@@ -194,7 +191,7 @@ class Columns(NamedTuple):
     seen: Bool[np.ndarray, "T P"]
     """By two cameras or more."""
     worn: tuple[dict[str, NDArray[Any]], ...]
-    """The tables of each person's `gloves.attachment.Attachment`."""
+    """The tables of each person's `gloves.fit.Attachment`."""
 
     def chosen(self, columns: Sequence[int] | Int[np.ndarray, "Q"]) -> Columns:
         """Some columns in this order."""
@@ -368,7 +365,7 @@ class Improvement:
         return [layout for layout in layouts if self.is_wearable(layout.places)]
 
     def is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
-        """Whether markers may replace those so far: each digit keeps one, no bone gets a crowd, the palm enough."""
+        """Whether markers may replace those so far: digits keep one, no bone is crowded, the palm known."""
         now, palm = self._columns.places, BONE_NAMES[PALM]
         bones, before = (Counter(place.bone for place in some) for some in (places, now))
         crowded = any(count > max(1, before[bone]) for bone, count in bones.items() if bone != palm)

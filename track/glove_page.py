@@ -28,7 +28,7 @@ from handsim.pages import (
     write_sections,
 )
 from track.glove_score import METHODS, NOISE, LayoutScore, Trial
-from train.metrics import percent
+from train.evaluation import percent
 from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
 
 if TYPE_CHECKING:
@@ -160,4 +160,6 @@ def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"
         panel.annotate(
             f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=INK, zorder=4
         )
-    color_bar(figure, colors, "standard deviation of the worst joint [deg]", ax=panel, shrink=0.6, extend="max")
+    color_bar(
+        figure, colors, "standard deviation of the worst joint [deg]", ax=panel, shrink=0.6, extend="max"
+    )

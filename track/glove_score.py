@@ -16,8 +16,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
@@ -31,19 +30,16 @@ from track.config import BOTH
 from track.inputs import AnyGlove
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import known_hand, pose_spreads, tip_lengths
-from train.any_layout.learned_gloves import learned_labeler
-from train.data.augmentation import Corruption, corrupt
-from train.data.batches import paper_corruption
-from train.evaluate import evaluate_labeler
+from train.data.batches import Corruption, corrupt, paper_corruption
+from train.evaluation import LabelCounts, LabelingReport, evaluate_clouds, evaluate_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
-from train.glove_labeler import load_labeler
-from train.labeler_evaluation import Report, evaluate_clouds
+from train.labelers.layout_labeler import learned_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
-from train.metrics import LabelCounts
+from train.labelers.storage import load_labeler
 from train.reports.hand_plot import mistakes
-from train.simulation.room_settings import SimulatedKind
+from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
 METHODS: Final = ("label", "track")
@@ -118,11 +114,11 @@ class LayoutScore:
     """How well a layout can be labeled, and what it tells of each joint."""
 
     layout: MarkerLayout
-    observed: Report
+    observed: LabelingReport
     """Labels of the frames as the rig sees them, on average over both hands."""
-    clean: Report
+    clean: LabelingReport
     """Labels where every marker is seen."""
-    corrupted: Report
+    corrupted: LabelingReport
     """Labels with the drops and ghosts of the paper's recipe."""
     seen: Float[np.ndarray, "M"]
     """Share of the frames in which each marker is seen by two cameras and becomes a point."""
@@ -293,8 +289,8 @@ def layout_spreads(
 
 def free_spreads() -> Float[np.ndarray, "20"]:
     """Standard deviation of each joint where nothing is seen: anywhere in its range [rad]."""
-    ranges: Float[np.ndarray, "20"] = np.deg2rad([joint.high - joint.low for joint in JOINTS])
-    return ranges / np.sqrt(12.0)
+    ranges = np.deg2rad([joint.high - joint.low for joint in JOINTS])
+    return np.asarray(ranges / np.sqrt(12.0))
 
 
 def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:

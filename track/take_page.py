@@ -1,6 +1,6 @@
-"""The page on a take and the tables beside it: angles, range of motion, markers, residuals, frames to look at.
+"""The page on a take and the tables beside it: what a biomechanics lab looks at before it uses the angles.
 
-It is what a biomechanics lab looks at before it uses the angles. Angles are in degrees and residuals in
+Angles are in degrees and residuals in
 millimeters. In the tables (.csv) units stand in the names of columns, and an empty cell is a number that does
 not exist.
 """
@@ -42,7 +42,7 @@ from handsim.pages import (
 from track.config import Size
 from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
-from train.metrics import percent
+from train.evaluation import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +80,12 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
     sections = [_summary_section(take), _calibration_section(take)]
     sections += [section for hand in hands for section in _hand_sections(take, hand)]
     sections.append(_spans_section(take, spans, source))
-    tables = [_frame_rows(take, hands), _joint_rows(hands), _marker_rows(take, hands), _span_rows(take, spans)]
+    tables = [
+        _frame_rows(take, hands),
+        _joint_rows(hands),
+        _marker_rows(take, hands),
+        _span_rows(take, spans),
+    ]
     paths = table_paths(out)
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
@@ -133,7 +138,7 @@ class HandFigures:
         return np.sqrt(square)
 
     def joints(self) -> Float[np.ndarray, "20 6"]:
-        """`_RANGE` of each joint's angle over the fitted frames, and its median spread [deg]; NaN if unknown."""
+        """`_RANGE` of each angle over the fitted frames, and its median spread [deg]; NaN if unknown."""
         found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
         if self.fitted.any():
             found[:, :-1] = np.percentile(self.angles[self.fitted], list(_RANGE.values()), axis=0).T
@@ -157,7 +162,9 @@ class HandFigures:
                 longest_gap=int(gaps.max(initial=0)),
                 median_residual=float(median),
                 high_residual=float(high),
-                median_confidence=float(np.median(self.confidence[frames, marker])) if len(frames) else np.nan,
+                median_confidence=float(np.median(self.confidence[frames, marker]))
+                if len(frames)
+                else np.nan,
             )
 
 

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, Final, Literal, TextIO
 
 from handsim._closing import Closing
 from handsim.errors import HandSimWarning
@@ -37,12 +37,13 @@ def print_table(
     from rich.table import Table
     from rich.text import Text
 
+    cells = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
     table = Table(box=None, pad_edge=False, title=None if title is None else Text(title))
-    for number, column in enumerate(rows[0]):
-        justify = "left" if number < left else "right"
-        table.add_column(Text(column) if isinstance(column, str) else column, justify=justify, no_wrap=not wraps)
-    for row in rows[1:]:
-        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    for number, column in enumerate(cells[0]):
+        justify: Literal["left", "right"] = "left" if number < left else "right"
+        table.add_column(column, justify=justify, no_wrap=not wraps)
+    for row in cells[1:]:
+        table.add_row(*row)
     Console().print(table)
 
 

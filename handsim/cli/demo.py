@@ -12,9 +12,9 @@ from rich.text import Text
 
 from handsim._checks import check_count
 from handsim.app.messages import print_line
-from handsim.app.page import write_page
 from handsim.app.progress import named_steps
 from handsim.files.atomic import atomic_write, written_together
+from handsim.pages import write_sections
 
 
 def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:
@@ -38,7 +38,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
             for picture in sorted(pictures.iterdir()):
                 with atomic_write(out / picture.name) as temporary:
                     shutil.copyfile(picture, temporary)
-            write_page(
+            write_sections(
                 page,
                 sections,
                 title="handsim demo",

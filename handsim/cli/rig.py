@@ -16,6 +16,7 @@ from handsim.files.atomic import written_together
 from handsim.files.json_files import save_json
 from handsim.files.names import as_text
 from handsim.files.outputs import check_ending, check_outputs, write_starter
+from handsim.pages import coordinates
 from handsim.space.cameras import CameraRig, list_rigs, load_rig, named_rig, rig_description
 from handsim.space.rig_formats.any_file import import_cameras
 from train.forecast.settings import PlanRigSettings, ScoreRigSettings
@@ -79,21 +80,22 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
     Args:
         rig: A .toml file or a shipped name.
     """
+    from train.forecast import rig_score
+    from train.forecast.rig_forecast import HALF_SIDE
+
     cameras = load_rig(rig)
-    point, side = rig_score.working_point(cameras), 2 * rig_score.HALF_SIDE
+    point, side = rig_score.working_point(cameras), 2 * HALF_SIDE
     shares = cameras.in_view(rig_score.cube_points(point, side))
     pixels = rig_score.pixels_of_a_marker(cameras, point)
     rows = [["camera", "position [m]", "from the middle [m]", "a marker [px]", "of the cube in view [%]"]]
     for number, position in enumerate(cameras.positions):
         away = f"{np.linalg.norm(position - point):.2f}"
         share = f"{100 * shares[:, number].mean():.0f}"
-        rows.append(
-            [str(number + 1), rig_score.coordinates(position, "  "), away, f"{pixels[number]:.1f}", share]
-        )
+        rows.append([str(number + 1), coordinates(position, "  "), away, f"{pixels[number]:.1f}", share])
     print_table(rows, title=f"{cameras.name}: {len(cameras.cameras)} cameras")
     covered = 100 * (shares.sum(axis=-1) >= 2).mean()
     print_line(
-        f"The cameras look at ({rig_score.coordinates(point, ', ')}) m; {covered:.0f} % of the cube of "
+        f"The cameras look at ({coordinates(point, ', ')}) m; {covered:.0f} % of the cube of "
         f"{side:g} m around it is in view of two or more."
     )
     if not _tell_faults(cameras):
@@ -101,7 +103,9 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
 
 
 def _tell_faults(rig: CameraRig) -> list[str]:
-    found = rig_score.faults(rig)
+    from train.forecast.rig_score import faults
+
+    found = faults(rig)
     for sentence in found:
         print_line(f"Suspicious: {sentence}.")
     return found
@@ -128,7 +132,7 @@ def import_rig(
     rig.save(out)
     rows = [["camera", "name", "position [m]", "picture [px]", "focal length [px]", "lens"]]
     for number, camera in enumerate(rig.cameras, 1):
-        place = rig_score.coordinates(camera.T_world_camera[:3, 3])
+        place = coordinates(camera.T_world_camera[:3, 3])
         size = f"{camera.size[0]} x {camera.size[1]}"
         rows.append([str(number), camera.name, place, size, f"{camera.focal_length:.0f}", camera.lens.kind])
     print_table(rows, left=2, wraps=True)
@@ -156,6 +160,8 @@ def score_rig(
     if json is not None:
         check_ending(json, ".json", option="--json")
     check_outputs([rig, settings.take, settings.glove], [page, json])
+    from train.forecast import rig_score
+
     with named_steps("getting ready") as step:
         score = rig_score.score_rig(cameras, settings, on_step=step)
     for header, *rows in (rig_score.work_table(score), rig_score.camera_table(score)):
@@ -191,11 +197,13 @@ def plan_rig(
     """
     check_ending(out, ".toml")
     check_outputs([settings.keep, settings.glove], [out])
+    from train.forecast import rig_plan
+
     with named_steps("getting ready") as step:
         planned = rig_plan.plan_rig(cameras, room, settings, name=as_text(out.stem), on_step=step)
     rows = [["camera", "position [m]", "looks at [m]"]]
     for number, places in enumerate(zip(planned.rig.positions, planned.targets, strict=True), 1):
-        rows.append([str(number), *(rig_score.coordinates(place, "  ") for place in places)])
+        rows.append([str(number), *(coordinates(place, "  ") for place in places)])
     print_table(rows)
     if planned.before is not None:
         print_line(f"before: {_forecast_line(planned.before)}")

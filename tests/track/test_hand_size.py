@@ -13,7 +13,7 @@ from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from handsim.hand.topology import DIGITS
-from poses.motion.motions import sample_motion
+from poses.motion import sample_motion
 from track.hand_size import (
     _PRECISION,
     SizeFit,
@@ -24,7 +24,7 @@ from track.hand_size import (
     usual_breadth,
 )
 from track.streams.frame_source import StreamedFrame, checked_frames
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

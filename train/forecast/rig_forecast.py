@@ -18,24 +18,39 @@ from numpy.typing import NDArray
 from gloves.captures.capture import run_lengths, runs_of
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import MarkerLayout
-from gloves.optics.blobs import MARKER_RADIUS
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, PoseError
 from handsim.hand.motion import BodyMotion
 from handsim.space.cameras import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import FrameScene, sample_frame_scene
-from train.simulation.light_sources import LightSources, sample_light_sources
-from train.simulation.motion import MovingObject, SceneMotion
-from train.simulation.people import sample_hands, wear_gloves
-from train.simulation.real_like import sample_real_like_scene
-from train.simulation.room import label_false_points
-from train.simulation.room_settings import KINDS, SIMULATED_KINDS, RoomConfig, SimulatedKind, usual_room
-from train.simulation.sight import SceneSight
+from train.simulation.room import (
+    LightSources,
+    RoomConfig,
+    SceneSight,
+    label_false_points,
+    sample_light_sources,
+    usual_room,
+)
+from train.simulation.scenes import (
+    KINDS,
+    SIMULATED_KINDS,
+    Kind,
+    MovingObject,
+    SceneMotion,
+    SimulatedKind,
+    sample_hands,
+    sample_real_like_scene,
+    wear_gloves,
+)
 from train.simulation.takes import sample_scene
-from train.simulation.training_frames import HandFrames, observe_scene
+from train.simulation.training_frames import (
+    DatasetConfig,
+    FrameScene,
+    HandFrames,
+    observe_scene,
+    sample_frame_scene,
+)
 
 HALF_SIDE: Final = 0.3
 """Half side of the cube that hands work in unless somebody says otherwise [m]."""
@@ -66,17 +81,16 @@ def sample_work(
     for kind in (_REAL_LIKE, *KINDS):
         work[kind] = []
         for _ in range(people):
-            if kind == _REAL_LIKE:
-                scene = _real_like_scene(layout, num_frames, rng)
-            else:
-                scene = sample_scene(kind, layout, num_frames, rng=rng)
+            scene = _work_scene(kind, layout, num_frames, rng)
             walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
             work[kind].append(moved(scene, walk + center - ROOM_CENTER))
     return work
 
 
-def _real_like_scene(layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """The motion of the first person who can bring the hands together."""
+def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
+    """The motion of the first person who can do it."""
+    if kind != _REAL_LIKE:
+        return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
         try:

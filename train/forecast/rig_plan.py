@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
 from gloves.layout import load_layout
-from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import MARKER_RADIUS
 from handsim._checks import check_array, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
@@ -24,15 +24,13 @@ from handsim.space.cameras import (
     FEWEST_CAMERAS,
     HAND_REACH,
     MAX_CAMERAS,
-    ROOM_CENTER,
     CameraRig,
     as_rig,
 )
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
 from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
-from train.simulation.light_sources import marker_radii
-from train.simulation.motion import SceneMotion
-from train.simulation.sight import SceneSight
+from train.simulation.room import SceneSight, marker_radii
+from train.simulation.scenes import SceneMotion
 
 _MOST: Final = 400  # places; the step between them grows with the room
 _STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # between places [m]
@@ -252,9 +250,7 @@ def view_candidates(
     views, centers = np.concatenate(seen, axis=1), np.concatenate(points)
     sampled = rng.choice(len(centers), min(_SAMPLED, len(centers)), replace=False)
     focals = np.array([one.focal_length for one in candidates])
-    information = _information(
-        centers[sampled], positions, np.concatenate(noise)[sampled] / focals[:, None]
-    )
+    information = _information(centers[sampled], positions, np.concatenate(noise)[sampled] / focals[:, None])
     padded = np.zeros((len(views), -(-views.shape[1] // 64) * 64), dtype=bool)
     padded[:, : views.shape[1]] = views
     bits = np.packbits(padded, axis=1).view(np.uint64)

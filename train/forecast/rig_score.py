@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
 from gloves.layout import load_layout
-from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import MARKER_RADIUS
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.pages import (
@@ -33,6 +33,7 @@ from handsim.pages import (
     Section,
     color_bar,
     color_scale,
+    coordinates,
     html_list,
     picture,
     write_sections,
@@ -51,9 +52,8 @@ from train.forecast.rig_forecast import (
     work_of_take,
 )
 from train.forecast.settings import ScoreRigSettings
-from train.simulation.light_sources import marker_radii
-from train.simulation.motion import SceneMotion
-from train.simulation.sight import SceneSight
+from train.simulation.room import SceneSight, marker_radii
+from train.simulation.scenes import SceneMotion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,7 +132,8 @@ class RigScore:
             "all": _figures(self.whole),
             "kinds": {kind: _figures(one) for kind, one in self.kinds.items()},
             "without_camera": [
-                {"seen": one.seen, "needed": one.needed} | ({} if one.without is None else _figures(one.without))
+                {"seen": one.seen, "needed": one.needed}
+                | ({} if one.without is None else _figures(one.without))
                 for one in self.losses
             ],
             "volume": {name: _numbers(values) for name, values in self.volume._asdict().items()},
@@ -419,11 +420,6 @@ def pixels_of_a_marker(rig: CameraRig, point: Float[np.ndarray, "3"]) -> NDArray
     distances = np.linalg.norm(point - rig.positions, axis=1)
     focals = np.array([one.focal_length for one in rig.cameras])
     return np.asarray(2 * MARKER_RADIUS * focals / np.maximum(distances, 1e-9))
-
-
-def coordinates(point: Float[np.ndarray, "3"], separator: str = " ") -> str:
-    """A point with two decimals."""
-    return separator.join(f"{one:.2f}" for one in point + 0.0)
 
 
 def _place(point: Float[np.ndarray, "3"]) -> str:

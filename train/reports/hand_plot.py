@@ -9,11 +9,24 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, PALM
-from handsim.pages import AMBER, BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM, color_bar, color_scale, picture
+from handsim.pages import (
+    AMBER,
+    BAND,
+    BLUE,
+    CARD,
+    INK,
+    LINE,
+    PALE,
+    SOFT,
+    WARM,
+    color_bar,
+    color_scale,
+    picture,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +57,9 @@ class FlatHand(NamedTuple):
     below: NDArray[np.bool_]
     """Which markers face the palm's side (M,)."""
 
-    def draw(self, panel: Axes, *, scale: float = 1.0, shift: Any = 0.0, bone_width: float, **bones: Any) -> None:
+    def draw(
+        self, panel: Axes, *, scale: float = 1.0, shift: Any = 0.0, bone_width: float, **bones: Any
+    ) -> None:
         """Draw outline and bones, scaled and then shifted."""
         from matplotlib.patches import PathPatch
         from matplotlib.path import Path
@@ -150,9 +165,7 @@ def _draw_hand(
     hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
-    colors = color_scale(
-        min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0, [WARM, AMBER, PALE, BLUE]
-    )
+    colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0, [WARM, AMBER, PALE, BLUE])
     for dot, color, ring in zip(dots, colors.to_rgba(100.0 * accuracy), hand.below, strict=True):
         panel.plot(*dot, "o", markersize=2.0 * _DOT_RADIUS, zorder=5, markeredgecolor=color if ring else INK,
                    markerfacecolor=CARD if ring else color, markeredgewidth=2.2 if ring else 0.7)  # fmt: skip
@@ -211,7 +224,7 @@ def place_names(
     curves: Sequence[Float[np.ndarray, "K 2"]],
     size: tuple[float, float],
 ) -> Float[np.ndarray, "M 2"]:
-    """Centers of the names, each placed in turn where it overlaps least with what is there; all in [points]."""
+    """Centers of the names [points], each placed in turn where it overlaps least with what is there."""
     extents = np.array([name_extent(name) for name in names])
     taken = np.concatenate([dots, *curves])
     half_sizes = np.concatenate(

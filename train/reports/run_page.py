@@ -12,12 +12,22 @@ from jaxtyping import Int
 
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.files.atomic import atomic_write
-from handsim.pages import BAND, BLUE, INK, LINE, NOTHING, PALE, SOFT, WARM, Section, annotate, color_bar
-from handsim.pages import picture as picture  # tests leave the pictures out
-from handsim.pages import write_sections
-from train.history import History
-from train.labeler_evaluation import Report
-from train.metrics import BINS, LEAST_SURE, Reliability, percent, reliability
+from handsim.pages import (
+    BAND,
+    BLUE,
+    INK,
+    LINE,
+    NOTHING,
+    PALE,
+    SOFT,
+    WARM,
+    Section,
+    annotate,
+    color_bar,
+    picture,
+    write_sections,
+)
+from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
 from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
 
 if TYPE_CHECKING:
@@ -33,7 +43,7 @@ _LEAST_SHARE: Final = 0.01  # lowest end of the confusions' scale [%]
 _MOST_WRITTEN: Final = 30  # classes up to which a cell has room for a number
 
 
-def write_run_page(out: Path, card: dict[str, Any], history: History, report: Report) -> Path:
+def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
     """Write the page of a run, complete or not at all; its path.
 
     The report is of held-out frames with the paper's corruption.
@@ -75,7 +85,7 @@ def _columns(card: dict[str, Any]) -> tuple[dict[str, float], tuple[str, dict[st
     return clean, (recipe, corrupted)
 
 
-def _figures_section(card: dict[str, Any], report: Report) -> Section:
+def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     clean, (recipe, corrupted) = _columns(card)
     table = [["figure [%]", "clean", recipe]]
     table += [[name.replace("_", " "), percent(clean[name]), percent(corrupted[name])] for name in corrupted]
@@ -129,7 +139,7 @@ def draw_curves(figure: Figure, history: History) -> None:
     figure.align_ylabels()
 
 
-def _confusion_section(layout: MarkerLayout, report: Report) -> Section:
+def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     size = confusion_size(layout.num_markers + 1)
     drawn = picture(size, draw_confusion, layout.names, report.confusion)
     caption = (
@@ -180,11 +190,13 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
     panel.spines[:].set_visible(False)
     panel.set_xlabel("called")
     panel.set_ylabel("is")
-    bar = color_bar(figure, shades, "share of the row's points [%]", ax=panel, pad=0.02, aspect=40, shrink=0.8)
+    bar = color_bar(
+        figure, shades, "share of the row's points [%]", ax=panel, pad=0.02, aspect=40, shrink=0.8
+    )
     bar.yaxis.set_major_formatter("{x:g}")
 
 
-def _hand_section(layout: MarkerLayout, report: Report) -> Section:
+def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     arrows = mistakes(report.confusion)
     drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
     caption = HAND_CAPTION + (
@@ -202,7 +214,7 @@ def _hand_section(layout: MarkerLayout, report: Report) -> Section:
     return Section("On the hand", _hand_text(layout, report), pictures=[(drawn, caption)], table=table)
 
 
-def _hand_text(layout: MarkerLayout, report: Report) -> str:
+def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
     """The markers most often wrong, and what became of hidden markers and ghosts; HTML."""
     order = np.argsort(report.slot_accuracy_by_marker, kind="stable")[:3]
     worst = ", ".join(
@@ -221,7 +233,7 @@ def _hand_text(layout: MarkerLayout, report: Report) -> str:
     )
 
 
-def _reliability_section(report: Report) -> Section:
+def _reliability_section(report: LabelingReport) -> Section:
     bins = reliability(report.confidences, report.right)
     drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
     caption = (

@@ -18,8 +18,8 @@ from handsim.hand.topology import JOINT_NAMES, JOINTS
 from train.data.shards import Dataset, row_dtype
 from train.reports import dataset_page as report
 from train.simulation import generation
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
@@ -163,9 +163,9 @@ def test_only_drawing_loads_matplotlib_and_nothing_loads_pyplot():
     code = """
 import sys
 import handsim.cli.generate, handsim.cli.train, train.simulation.generation
-import train.reports.dataset_page, train.reports.run_page, train.reports.plot_style
+import handsim.pages, train.reports.dataset_page, train.reports.run_page
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
-train.reports.plot_style.picture((1, 1), lambda figure: figure.subplots())
+handsim.pages.picture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

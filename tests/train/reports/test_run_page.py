@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import json
 import re
+from importlib import resources
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,23 +16,38 @@ import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.topology import BONES
+from handsim.pages import picture
 from tests.renames import fails_at
-from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
-from train.glove_labeler import load_labeler
-from train.history import History
-from train.labeler_evaluation import Report
-from train.labelers.storage import CARD, WEIGHTS
-from train.loop import CHECKPOINT, train_labeler
-from train.metrics import error_without, expected_calibration_error, macro_f1, percent
-from train.reports.model_card import MODEL_CARD
-from train.reports.run_page import PAGE, write_run_page
-from train.simulation.dataset_config import DatasetConfig
+from train.evaluation import (
+    History,
+    LabelingReport,
+    error_without,
+    expected_calibration_error,
+    macro_f1,
+    percent,
+    reliability,
+)
+from train.labelers.storage import CARD, WEIGHTS, load_labeler
+from train.loop import CHECKPOINT, TrainingState, train_labeler
+from train.reports.hand_plot import LONGEST_NAME, short
+from train.reports.run_page import (
+    MODEL_CARD,
+    PAGE,
+    confusion_size,
+    draw_confusion,
+    draw_curves,
+    draw_reliability,
+    model_card,
+    write_model_card,
+    write_run_page,
+)
+from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
-from train.training_state import TrainingState
+from train.simulation.training_frames import DatasetConfig
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
-SMALL = TrainConfig(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
+SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
 
 
 def pictures(page: Path) -> list[str]:
@@ -54,7 +71,8 @@ def run(dataset, tmp_path_factory):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    monkeypatch.setattr("train.reports.run_page.picture", lambda size, draw: "data:,")
+    for page in ("run_page", "hand_plot"):
+        monkeypatch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
 
 
 def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path, without_pictures):
@@ -75,8 +93,8 @@ def test_the_page_says_what_the_card_says(run):
             assert f"<td>{percent(figures[figure])}</td>" in text
     drawn = pictures(out / PAGE)
     assert len(drawn) == 4
-    for picture in drawn:
-        assert len(list(ElementTree.fromstring(picture).iter())) > 100
+    for one in drawn:
+        assert len(list(ElementTree.fromstring(one).iter())) > 100
     assert load_labeler(out).marker_names == tuple(card["marker_names"])
 
 
@@ -152,7 +170,7 @@ def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path):
     assert len(pictures(tmp_path / "run" / PAGE)) == 4
 
 
-def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> tuple[dict, Report]:
+def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> tuple[dict, LabelingReport]:
     """A card and a report of a glove with names that pages and formulas take for their own."""
     places = []
     for number in range(count):
@@ -173,11 +191,11 @@ def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> t
     }  # fmt: skip
     card = {
         "dataset": {"layout": dataclasses.asdict(layout), "num_frames": 1000},
-        "train": dataclasses.asdict(TrainConfig(labeler="cnn", average=0.0)),
+        "train": dataclasses.asdict(TrainSettings(labeler="cnn", average=0.0)),
         "held_out_simulated": {"clean": figures, "occlude 1, ghosts 2": figures},
     }
     accuracy = confusion.diagonal()[:-1] / confusion[:-1].sum(axis=1)
-    return card, Report(figures, accuracy, 500, confusion, confidences, right)
+    return card, LabelingReport(figures, accuracy, 500, confusion, confidences, right)
 
 
 @pytest.mark.parametrize("count", [FEWEST_MARKERS, MOST_MARKERS])
@@ -198,3 +216,95 @@ def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng):
     card, report = made_up(19, rng, perfect=True)
     page = write_run_page(tmp_path, card, History([(256, 0.1, 0.6)], [(256, 0.1, 1.0)]), report)
     assert "No marker was taken for another" in page.read_text("utf-8")
+
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+@pytest.mark.parametrize(
+    "history",
+    [
+        History(),
+        History([(256, 3.0, 0.1)], [(256, 0.1, 0.5)]),
+        History([(256, 3.0, 0.1), (512, 0.02, 0.1), (768, 1e-4, 0.0)], [(512, 0.1, 1.0), (768, 0.2, 1.0)]),
+    ],
+)
+def test_curves_of_any_length_are_drawn(history):
+    assert picture((6.0, 4.0), draw_curves, history=history).startswith("data:image/svg")
+
+
+@pytest.mark.parametrize(
+    "confusion",
+    [np.zeros((6, 6), int), 7 * np.eye(6, dtype=int), np.ones((6, 6), int), np.diag([0, 5, 0, 0, 9, 0])],
+)
+def test_any_confusion_is_drawn(confusion):
+    names = ("a$b$", "<i>&amp;", "x" * 60, "\\frac", "e")
+    assert picture(confusion_size(6), draw_confusion, names, confusion).startswith("data:image/svg")
+
+
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_reliability_of_few_and_many_points(rng, count):
+    confidence = rng.uniform(size=count)
+    bins = reliability(confidence, confidence > 0.4)
+    assert picture((6.0, 6.0), draw_reliability, bins, 0.1).startswith("data:image/svg")
+
+
+def test_long_names_are_cut():
+    assert short("IndexTip") == "IndexTip"
+    assert len(short("x" * 60)) == LONGEST_NAME and short("x" * 60).endswith("…")
+
+
+SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
+
+
+def head(text: str) -> dict[str, str | list[str]]:
+    """The YAML between the first two rules: plain keys with a word or a list of words."""
+    before, lines, _ = text.split("---\n", maxsplit=2)
+    assert before == ""
+    found: dict[str, str | list[str]] = {}
+    for line in lines.splitlines():
+        if line.startswith("- "):
+            entries = found[key]
+            assert isinstance(entries, list)
+            entries.append(line[2:])
+        else:
+            key, _, value = line.partition(":")
+            found[key] = value.strip() or []
+    return found
+
+
+@pytest.mark.parametrize("license", ["unknown", "apache-2.0"])
+def test_the_head_is_what_hubs_read(license: str) -> None:
+    found = head(model_card(SHIPPED | {"license": license}))
+    assert found["license"] == license
+    assert found["library_name"] == "handsim"
+    assert found["pipeline_tag"] == "other"
+    assert "motion-capture" in found["tags"]
+
+
+def test_the_shipped_weights_have_the_same_head() -> None:
+    text = resources.files("train").joinpath("weights/README.md").read_text()
+    assert head(text) == head(model_card(SHIPPED))
+
+
+def test_the_words_say_what_the_card_says() -> None:
+    text = model_card(SHIPPED)
+    assert "# Labeler of hand markers: dense19" in text
+    assert "Trained on simulated frames only: 1,200,000 of them" in text
+    assert "clouds" in text
+    for column in SHIPPED["held_out_simulated"].values():
+        assert f"{100 * column['slot_accuracy']:.2f}" in text
+    for name in SHIPPED["marker_names"]:
+        assert name in text
+
+
+def test_a_card_in_which_a_license_was_named_is_its_authors(tmp_path: Path) -> None:
+    card = SHIPPED | {"license": "unknown"}
+    path = write_model_card(tmp_path, card)
+    assert path == tmp_path / MODEL_CARD
+    write_model_card(tmp_path, card | {"handsim": "9.9.9"})
+    assert "9.9.9" in path.read_text()
+    mine = path.read_text().replace("license: unknown", "license: cc-by-4.0")
+    path.write_text(mine)
+    write_model_card(tmp_path, card)
+    assert path.read_text() == mine
