@@ -43,8 +43,7 @@ from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from track.captures import calibrate
-from track.settings import warm_up
-from track.tracker import Tracker
+from track.tracker import Tracker, warm_up
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
