@@ -23,8 +23,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from train.any_layout.layout_labeler import LayoutLabeler, sample_worn_markers
 from train.any_layout.learned_gloves import fine_tuned_labeler
 from train.any_layout.skin_bank import sample_places
-from train.data.augmentation import Corruption
-from train.data.batches import paper_corruption
+from train.data.batches import Corruption, paper_corruption
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler

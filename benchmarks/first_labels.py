@@ -26,8 +26,8 @@ from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig
 from train.training_state import TrainingState
 
 GLOVE = "dense19"

@@ -33,13 +33,13 @@ from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
 from benchmarks.training_scaling import train
 from render.painting.gl import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
-from train.data.augmentation import Corruption, corrupt
+from train.data.batches import Corruption, corrupt
 from train.glove_labeler import load_labeler
 from train.labelers import kinds
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.protocol import Labeler
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig
 
 SECTIONS: Final = ("labels", "training", "pictures")
 CPU: Final = torch.device("cpu")

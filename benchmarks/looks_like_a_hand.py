@@ -35,8 +35,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES, Side
 from handsim.space.camera import Camera, preset
-from poses.shapes.library import gesture
-from poses.shapes.validity import make_valid
+from poses.shapes import gesture, make_valid
 from render.formats.writer import open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people

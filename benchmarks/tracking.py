@@ -46,9 +46,8 @@ from track.captures import calibrate
 from track.tracker import Tracker, warm_up
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import simulate_take
+from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
+from train.simulation.takes import simulate_calibration, simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""

@@ -19,7 +19,7 @@ from handsim.hand.shape import HAND_DTYPE, HandShape, shape_from_measures, unpac
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
 from handsim.motion_files.joint_table import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
-from poses.shapes.couplings import HIGH, LOW
+from poses.shapes import HIGH, LOW
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"

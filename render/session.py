@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_type
-from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
@@ -27,6 +26,7 @@ from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
+from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.rig_file import check_names
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured

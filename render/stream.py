@@ -23,7 +23,7 @@ from handsim.hand.shape import HandShape, pack_hand, sample_shape
 from handsim.hand.topology import NUM_KEYPOINTS, NUM_QPOS, SIDES, Side
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
-from poses.shapes.sampling import load_sampler, mixed_angles
+from poses.shapes import load_sampler, mixed_angles
 from render.cameras.viewpoints import around_hands, crop_around
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.drawing import configured, open_studio, sample_choices

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from handsim.app.interrupts import ENDING
 from handsim.errors import HandSimError
+from handsim.files.signals import ENDING
 
 ROOT = Path(__file__).resolve().parents[1]
 

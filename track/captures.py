@@ -19,7 +19,7 @@ import numpy as np
 
 from gloves.captures.capture import Capture
 from gloves.layout import load_layout
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
@@ -39,7 +39,7 @@ from track.inputs import AnyCapture, AnyGlove, AnyLabeler, capture_of, labeler_o
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points

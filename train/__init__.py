@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from train.config import CNNConfig as CNNConfig
     from train.config import SetLabelerConfig as SetLabelerConfig
     from train.config import TrainConfig as TrainConfig
-    from train.data.augmentation import Cloud as Cloud
-    from train.data.augmentation import Corruption as Corruption
-    from train.data.augmentation import corrupt as corrupt
+    from train.data.batches import Cloud as Cloud
+    from train.data.batches import Corruption as Corruption
+    from train.data.batches import OwnCorruption as OwnCorruption
+    from train.data.batches import corrupt as corrupt
     from train.data.cloud_stream import CloudStream as CloudStream
-    from train.data.own_corruption import OwnCorruption as OwnCorruption
     from train.data.shards import Dataset as Dataset
     from train.data.shards import MappedRows as MappedRows
     from train.evaluate import evaluate_labeler as evaluate_labeler

@@ -11,9 +11,7 @@ import numpy as np
 from handsim._checks import check_callable, check_choice, check_count, check_number, fill_settings
 from handsim._plugins import plugin_name
 from handsim.errors import ArgumentError, HandSimError
-from train.data.augmentation import Corruption
-from train.data.batches import BatchRecipe, paper_corruption
-from train.data.own_corruption import OwnCorruption
+from train.data.batches import BatchRecipe, Corruption, OwnCorruption, paper_corruption
 
 Kind = Literal["set", "cnn"]
 """`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's

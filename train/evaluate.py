@@ -17,8 +17,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_rng, check_type
 from handsim.errors import ArgumentError, CaptureError
-from train.data.augmentation import Corruption
-from train.data.own_corruption import OwnCorruption
+from train.data.batches import Corruption, OwnCorruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.glove_labeler import load_labeler
 from train.labeler_evaluation import LabelingCount, Report

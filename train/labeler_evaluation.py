@@ -13,9 +13,7 @@ from scipy.spatial import cKDTree
 
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take
-from train.data.augmentation import Cloud, Corruption
-from train.data.batches import paper_corruption
-from train.data.own_corruption import OwnCorruption, draw_cloud
+from train.data.batches import Cloud, Corruption, OwnCorruption, draw_cloud, paper_corruption
 from train.labelers.protocol import Labeler
 from train.metrics import LabelCounts, error_without, expected_calibration_error
 

@@ -16,13 +16,12 @@ import torch
 from lightning_fabric import Fabric
 
 from handsim._checks import check_type, make_settings
-from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
+from handsim.files.signals import Stopped, interrupt_flag, interrupts_bare
 from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
-from train.data.batches import Batch, draw_batch
-from train.data.own_corruption import check_corruption
+from train.data.batches import Batch, check_corruption, draw_batch
 from train.data.shards import Dataset, MappedRows, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric

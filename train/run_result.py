@@ -14,8 +14,7 @@ from torch import nn
 from handsim._version import __version__
 from handsim.files.atomic import written_together
 from train.config import CNNConfig, Kind, TrainConfig
-from train.data.augmentation import Corruption
-from train.data.batches import paper_corruption, right_hands
+from train.data.batches import Corruption, paper_corruption, right_hands
 from train.data.shards import Manifest, MappedRows
 from train.labeler_evaluation import Report, evaluate_markers, paper_report
 from train.labelers.cnn_labeler import label_by_distance

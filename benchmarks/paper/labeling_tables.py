@@ -22,8 +22,7 @@ from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
 from train.config import Kind, default_config
-from train.data.augmentation import Corruption
-from train.data.batches import paper_corruption
+from train.data.batches import Corruption, paper_corruption
 from train.data.shards import Dataset
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
@@ -31,7 +30,8 @@ from train.labeler_evaluation import Report
 from train.labelers.protocol import Labeler
 from train.labelers.storage import shipped_labelers
 from train.loop import train_labeler
-from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.room import TWINS
+from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 
 # Median and p90 of real finger markers' gaps [frames]; docs/room_numbers.md.

@@ -11,10 +11,10 @@ import tyro
 from rich.console import Console
 
 from handsim._checks import check_choice
-from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import Place, place_of
 from handsim.app.progress import progress_bar
+from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side

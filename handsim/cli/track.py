@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from track.captures import OnFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
-    from track.sinks.addresses import SinkGroup
+    from track.sinks import SinkGroup
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
@@ -80,7 +80,7 @@ def track(
     from handsim.cli.options import chosen_hands
     from track.live import track_live
     from track.settings import TrackerSetup, TrackSettings
-    from track.sinks.addresses import open_sinks
+    from track.sinks import open_sinks
     from track.streams.frame_source import StreamedFrame
     from track.tracker import warm_up
 

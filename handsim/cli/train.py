@@ -11,12 +11,12 @@ from typing import Annotated, Final
 
 import tyro
 
-from handsim.app.interrupts import Stopped
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.command_table import PresetCommand, given_option
 from handsim.cli.parsing import run_command
 from handsim.errors import DatasetError, HandSimError
+from handsim.files.signals import Stopped
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
 from train.devices.world import world_of
 from train.metrics import print_figures

@@ -17,8 +17,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import BONE_NAMES
 from handsim.space.cameras import CameraRig
-from poses.shapes.library import gesture
-from poses.shapes.validity import make_valid
+from poses.shapes import gesture, make_valid
 from render.illustrations.captions import captioned, pad, side_by_side, titled, with_names
 from render.illustrations.palette import (
     BACKGROUND,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gloves.attachment import Attachment, attach_markers
+from gloves.fit import Attachment, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos

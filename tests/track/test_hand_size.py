@@ -12,7 +12,7 @@ from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from handsim.hand.topology import DIGITS
-from poses.motion.motions import sample_motion
+from poses.motion import sample_motion
 from track.hand_size import (
     SizeFit,
     _is_found,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from train.data.augmentation import Corruption
+from train.data.batches import Corruption
 from train.evaluate import evaluate_labeler
 from train.labelers.protocol import Labeling
 

@@ -10,17 +10,16 @@ import signal
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import WeightsError
+from handsim.files.signals import Stopped
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
 from train.labelers.storage import WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 from train.training_state import TrainingError
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
+from handsim.files.signals import Stopped
 from train.config import SetLabelerConfig, TrainConfig, batch_recipe, default_config
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
@@ -29,9 +29,8 @@ from train.labelers.kinds import batch_loss, new_network, prepare_network
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 
 pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ import pytest
 from gloves.captures.formats import read_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, WeightsError
-from train.data.augmentation import Corruption
+from train.data.batches import Corruption
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.storage import shipped_labelers

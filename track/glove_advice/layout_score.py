@@ -15,8 +15,7 @@ from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
 from track.glove_advice.trials import Trial
-from train.data.augmentation import Corruption, corrupt
-from train.data.batches import paper_corruption
+from train.data.batches import Corruption, corrupt, paper_corruption
 from train.evaluate import evaluate_labeler
 from train.labeler_evaluation import Report, evaluate_clouds
 from train.labelers.protocol import Labeler

@@ -27,7 +27,7 @@ from track.streams.frame_source import checked_frames
 from track.user import nominal_user
 from train.labelers.protocol import Labeler
 from train.metrics import LabelCounts
-from train.simulation.room_settings import SimulatedKind
+from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
 FRAMES: Final = 240

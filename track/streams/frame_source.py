@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_place, check_unit
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from track.frames import FARTHEST
 
 

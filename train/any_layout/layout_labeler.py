@@ -28,9 +28,8 @@ from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, 
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.matching.pose_prior import PosePrior
 from train.matching.prior_learning import learn_pose_prior
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import sample_single_hand
-from train.simulation.people import sample_hands, wear_gloves
+from train.simulation.scenes import sample_hands, wear_gloves
+from train.simulation.training_frames import DatasetConfig, sample_single_hand
 from train.threads import labeling_threads
 
 NUM_POSES: Final = 40_000

@@ -23,8 +23,7 @@ from handsim.hand.topology import PALM
 from train.any_layout.layout_labeler import save_layout_network
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.any_layout.skin_bank import SkinBank, sample_skin_bank
-from train.data.augmentation import Cloud, Corruption, corrupt
-from train.data.batches import stretched
+from train.data.batches import Cloud, Corruption, corrupt, stretched
 from train.threads import torch_threads
 
 PLACES, PEOPLE = 480, 1600

@@ -31,9 +31,8 @@ from train.config import TrainConfig, batch_recipe
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.labelers.storage import LEARNED, learned_folder, learned_gloves
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.people import sample_hands
-from train.simulation.training_frames import simulate_frames
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, simulate_frames
 from train.threads import torch_threads
 
 MOST: Final = 32

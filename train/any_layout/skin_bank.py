@@ -9,15 +9,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Float16, Int
 
-from gloves.attachment import attach_markers, wear
+from gloves.fit import attach_markers, wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import sample_frame_scene
-from train.simulation.people import sample_hands
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, sample_frame_scene
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least

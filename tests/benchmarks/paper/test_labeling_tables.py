@@ -13,7 +13,8 @@ from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST
 from handsim.cli.main import main
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
-from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.room import TWINS
+from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 
 

@@ -9,11 +9,9 @@ import pytest
 import train.loop
 from handsim.cli.main import main
 from train.config import EPOCHS, CNNConfig, TrainConfig, default_config, preset_config
-from train.data.augmentation import Corruption
-from train.data.batches import paper_corruption
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
+from train.data.batches import Corruption, paper_corruption
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 from train.training_state import _rate
 
 FRAMES = 16

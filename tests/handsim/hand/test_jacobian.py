@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.jacobian import NUM_VELOCITIES, skinned_jacobian
 from handsim.hand.model import HandModel, join_qpos

@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.attachment import Attachment
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.camera import look_at
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.illustrations.scene import (
     Balls,
     HandScene,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import shade_colors, skin_material

@@ -16,7 +16,7 @@ from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import SIDES, Side
 from handsim.space.camera import Camera, look_at, pinhole
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.painting.figures import Drawn, HandFigure, sample_people
 from render.painting.materials import Material
 from render.painting.painter import Painter, paint, put_before

@@ -12,7 +12,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.skin.surface import vertex_normals
 from handsim.space.camera import Camera, look_at, pinhole, preset
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from render.painting.rasterizer import Triangles, join, rasterize
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")

@@ -10,7 +10,7 @@ from handsim.hand.shape import sample_shape
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, SIDES, Side
 from handsim.space.transforms import MIRROR
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.skin.atlas import RINGS, skin_atlas
 from render.skin.forearm import CUFF, FOREARM, REACH, Forearm, arm_places, sample_forearm
 from render.skin.mesh import PosableSkin, face_parts

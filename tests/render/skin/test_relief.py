@@ -5,7 +5,7 @@ import pytest
 
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import SIDES, Side
-from poses.shapes.library import gesture
+from poses.shapes import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import skin_material

@@ -8,7 +8,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from poses.shapes.validity import resting_angles
+from poses.shapes import resting_angles
 from track.association.frame_state import FrameState, targets_of
 from track.association.hand_state import HandState, HandTrack
 from track.association.labeler_review import LabelerReview

@@ -15,7 +15,7 @@ from gloves.layout import load_layout
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
-from poses.shapes.sampling import sample_poses
+from poses.shapes import sample_poses
 from track.config import HandOrigin
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.marker_kinematics import hand_arrays

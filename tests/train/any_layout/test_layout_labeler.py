@@ -16,7 +16,7 @@ from train.any_layout.layout_labeler import (
     save_layout_network,
     shipped_network,
 )
-from train.data.augmentation import Corruption
+from train.data.batches import Corruption
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.storage import shipped_labelers

@@ -11,7 +11,7 @@ from gloves.layout import load_layout
 from train.any_layout import learned_gloves
 from train.any_layout.layout_labeler import LayoutLabeler, sample_worn_markers, shipped_network
 from train.any_layout.learned_gloves import fine_tuned_labeler, is_learned, learned_labeler
-from train.data.augmentation import Corruption
+from train.data.batches import Corruption
 from train.evaluate import evaluate_labeler
 from train.labelers.storage import learned_folder
 

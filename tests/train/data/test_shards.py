@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from train.config import TrainConfig, batch_recipe
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset, MappedRows, row_dtype
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 
 
 def shards_of(sizes):

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, HandSimError
+from handsim.files.signals import Stopped
 from train.config import TrainConfig
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import start_fabric

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.held_out import held_out_markers
 from train.config import CNNConfig
-from train.data.augmentation import Corruption, corrupt
+from train.data.batches import Corruption, corrupt
 from train.glove_labeler import load_labeler
 from train.labelers import kinds
 from train.labelers.kinds import labeler_of, new_network

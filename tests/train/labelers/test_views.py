@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from train.data.augmentation import Corruption, corrupt
+from train.data.batches import Corruption, corrupt
 from train.labelers.views import (
     MIRROR_IMAGE,
     SIGNS,

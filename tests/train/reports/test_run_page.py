@@ -25,8 +25,8 @@ from train.loop import CHECKPOINT, train_labeler
 from train.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig
 from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit

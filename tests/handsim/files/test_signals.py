@@ -11,7 +11,7 @@ import time
 import pytest
 
 import handsim.cli.main as command
-from handsim.app.interrupts import Stopped, interrupt_flag, interrupts_bare, signals_raise
+from handsim.files.signals import Stopped, interrupt_flag, interrupts_bare, signals_raise
 from tests.waiting import LONG
 
 

@@ -22,9 +22,7 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.library import gesture
-from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid
+from poses.shapes import HIGH, LOW, MAX_PENETRATION, gesture, is_valid, make_valid
 
 FINGERS: Final = DIGITS[1:]
 MAX_OVERLAP: Final = 0.0006

@@ -1,11 +1,16 @@
-"""What is sent of a tracked frame: names that never change, and numbers that do. Nothing here is a format."""
+"""What is sent of a tracked frame: names that never change, numbers that do, and both as documents.
+
+Every outgoing message is made here, by `MessageEncoder`; docs/live_output.md describes the documents.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic
-from typing import Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,6 +18,8 @@ from jaxtyping import Float, Int
 from gloves.fit import GloveFit
 from gloves.takes.status import Status
 from gloves.takes.take import label_names
+from handsim import __version__
+from handsim._extras import import_extra
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate
@@ -21,6 +28,8 @@ from track.streams.frame_source import StreamedFrame
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""
+FORMATS: Final = ("json", "msgpack")
+_DECIMALS: Final = 6  # micrometers and microradians
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +115,8 @@ class LiveMessage:
 class LiveSink(Protocol):
     """Takes messages somewhere; a class of the user's own for `handsim track --send module:name`.
 
-    Both methods are called by the tracker, which waits for them: `send` must not wait itself. A sink that
-    raises is told and closed, and tracking goes on without it.
+    The tracker calls both methods and waits for them, so `send` must not wait itself. A sink that raises is
+    closed with a warning, and tracking goes on without it.
     """
 
     def send(self, message: LiveMessage) -> None:
@@ -134,26 +143,19 @@ class MessageEncoder:
         """The names in its messages."""
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
-        """The message of a frame.
-
-        Args:
-            frame: The frame, with the tracker's time.
-            tracked: What the tracker made of it.
-        """
-        hands = tuple(self._hand(number, hand) for number, hand in enumerate(tracked.hands))
-        bodies = tuple(
-            LiveBody(body.name, body.status, body.translation, body.rotation) for body in tracked.bodies
-        )
+        """The message of a frame, which has the tracker's time."""
         return LiveMessage(
-            self.header,
-            frame.number,
-            frame.time,
-            frame.silent,
-            hands,
-            bodies,
-            frame.points,
-            tracked.labels,
-            monotonic() - frame.arrived,
+            header=self.header,
+            number=frame.number,
+            time=frame.time,
+            silent=frame.silent,
+            hands=tuple(self._hand(number, hand) for number, hand in enumerate(tracked.hands)),
+            bodies=tuple(
+                LiveBody(one.name, one.status, one.translation, one.rotation) for one in tracked.bodies
+            ),
+            points=frame.points,
+            labels=tracked.labels,
+            lag=monotonic() - frame.arrived,
         )
 
     def _hand(self, number: int, hand: TrackedHand) -> LiveHand:
@@ -163,3 +165,89 @@ class MessageEncoder:
         wrist, angles = (hand.qpos[:3], hand.qpos[3:7]), hand.qpos[7:]
         spreads = hand.angle_spread, hand.keypoint_spread
         return LiveHand(hand.side, hand.status, *wrist, angles, positions, *spreads)
+
+
+class MessageFormat(NamedTuple):
+    """How messages become bytes."""
+
+    header: Callable[[LiveHeader], bytes]
+    frame: Callable[[LiveMessage], bytes]
+    is_text: bool = False
+
+
+def document_format(name: str, *, points: bool = False) -> MessageFormat:
+    """Messages as documents, with all points and their labels if `points`.
+
+    Raises:
+        ArgumentError: The format, one of `FORMATS`, needs a package that is not installed.
+    """
+    encode: Callable[[dict[str, Any]], bytes] = _encode_json
+    if name == "msgpack":
+        packer: Callable[[], Any] = import_extra("msgpack", f"format={name}", "send").Packer
+        encode = packer().pack
+    return MessageFormat(
+        lambda header: encode(header_document(header)),
+        lambda message: encode(frame_document(message, points=points)),
+        is_text=name == "json",
+    )
+
+
+def header_document(header: LiveHeader) -> dict[str, Any]:
+    """The header: names and units of everything that the frames hold."""
+    return {
+        "type": "header",
+        "schema": SCHEMA,
+        "source": f"handsim {__version__}",
+        "units": {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"},
+        "sides": list(header.sides),
+        "angles": list(header.angles),
+        "positions": list(header.positions),
+        "bodies": list(header.bodies),
+        "markers": list(header.markers),
+    }
+
+
+def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, Any]:
+    """A frame: what is NaN in the message is null here."""
+    document = {
+        "type": "frame",
+        "schema": SCHEMA,
+        "number": int(message.number),
+        "time": float(message.time),
+        "silent": message.silent,
+        "lag": None if math.isnan(message.lag) else round(message.lag, _DECIMALS),
+        "hands": [_hand_document(hand) for hand in message.hands],
+        "bodies": [
+            {"name": body.name, "status": str(body.status), "pose": _pose(body)} for body in message.bodies
+        ],
+    }
+    if points:
+        document |= {"points": _rounded(message.points), "labels": message.labels.tolist()}
+    return document
+
+
+def _encode_json(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _hand_document(hand: LiveHand) -> dict[str, Any]:
+    return {
+        "side": hand.side,
+        "status": str(hand.status),
+        "wrist": _pose(hand),
+        "angles": _rounded(hand.angles) if hand.has_pose else None,
+        "positions": _rounded(hand.positions) if hand.has_pose else None,
+        "angle_spread": None if np.isnan(hand.angle_spread).any() else _rounded(hand.angle_spread),
+        "position_spread": None if np.isnan(hand.position_spread).any() else _rounded(hand.position_spread),
+    }
+
+
+def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
+    if not thing.has_pose:
+        return None
+    return {"position": _rounded(thing.position), "quaternion": _rounded(thing.quaternion)}
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> Any:
+    """Numbers of a document, as lists."""
+    return np.round(values, _DECIMALS).tolist()

@@ -1,4 +1,4 @@
-"""Documents: what is in a message, as JSON and as MessagePack."""
+"""Messages hold what the tracker found and a name for every number, also as JSON and MessagePack."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
 from handsim.errors import ArgumentError
-from track.sinks.documents import FORMATS, encoder_of, frame_document, header_document
+from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
+from track.live_message import FORMATS, document_format, frame_document, header_document
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
@@ -29,9 +32,8 @@ DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 )
 def test_a_frame_comes_back(name, message, number, seed, lost, points):
     one = message(number, seed=seed, lost=lost, points=points)
-    document = frame_document(one, points=True)
-    there = DECODE[name](encoder_of(name)(document))
-    assert there == document
+    there = DECODE[name](document_format(name, points=True).frame(one))
+    assert there == frame_document(one, points=True)
     assert (there["type"], there["schema"], there["number"]) == ("frame", 1, number)
     assert there["time"] == one.time and there["silent"] is False
     for hand, sent in zip(there["hands"], one.hands, strict=True):
@@ -54,7 +56,7 @@ def test_a_frame_comes_back(name, message, number, seed, lost, points):
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_header_names_everything(name, message):
     header = message().header
-    document = DECODE[name](encoder_of(name)(header_document(header)))
+    document = DECODE[name](document_format(name).header(header))
     assert (document["type"], document["schema"]) == ("header", 1)
     assert document["units"] == {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"}
     for key in ("sides", "angles", "positions", "bodies", "markers"):
@@ -66,8 +68,8 @@ def test_points_are_left_out_unless_asked_for(message):
 
 
 def test_a_frame_of_two_hands_takes_three_kilobytes(message):
-    assert len(encoder_of("msgpack")(frame_document(message()))) < 3000
-    assert len(encoder_of("json")(frame_document(message()))) < 3500
+    assert len(document_format("msgpack").frame(message())) < 3000
+    assert len(document_format("json").frame(message())) < 3500
 
 
 def test_a_missing_package_is_told(monkeypatch):
@@ -75,7 +77,7 @@ def test_a_missing_package_is_told(monkeypatch):
     with pytest.raises(
         ArgumentError, match=r"format=msgpack needs the package msgpack.*pip install 'handsim\[send\]'"
     ):
-        encoder_of("msgpack")
+        document_format("msgpack")
 
 
 def test_the_page_shows_what_is_sent(message):
@@ -93,3 +95,37 @@ def test_the_page_shows_what_is_sent(message):
             key: type(value) for key, value in real.items()
         }
     assert set(shown[1]["bodies"][0]) == set(frame["bodies"][0])
+
+
+def test_every_number_has_a_name(message):
+    one = message()
+    header = one.header
+    assert header.sides == tuple(hand.side for hand in one.hands) == ("right", "left")
+    assert header.angles == JOINT_NAMES and one.hands[0].angles.shape == (len(header.angles),)
+    assert one.hands[0].positions.shape == (len(header.positions), 3)
+    assert header.bodies == tuple(body.name for body in one.bodies) == ("mug",)
+    assert header.markers[0] == "right:" + load_layout("dense19").names[0]
+    assert header.markers[19].startswith("left:") and header.markers[38].startswith("mug:")
+    assert message(1).header is header
+
+
+def test_joint_positions_are_those_of_the_pose(message):
+    one = message()
+    for hand in one.hands:
+        qpos = np.concatenate([hand.position, hand.quaternion, hand.angles])
+        bones = nominal_fit(load_layout("dense19"), "M", hand.side).model.forward_kinematics(qpos[None])[0]
+        place = dict(zip(one.header.positions, hand.positions, strict=True))
+        np.testing.assert_allclose(place["wrist"], hand.position, atol=1e-12)
+        for joint, bone in (("thumb_CMC", "thumb_metacarpal"), ("index_PIP", "index_middle"),
+                            ("little_DIP", "little_distal")):  # fmt: skip
+            np.testing.assert_allclose(place[joint], bones[BONE_NAMES.index(bone), :3, 3], atol=1e-12)
+        tip = np.linalg.inv(bones[BONE_NAMES.index("ring_distal")]) @ [*place["ring_tip"], 1.0]
+        assert tip[0] > 0.015 and abs(tip[1:3]).max() < 1e-9, "ahead of its bone"
+
+
+def test_a_lost_hand_has_no_numbers(message):
+    one = message(lost=True)
+    assert [hand.has_pose for hand in one.hands] == [True, False] and not one.bodies[0].has_pose
+    lost = one.hands[1]
+    for values in (lost.position, lost.quaternion, lost.angles, lost.positions):
+        assert np.isnan(values).all()
