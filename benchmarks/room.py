@@ -28,7 +28,7 @@ from gloves.optics.mesh_tree import hand_tree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import facing_cameras, visible_cameras
 from handsim.hand.model import join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
 from train.simulation.dataset_config import DatasetConfig

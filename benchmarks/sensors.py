@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.space.camera import Camera, pinhole
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, pinhole
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 from render.sensors.depth_noise import SENSORS, apply_depth_noise, named_sensor, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of

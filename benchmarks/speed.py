@@ -58,7 +58,7 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from poses.shapes.validity import sample_valid_angles
 from track.setup import warm_up
 from track.tracker import Tracker

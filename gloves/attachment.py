@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import ArgumentError, LayoutError
-from handsim.hand.mjcf import Site
-from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import HandSurface, vertex_normals
-from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
+from handsim.hand.model import HandModel, Site
+from handsim.hand.shape import BONE_NAMES, NUM_BONES, PALM
+from handsim.hand.skin import HandSurface, vertex_normals
 from handsim.kernels.kernel import kernel
 
 _MOST_FITTINGS: Final = 20

@@ -14,9 +14,8 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_QPOS, Side
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import NUM_QPOS, HandShape, Side
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 
 

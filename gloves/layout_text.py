@@ -9,7 +9,7 @@ from typing import Final
 
 from gloves.layout import MarkerLayout, MarkerPlace, layout_lines, parse_layout
 from handsim.errors import HandSimError
-from handsim.files.toml_values import quoted, written
+from handsim.files.inputs import quoted, written
 
 _TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
 _ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")

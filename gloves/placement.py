@@ -14,8 +14,8 @@ from gloves.attachment import attach_markers
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONE_NAMES, PALM
+from handsim.hand.shape import BONE_NAMES, PALM
+from handsim.hand.skin import vertex_normals
 
 _STEPS: Final = 12
 _NEAR: Final = 1e-5  # [m]

@@ -17,7 +17,7 @@ from gloves.takes.take import RigidBody, Take
 from handsim._checks import check_type, make_settings
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from render.cameras.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 from render.config import RenderConfig, SpawnKey
 from render.frames import RenderedFrame

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
-from handsim.hand.keypoints import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import DIGITS, PALM, bones_of
+from handsim.hand.model import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.space.camera import Camera
 from render.frames import PARTS_A_HAND, HandTruth, Pictures
 from render.painting.figures import HandFigure

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from handsim.errors import DatasetError
 from handsim.files.json_files import load_json
-from handsim.files.names import plain_path
-from handsim.hand.topology import NUM_KEYPOINTS, SIDES
+from handsim.files.outputs import plain_path
+from handsim.hand.shape import NUM_KEYPOINTS, SIDES
 
 _CENTER: Final = 0.5  # COCO counts pixels from the first one's center, we count from its corner
 _FEWEST: Final = 3  # labeled keypoints of a hand that can be cut out

@@ -15,9 +15,16 @@ from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWar
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
 from handsim.hand.model import join_qpos
-from handsim.hand.shape import HAND_DTYPE, HandShape, shape_from_measures, unpack_hand
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
-from handsim.motion_files.joint_table import read_joint_csv
+from handsim.hand.shape import (
+    HAND_DTYPE,
+    NUM_JOINTS,
+    NUM_QPOS,
+    HandShape,
+    Side,
+    shape_from_measures,
+    unpack_hand,
+)
+from handsim.motion_files.joint_files import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes.couplings import HIGH, LOW
 

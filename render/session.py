@@ -27,7 +27,7 @@ from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
-from handsim.space.rig_file import check_names
+from handsim.space.rig import check_names
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured
 from render.formats.annotations.common import centered_K, without_colors

@@ -19,8 +19,7 @@ from handsim._checks import check_choice, check_count, check_type
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, load_model
-from handsim.hand.shape import HAND_DTYPE, HandShape, pack_hand, sample_shape
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import HAND_DTYPE, SIDES, HandShape, Side, pack_hand, sample_shape
 from render.config import SpawnKey
 from render.pose_file import CSV, MOST_PEOPLE, OwnPoses, check_poses, read_pose_file
 

@@ -19,7 +19,7 @@ from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.association.initialization import FEWEST_POINTS
 from track.association.point_linking import change_of_distances
 from track.association.single_frames import label_alone

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.takes.take import LOST, Take
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import point_distance
 from track.kinematics.joint_prior import resting_prior

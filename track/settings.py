@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from gloves.fit import GloveFit
 from handsim._checks import check_type, make_settings
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.bodies.body_file import AnyBody
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyGlove, AnyLabeler

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, TRACKED, Take
-from handsim.hand.topology import BONES, Side
+from handsim.hand.shape import BONES, Side
 from track.calibration.frames import CalibrationError
 from track.calibration.solver import Progress
 from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from gloves.takes.status import Status
-from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
+from gloves.takes.points import Status
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
 
 Spreads = tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]
 """Standard deviation of each joint angle [rad], and of each keypoint in each direction [m]."""

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, select_hands
 from gloves.captures.formats import find_captures, read_markers
-from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_rng, check_type

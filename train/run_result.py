@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from handsim._version import __version__
-from handsim.files.atomic import written_together
+from handsim import __version__
+from handsim.files.outputs import written_together
 from train.config import CNNConfig, Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption, right_hands

@@ -17,7 +17,7 @@ from torch import nn
 
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.arrays import check_members
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from train.config import TrainConfig
 from train.data.batches import Batch, Part
 from train.data.shards import MappedRows

@@ -19,7 +19,7 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import PALM
+from handsim.hand.shape import PALM
 from handsim.space.transforms import rigid_fit
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.kernels.kernel import kernel
-from handsim.space.lens import PINHOLE, distort_jacobian
+from handsim.space.camera import PINHOLE, distort_jacobian
 
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gloves.optics.mirrors import cameras_by_mirror, reflect
 from handsim._checks import check_number, check_span
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 MAX_GHOSTS: Final = 4
 """Ghosts kept per frame; more are dropped at random."""

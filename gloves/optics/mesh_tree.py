@@ -13,7 +13,7 @@ from gloves.optics.mesh_lines import refit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.shape import named_shape
-from handsim.hand.skin.surface import build_surface
+from handsim.hand.skin import build_surface
 from handsim.kernels.kernel import kernel
 
 _LEAF: Final = 4  # triangles of a leaf at most

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 
 def reflect(

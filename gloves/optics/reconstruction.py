@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.triangulation import reconstruct_frames
 from handsim.errors import ArgumentError
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 MAX_FALSE_POINTS: Final = 6
 """False intersections kept per frame."""

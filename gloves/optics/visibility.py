@@ -12,7 +12,7 @@ from handsim.hand.capsules import bounding_spheres
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 MAX_FACING: Final = np.deg2rad(85.0)
 """Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from handsim.app.workers import check_workers, without_signals
 from handsim.errors import ArgumentError, HandSimError
 from handsim.files.json_files import load_json

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import HandSimError
 from handsim.files.signals import ENDING
 

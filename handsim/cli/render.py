@@ -17,7 +17,7 @@ from handsim.app.output import Place, place_of
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from render.cameras.viewpoints import Placement, ViewConfig
 from render.config import RenderConfig
 from render.formats.merging import merge_renderings

@@ -15,7 +15,7 @@ from handsim._checks import check_choice
 from handsim.errors import ArgumentError
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS, bones_of
+from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.transforms import MIRROR, euler_matrix
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture, gesture_names

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from handsim.errors import PoseError
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rotation_quaternions
 from poses.motion.paths import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk

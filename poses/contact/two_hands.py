@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
 from poses.contact.meetings import draw_poses, play_meeting

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, BONES, JOINTS, NUM_JOINTS, NUM_QPOS, PALM
+from handsim.hand.model import HandModel, build_spec
+from handsim.hand.shape import BONE_NAMES, BONES, JOINTS, NUM_JOINTS, NUM_QPOS, PALM
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 

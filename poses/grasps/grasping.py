@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
 from poses.grasps.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, pose_to_qpos
 from poses.grasps.hold_library import HoldStyle, hold_names, hold_style, place_object

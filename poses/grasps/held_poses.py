@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
 from poses.grasps.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene
 from poses.grasps.grasping import Hold

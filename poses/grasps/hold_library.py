@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.files.json_files import package_data
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import shape_from_measures
-from handsim.hand.topology import BONE_NAMES, DIGITS, NUM_JOINTS, bones_of
+from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
+from handsim.hand.shape import BONE_NAMES, DIGITS, NUM_JOINTS, bones_of, shape_from_measures
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import MIRROR, quaternion_matrix, vector_quaternions
 from poses.grasps.grasp_scene import GraspScene

@@ -17,8 +17,7 @@ from handsim._checks import check_array, check_number, check_rng, check_type
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS, HandShape
 from poses.motion.paths import MotionConfig, held, minimum_jerk, path_to_rest, straight_path
 from poses.motion.wrist_paths import free_wrist_path
 from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_number, check_span
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.validity import is_valid, resting_angles

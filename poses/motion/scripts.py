@@ -15,8 +15,7 @@ from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS, HandShape
 from poses.motion.motions import angles_through, count_frames, sample_motion, with_wrist
 from poses.motion.paths import MotionConfig, can_be_left
 from poses.shapes.library import gesture, gestures_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array, check_number, check_span
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.motion.paths import MotionConfig, minimum_jerk
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim.hand.topology import JOINTS
+from handsim.hand.shape import JOINTS
 
 LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
 HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])

@@ -13,8 +13,7 @@ from handsim._checks import check_array, check_callable, check_rng, check_type
 from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, HandShape
 from poses.shapes.samplers import sample_angles
 from poses.shapes.validity import make_valid
 
@@ -40,7 +39,7 @@ class PoseSampler(Protocol):
             rng: Source of all randomness.
 
         Returns:
-            Joint angles [rad], in the order of `handsim.hand.topology.JOINTS`; or whole poses: wrist position
+            Joint angles [rad], in the order of `handsim.hand.shape.JOINTS`; or whole poses: wrist position
             [m], wrist orientation (wxyz) and these angles.
         """
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import JOINTS, NUM_QPOS
+from handsim.hand.shape import JOINTS, NUM_QPOS, HandShape
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.samplers import DEFAULT_MIX, PoseMix, sample_angles

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from gloves.takes.take import Take
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from handsim.space.camera import Camera
 
 _KEPT: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that a hand's outline depends on

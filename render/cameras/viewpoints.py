@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import load_rig
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig import load_rig
+from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.framing import Framing, looking, poses_at
 

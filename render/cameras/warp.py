@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float32
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, camera_matrix
 
 Interpolation = Literal["nearest", "linear"]
 _MARGIN: Final = 2  # [px] around what is looked up

@@ -22,8 +22,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path, unwritten
 from render.frames import Pictures, RenderedFrame
 
 _RGB: Final = ("R", "G", "B")

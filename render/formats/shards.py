@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write, temporary_beside
+from handsim.files.outputs import atomic_write, temporary_beside
 from render.formats.annotations.common import to_json
 
 INDEX: Final = "index.json"

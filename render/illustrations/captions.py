@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from render.illustrations.palette import BACKGROUND
 
 Picture = UInt8[np.ndarray, "H W 3"]

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim.errors import ArgumentError, FileError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel
 from render.illustrations.scene import Balls, HandScene, PosedHand, View, render_rgb, view_along
 

@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
+from handsim.hand.model import KEYPOINT_DIGITS, SKELETON
 from render.formats.annotations.common import CENTER, as_sensed
 from render.frames import HandTruth, RenderedFrame
 from render.illustrations.captions import pad, side_by_side

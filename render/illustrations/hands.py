@@ -14,9 +14,8 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIZES
-from handsim.hand.topology import BONE_NAMES
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import BONE_NAMES, SIZES
+from handsim.space.rig import CameraRig
 from poses.shapes.library import gesture
 from poses.shapes.validity import make_valid
 from render.illustrations.captions import captioned, pad, side_by_side, titled, with_names

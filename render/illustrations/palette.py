@@ -9,8 +9,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, DIGITS
+from handsim.hand.shape import BONES, DIGITS
+from handsim.hand.skin import vertex_normals
 from render.painting.materials import Material, linear
 from render.skin.glove_look import GLOVE_COLOR
 

@@ -15,8 +15,8 @@ from gloves.fit import GloveFit
 from handsim._checks import check_array
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
+from handsim.hand.skin import vertex_normals
 from handsim.space.camera import Camera, pinhole
 from render.illustrations.palette import BACKGROUND, Covering, covering_material, skin_tint
 from render.painting.figures import Drawn, sphere_surface

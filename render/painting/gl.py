@@ -9,7 +9,7 @@ import subprocess
 import sys
 from typing import Any, Final
 
-from handsim._extras import EGL_PACKAGES
+from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
 
 _BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later

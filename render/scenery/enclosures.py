@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 from numpy.typing import NDArray
 
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens
 from render.frames import Pictures
 from render.scenery.backgrounds import Background, draw_background
 from render.scenery.photographs import photos_beside

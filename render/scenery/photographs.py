@@ -15,7 +15,7 @@ from PIL import Image
 
 from handsim.errors import HandSimError
 from handsim.files.inputs import check_regular
-from handsim.files.names import plain_path
+from handsim.files.outputs import plain_path
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, camera_matrix
 from render.sensors import structured_light, time_of_flight
 from render.sensors.structured_light import StructuredLight
 from render.sensors.time_of_flight import TimeOfFlight

@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.hand.skin.cage_topology import WRIST, cage_topology
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
+from handsim.hand.skin import WRIST, cage_topology, catmull_clark, subdivided_loops
 
 TILE: Final = 16
 """Texels along a tile's side."""

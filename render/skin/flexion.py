@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.topology import JOINT_NAMES
+from handsim.hand.shape import JOINT_NAMES
 from handsim.space.transforms import MIRROR
 from render.skin.fields import bump, smooth
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from handsim.errors import HandSimError
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_BONES
+from handsim.hand.shape import NUM_BONES, HandShape
 from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR
 from render.skin.fields import smooth

@@ -17,7 +17,7 @@ from render.skin.texels import REFERENCE, behind_wrist, skin_texels
 from render.skin.texture import SkinTexture, lab_to_srgb
 
 if TYPE_CHECKING:
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
 """Of an average glove, sRGB in [0, 1]."""

@@ -15,8 +15,8 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import skin_frames, vertex_normals
-from handsim.hand.topology import BONES, DIGITS, NUM_BONES, PALM
+from handsim.hand.shape import BONES, DIGITS, NUM_BONES, PALM
+from handsim.hand.skin import skin_frames, vertex_normals
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import quaternion_matrix
 from render.skin.atlas import RINGS, skin_atlas

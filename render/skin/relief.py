@@ -18,7 +18,7 @@ from render.skin.fields import bump, smooth
 from render.skin.texels import skin_texels
 
 if TYPE_CHECKING:
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 
 _STEEPEST: Final = 0.9  # height over distance

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import DIGITS, NUM_BONES
+from handsim.hand.shape import DIGITS, NUM_BONES
+from handsim.hand.skin import vertex_normals
 from handsim.kernels.kernel import kernel
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import bump, smooth

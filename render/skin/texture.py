@@ -18,7 +18,7 @@ from render.skin.relief import normal_map, relief
 from render.skin.texels import behind_wrist, line_depth, skin_texels
 
 if TYPE_CHECKING:
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 
 _SHADED: Final = 0.006  # [m] of skin before a sleeve that lie in its shadow

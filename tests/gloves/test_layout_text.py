@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import gloves.layout
 from gloves.layout import load_layout, starter_layout
 from gloves.layout_text import moved_text
-from handsim.hand.topology import BONE_NAMES
+from handsim.hand.shape import BONE_NAMES
 
 DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
 

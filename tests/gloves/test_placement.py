@@ -14,7 +14,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.placement import place_marker
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.skin import vertex_normals
 
 LAYOUT = load_layout("dense19")
 MODELS = {side: HandModel.named("M", side=side) for side in ("right", "left")}

@@ -9,8 +9,7 @@ import pytest
 
 from handsim import Camera, HandModel
 from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import join_qpos
+from handsim.hand.model import hand_keypoints, join_qpos
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw
 from render.cameras.viewpoints import PLACEMENTS, Viewpoints

@@ -10,7 +10,7 @@ import pytest
 
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import ArgumentError, HandSimWarning, LayoutError, WeightsError
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import OwnLabeler

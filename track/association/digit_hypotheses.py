@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
 from handsim.kernels.segments import point_distance

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.integration import move, velocity_of
 from handsim.kernels.kernel import kernel
 from track.association.assignment import peak_log_odds

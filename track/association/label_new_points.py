@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from track.association.assignment import assign_jointly, match_log_odds, match_points
 from track.association.candidates import MAX_CANDIDATES, DigitCandidates, MarkerTable, find_candidates
 from track.association.digit_hypotheses import DigitHypotheses, empty_hypotheses, evaluate_digit

@@ -10,9 +10,9 @@ import numpy as np
 
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, choices
-from handsim.files.atomic import atomic_write, read_toml
-from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
-from handsim.hand.topology import SIDES
+from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import SIDES
 from handsim.space.objects import named_object, object_names
 from track.bodies.constellation import FEWEST
 from track.bodies.rigid_body import RigidTemplate

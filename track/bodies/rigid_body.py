@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import RigidBody
 from handsim._checks import check_array
 from handsim.errors import ArgumentError

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gloves.captures.capture import Capture
-from gloves.captures.plausibility import check_unit
+from gloves.captures.capture import Capture, check_unit
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate, template_fault
 from track.calibration.frames import CalibrationError
 from track.streams.frame_source import StreamedFrame, capture_frames

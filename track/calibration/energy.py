@@ -19,11 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.skin.surface import rest_vertices
-from handsim.hand.topology import NUM_BONES
+from handsim.hand.model import HandModel, skinned_jacobian
+from handsim.hand.shape import NUM_BONES, HandShape
+from handsim.hand.skin import rest_vertices
 from handsim.kernels.integration import move
 from track.calibration.contacts import (
     PAD_COMPRESSION,

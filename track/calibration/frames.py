@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.topology import BONES, DIGITS
+from handsim.hand.shape import BONES, DIGITS
 from track.kinematics.pose_solver import PoseSolver
 
 NUM_FRAMES: Final = 240

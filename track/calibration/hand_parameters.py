@@ -14,10 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.model import HandModel
-from handsim.hand.shape import ADULTS, HandShape
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.topology import DIGITS, NUM_BONES
+from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape
 from handsim.kernels.kernel import kernel
 
 LENGTH, BREADTH = 0, 1  # log factors

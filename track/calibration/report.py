@@ -8,11 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.skin.surface import rest_vertices
-from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, PALM
+from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, PALM, HandShape
+from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import quaternion_matrix, rigid_fit
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.energy import HEIGHT_SPREAD, POSITION_SPREAD, Estimate, Fit, Problem

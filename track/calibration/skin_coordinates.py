@@ -17,10 +17,8 @@ from scipy import sparse
 
 from gloves.attachment import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.shape import HandShape, named_shape
-from handsim.hand.skin.subdivision import catmull_clark
-from handsim.hand.skin.surface import build_surface, vertex_normals
-from handsim.hand.topology import NUM_BONES
+from handsim.hand.shape import NUM_BONES, HandShape, named_shape
+from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
 
 _MOST_STEPS: Final = 40
 _OUTSIDE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
@@ -31,7 +29,7 @@ class SkinTopology(NamedTuple):
     """Topology and weights, the same for the skins of all hands."""
 
     subdivide: sparse.csr_array
-    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin.surface` to these."""
+    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these."""
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     adjacent: Int[np.ndarray, "F 3"]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from handsim.space.transforms import MIRROR
 from track.calibration.contacts import contact_weights, find_touches, initialize_contacts
 from track.calibration.energy import Estimate, Fit, Problem

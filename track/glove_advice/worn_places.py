@@ -15,8 +15,8 @@ from gloves.fit import GloveFit
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from gloves.optics.visibility import visible_cameras
 from handsim.hand.model import HandModel
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import SIDES
+from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import pose_spreads
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import sample_single_hand

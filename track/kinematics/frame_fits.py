@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS
 from handsim.kernels.kernel import kernel
 from track.kinematics.levenberg_marquardt import MARKER_NOISE, levenberg_marquardt, marker_residuals
 from track.kinematics.marker_kinematics import NUM_UNKNOWNS, HandArrays, Workspace, workspace

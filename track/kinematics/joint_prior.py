@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from poses.shapes.library import LIBRARIES, gestures_of
 from track.kinematics.levenberg_marquardt import eliminate, invert_positive, solve_positive

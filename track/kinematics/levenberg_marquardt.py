@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import rotate_quaternion
 from track.kinematics.marker_kinematics import (

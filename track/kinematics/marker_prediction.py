@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
 from track.kinematics.levenberg_marquardt import invert_positive, marker_residuals, solve_positive

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from gloves.fit import GloveFit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import DIGITS, NUM_JOINTS, NUM_QPOS
 from track.kinematics.frame_fits import FEWEST_MARKERS, fit_frames
 from track.kinematics.joint_prior import JointPrior
 from track.kinematics.levenberg_marquardt import MARKER_NOISE

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import ADULTS
-from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
+from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from track.config import HandOrigin
 from track.kinematics.joint_prior import resting_prior

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import align_rigid, write_quaternion_matrix
 

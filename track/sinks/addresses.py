@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from gloves.fit import GloveFit
 from handsim._checks import check_type
-from handsim._closing import Closing
 from handsim._plugins import is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
 from track.bodies.rigid_body import RigidTemplate
 from track.network_address import split_address

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from handsim.errors import ArgumentError
 from track.sinks.documents import Encode, frame_document, header_document
 from track.sinks.message import SCHEMA, LiveHeader, LiveMessage

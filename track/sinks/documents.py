@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim import __version__
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from track.sinks.message import SCHEMA, LiveBody, LiveHand, LiveHeader, LiveMessage
 
 Encode = Callable[[dict[str, Any]], bytes]

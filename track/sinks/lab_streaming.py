@@ -7,8 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gloves.takes.status import Status
-from handsim._extras import import_extra
+from gloves.takes.points import Status
+from handsim._plugins import import_extra
 from track.sinks.message import SCHEMA, LiveHeader, LiveMessage
 
 STATUSES: Final = tuple(reversed(Status))

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import label_names
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import JOINT_NAMES, Side
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame, TrackedHand

@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from handsim.errors import ArgumentError
 from track.sinks.documents import Encode, frame_document, header_document
 from track.sinks.message import LiveMessage

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gloves.layout import MarkerLayout
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import WeightsError
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.json_files import save_json
-from handsim.hand.topology import SIDES
+from handsim.files.outputs import atomic_write, written_together
+from handsim.hand.shape import SIDES
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.matching.pose_prior import PosePrior

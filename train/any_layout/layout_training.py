@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from handsim.files.atomic import atomic_write
-from handsim.hand.topology import PALM
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import PALM
 from train.any_layout.layout_labeler import save_layout_network
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.any_layout.skin_bank import SkinBank, sample_skin_bank

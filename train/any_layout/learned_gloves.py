@@ -20,11 +20,11 @@ import torch
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import WeightsError
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.files.outputs import atomic_write
+from handsim.space.rig import CameraRig, as_rig
 from train.any_layout.layout_labeler import SHIPPED, WEIGHTS, LayoutLabeler
 from train.any_layout.layout_network import layout_loss
 from train.config import TrainConfig, batch_recipe

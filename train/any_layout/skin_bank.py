@@ -13,7 +13,7 @@ from gloves.attachment import attach_markers, wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, PALM, SIDES
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import sample_frame_scene

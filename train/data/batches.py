@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.own_corruption import OwnCorruption, draw_cloud
 from train.data.shards import MappedRows

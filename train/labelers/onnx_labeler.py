@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import HandSimError, WeightsError
-from handsim.files.atomic import atomic_write
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path
 from train.config import CNNConfig
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.protocol import Labeling, checked_names, label_by_scores, label_in_batches, pad_clouds

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
+from handsim.files.outputs import atomic_write, written_together
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
 from train.labelers.set_inference import TrainedSetLabeler, weight_shapes

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from gloves.captures.capture import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
-from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
+from handsim.space.rig import FEWEST_CAMERAS, CameraRig
 from train.rig_advice.work import room_of_work
 from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion

@@ -14,8 +14,8 @@ from gloves.takes.take import Take
 from handsim._checks import check_count
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import NUM_JOINTS
-from handsim.space.cameras import CameraRig, as_rig, rig_setting
+from handsim.hand.shape import NUM_JOINTS
+from handsim.space.rig import CameraRig, as_rig, rig_setting
 from poses.motion.motions import angles_through, count_frames, sample_motion
 from poses.motion.paths import MotionConfig, can_be_left
 from poses.motion.wrist_paths import WristConfig, wrist_path

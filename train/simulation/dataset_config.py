@@ -12,7 +12,7 @@ from gloves.optics.reconstruction import OpticsConfig
 from handsim._checks import check_count, check_number, check_span, check_type, fill_settings
 from handsim.errors import DatasetError
 from handsim.hand.shape import Population
-from handsim.space.cameras import CameraRig, list_rigs
+from handsim.space.rig import CameraRig, list_rigs
 from poses.shapes.samplers import PoseMix
 from poses.shapes.sampling import PoseSampler, checked_sampler
 from train.simulation.frame_scenes import SceneMix

@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
-from handsim.space.cameras import ROOM_CENTER
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.contact.two_hands import sample_two_hand_poses
 from poses.grasps.grasp_scene import wrist_poses

@@ -12,8 +12,8 @@ from gloves.optics.mirrors import cameras_by_mirror, reflect
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import sample_strays
 from gloves.optics.visibility import free_rays
-from handsim.hand.topology import PALM
-from handsim.space.cameras import check_outside
+from handsim.hand.shape import PALM
+from handsim.space.rig import check_outside
 from train.simulation.motion import SceneMotion
 from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight

@@ -14,8 +14,7 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import ADULTS, Population, sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import ADULTS, SIDES, Population, sample_shape
 from poses.shapes.validity import resting_angles
 
 NO_REST: Final = "person: fingers overlap at rest"

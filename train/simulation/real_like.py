@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from gloves.fit import GlovedHand
 from gloves.layout import MarkerLayout
-from handsim.hand.shape import EVERYBODY
-from handsim.hand.topology import BONES
+from handsim.hand.shape import BONES, EVERYBODY
 from handsim.space.transforms import quaternion_matrix
 from train.simulation.motion import SceneMotion, sample_scene_motion
 from train.simulation.people import sample_hands, wear_gloves

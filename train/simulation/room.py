@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from gloves.optics.identities import number_runs, pack_columns
 from gloves.optics.reconstruction import Reconstruction, reconstruct
 from gloves.takes.take import RigidBody, Take
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import transform_poses
 from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
 from gloves.optics.mesh_tree import MeshTree, hand_tree
 from gloves.optics.visibility import facing_cameras
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from train.simulation.motion import SceneMotion
 
 _CHUNK: Final = 256  # frames whose lines of sight are in memory at once

@@ -19,9 +19,9 @@ from gloves.optics.mesh_tree import MeshTree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import pack_cameras, visible_cameras
 from handsim.hand.model import HandModel
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import SIDES
 from handsim.space.objects import named_object
+from handsim.space.rig import CameraRig
 from poses.shapes.sampling import checked_sampler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import FrameScene, sample_frame_scene

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from handsim._version import __version__
-from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
+from handsim import __version__
+from handsim.hand.model import KEYPOINT_NAMES, SKELETON
 from handsim.space.camera import Camera
 from render.formats.annotations.common import (
     CENTER,

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import Side
+from handsim.hand.shape import HandShape, Side
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.frames import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.errors import DatasetError
-from handsim.hand.topology import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.annotations import coco
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json

@@ -1,4 +1,4 @@
-"""Joint orders of other data sets, as indices of our 21 (`handsim.hand.keypoints`), and conversions.
+"""Joint orders of other data sets, as indices of our 21 (`handsim.hand.model`), and conversions.
 
 One table, because a wrong permutation looks almost right. The index `ABSENT` marks a joint that we lack.
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError
-from handsim.hand.topology import NUM_KEYPOINTS
+from handsim.hand.shape import NUM_KEYPOINTS
 
 ABSENT: Final = -1
 _WRIST: Final = 0

@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from handsim.hand.keypoints import KEYPOINT_NAMES
-from handsim.hand.topology import NUM_KEYPOINTS
+from handsim.hand.model import KEYPOINT_NAMES
+from handsim.hand.shape import NUM_KEYPOINTS
 from render.formats.annotations.common import is_seen, keypoint_flags
 from render.frames import HandTruth, RenderedFrame
 

@@ -13,8 +13,7 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import PALM, SIDES
+from handsim.hand.shape import PALM, SIDES, sample_shape
 
 
 def worn(shape):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gloves.optics.ghosts import MAX_GHOSTS, GhostConfig, sample_ghosts
 from gloves.optics.mirrors import reflect
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from gloves.optics.mirrors import cameras_by_mirror, reflect
 from gloves.optics.strays import StrayConfig, sample_strays
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 
 RIG = named_rig("figure5")
 PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])

@@ -24,9 +24,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.archives import CutOffWarning
+from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
-from gloves.takes.growing import GrownArchive
 from gloves.takes.take import LOST, load_take
 from handsim.cli.main import main
 from handsim.hand.model import HandModel

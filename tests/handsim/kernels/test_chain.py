@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS, SIDES, bones_of
+from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels.chain import pose_digit_axes
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.contact.contact_closing import digit_parts

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES, sample_shape
 from poses.motion.motions import MotionConfig, minimum_jerk, motion_through, sample_motion
 from poses.motion.paths import can_be_left, path_to_rest
 from poses.motion.scripts import script_names, script_poses, scripted_motion

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gloves.takes.take import Take
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints
 from render.subject import subject_of_poses
 from train.simulation.takes import SimulatedKind, simulate_take

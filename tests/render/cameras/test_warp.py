@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera, preset
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, preset
 from handsim.space.transforms import euler_matrix
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 

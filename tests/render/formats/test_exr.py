@@ -8,8 +8,7 @@ import OpenEXR
 import pytest
 
 from handsim.errors import HandSimError
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens
 from render.formats.exr import linear_light, write_exr
 from render.frames import Pictures
 from tests.render.formats.reading import exr_content

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.space.lens import Lens
+from handsim.space.camera import Lens
 from render.formats.annotations.common import hand_mask
 from render.formats.freihand_writer import FreihandWriter
 from tests.render.formats.reading import depth_of

@@ -10,7 +10,7 @@ import trimesh
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.skin import vertex_normals
 from handsim.space.camera import Camera, look_at, pinhole, preset
 from poses.shapes.validity import sample_valid_angles
 from render.painting.rasterizer import Triangles, join, rasterize

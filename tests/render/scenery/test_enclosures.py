@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import draw

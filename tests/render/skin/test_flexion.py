@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import JOINT_NAMES, SIDES, Side
+from handsim.hand.shape import JOINT_NAMES, SIDES, Side
+from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR
 from render.skin.flexion import Flexion
 from render.skin.mesh import PosableSkin

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side
 from poses.shapes.library import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer

@@ -8,7 +8,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
 from track.association.hand_state import HandState

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from track.association.frame_state import Numbering
 from track.association.hand_state import HandState, HandTrack
 from track.association.label_consistency import fit_labels

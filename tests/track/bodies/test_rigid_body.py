@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object

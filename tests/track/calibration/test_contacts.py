@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import resting_angles
 from track.calibration.contacts import (

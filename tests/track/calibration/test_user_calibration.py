@@ -15,8 +15,7 @@ from gloves.fit import GloveFit, attach, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import named_shape
-from handsim.hand.topology import JOINT_NAMES, SIDES
+from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from track.calibration.skin_coordinates import displace_markers

@@ -8,10 +8,8 @@ import pytest
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
+from handsim.hand.shape import SIDES, sample_shape
 from track.kinematics.marker_kinematics import (
     NUM_UNKNOWNS,
     accumulate_normal_equations,

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from track.sinks import addresses
 from track.sinks.addresses import VALID, SinkGroup, open_sink, open_sinks

@@ -6,7 +6,7 @@ import numpy as np
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
 
 def test_every_number_has_a_name(message):

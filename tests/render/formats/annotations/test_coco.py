@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.hand.shape import HandShape
 from render.formats.annotations.common import hand_mask
 from render.formats.writer import open_writer

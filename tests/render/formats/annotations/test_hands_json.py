@@ -8,11 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import Side
-from handsim.space.camera import Camera, camera_from_record, look_at
-from handsim.space.lens import Lens
+from handsim.hand.model import HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import Side
+from handsim.space.camera import Camera, Lens, camera_from_record, look_at
 from handsim.space.transforms import axis_angle_matrix, quaternion_matrix, random_quaternions
 from render.formats.annotations.common import to_json
 from render.formats.annotations.hands_json import (

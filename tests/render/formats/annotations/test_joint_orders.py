@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import ArgumentError
-from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim.hand.model import KEYPOINT_NAMES
 from render.formats.annotations.joint_orders import ABSENT, JOINT_ORDERS, joint_order, to_order
 
 # Names as the formats' own documents list them, in our words.
