@@ -24,7 +24,7 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.takes.take import Take, keypoints_of
 from handsim.hand.shape import JOINT_NAMES
 from track.calibration.user_calibration import calibrate_hand
-from track.setup import USUAL_SIZE
+from track.settings import USUAL_SIZE
 from track.tracker import Tracker
 from track.user import MEASURED, User
 from train.glove_labeler import load_labeler

@@ -26,10 +26,9 @@ from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.captures.capture import runs_of
 from gloves.takes.take import Take
-from track.capture_labeling import label_capture
-from track.capture_tracking import track_capture
-from track.label_evidence import evidence_of
-from track.take_summary import doubts_of, frame_confidence
+from track.captures import label_capture, track_capture
+from track.label_confidence import evidence_of
+from track.take_summary import find_suspect_spans, frame_confidence
 from train.metrics import expected_calibration_error
 
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")
@@ -65,7 +64,7 @@ def error_runs(take: Take, truth: np.ndarray) -> list[tuple[int, int]]:
 
 def score(take: Take, truth: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Runs, those covered, spans, those with an error, seconds and seconds listed; pairs for calibration."""
-    spans, runs = doubts_of(take, None), error_runs(take, truth)
+    spans, runs = find_suspect_spans(take, None), error_runs(take, truth)
     there = np.isfinite(take.points[..., 0])
     right, listed = (take.labels == truth) | ~there, np.zeros(take.num_frames, dtype=bool)
     for span in spans:

@@ -29,10 +29,8 @@ from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
 from handsim.hand.shape import Side
-from track.capture_calibration import calibrate
-from track.capture_tracking import track_capture
+from track.captures import calibrate, measure_hands, track_capture
 from track.kinematics.pose_solver import PoseSolver
-from track.setup import measure_hands
 from train.simulation.takes import simulate_take
 
 FRESH, RATE = 20.0, 120.0  # [s], [Hz]

@@ -25,7 +25,7 @@ from websockets.sync.client import connect
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
 from gloves.takes.take import Take
-from track.setup import warm_up
+from track.settings import warm_up
 from track.sinks.addresses import open_sinks
 from track.streams import natnet
 from track.streams.addresses import open_source

@@ -31,7 +31,7 @@ import torch
 from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import load_layout
-from track.capture_labeling import label_capture
+from track.captures import label_capture
 from track.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker

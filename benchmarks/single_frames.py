@@ -22,7 +22,7 @@ from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.captures.capture import Capture
 from gloves.captures.formats import find_captures, read_markers
-from track.capture_labeling import label_capture
+from track.captures import label_capture
 from train.glove_labeler import load_labeler
 from train.labeler_evaluation import Report
 from train.labelers.protocol import Labeler, Labeling

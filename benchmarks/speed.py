@@ -60,7 +60,7 @@ from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.rig import named_rig
 from poses.shapes.validity import sample_valid_angles
-from track.setup import warm_up
+from track.settings import warm_up
 from track.tracker import Tracker
 from train.config import CNNConfig, batch_recipe, default_config
 from train.data.augmentation import Corruption, corrupt

@@ -42,8 +42,8 @@ from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recover
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
-from track.capture_calibration import calibrate
-from track.setup import warm_up
+from track.captures import calibrate
+from track.settings import warm_up
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler

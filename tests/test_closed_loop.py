@@ -12,7 +12,7 @@ from handsim.cli.simulate import simulate
 from handsim.hand.model import HandModel, hand_keypoints
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0

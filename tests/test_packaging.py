@@ -101,7 +101,7 @@ def test_nobody_pays_for_another_packages_imports() -> None:
 
 def test_labeling_and_tracking_load_only_what_they_need() -> None:
     code = (
-        "import sys, track.capture_labeling, track.capture_tracking\n"
+        "import sys, track.captures\n"
         "from train import load_labeler\n"
         "load_labeler('dense19')\n"
         "heavy = {'torch', 'mujoco', 'trimesh', 'matplotlib', 'cv2', 'scipy.optimize', 'scipy.spatial'}\n"

@@ -4,7 +4,7 @@
 takes one frame of points at a time and gives a `TrackedFrame`; `measure_hands` measures whom it follows, and
 `calibrate` fits hands and gloves to them as a `User`. `open_source` opens a live stream, `ReplayServer` plays
 a capture as one, `open_sinks` takes hands to other programs, and a `Recorder` writes the take. `solve_pose`
-is the inverse kinematics alone: poses from labeled markers. `doubts_of` tells of a take,
+is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans` tells of a take,
 `score_glove` and `improve_glove` of a glove that nobody has worn.
 """
 
@@ -19,10 +19,14 @@ if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch
-    from track.capture_calibration import calibrate as calibrate
-    from track.capture_labeling import label_capture as label_capture
-    from track.capture_tracking import track_capture as track_capture
+    from track.captures import calibrate as calibrate
+    from track.captures import label_capture as label_capture
+    from track.captures import measure_hands as measure_hands
+    from track.captures import track_capture as track_capture
     from track.config import TrackerConfig as TrackerConfig
+    from track.frames import TrackedBody as TrackedBody
+    from track.frames import TrackedFrame as TrackedFrame
+    from track.frames import TrackedHand as TrackedHand
     from track.glove_advice.improvement import Worth as Worth
     from track.glove_advice.improving import ImprovedGlove as ImprovedGlove
     from track.glove_advice.improving import improve_glove as improve_glove
@@ -33,7 +37,6 @@ if TYPE_CHECKING:
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.recorder import Recorder as Recorder
     from track.settings import TrackSettings as TrackSettings
-    from track.setup import measure_hands as measure_hands
     from track.sinks.addresses import SinkGroup as SinkGroup
     from track.sinks.addresses import open_sinks as open_sinks
     from track.sinks.message import LiveBody as LiveBody
@@ -46,11 +49,8 @@ if TYPE_CHECKING:
     from track.streams.live_stream import LiveStream as LiveStream
     from track.streams.natnet_server import PointFrames as PointFrames
     from track.streams.natnet_server import ReplayServer as ReplayServer
-    from track.take_summary import Doubt as Doubt
-    from track.take_summary import doubts_of as doubts_of
-    from track.tracked_frame import TrackedBody as TrackedBody
-    from track.tracked_frame import TrackedFrame as TrackedFrame
-    from track.tracked_frame import TrackedHand as TrackedHand
+    from track.take_summary import SuspectSpan as SuspectSpan
+    from track.take_summary import find_suspect_spans as find_suspect_spans
     from track.tracker import Tracker as Tracker
     from track.user import User as User
     from track.user import load_user as load_user

@@ -25,8 +25,8 @@ from handsim.hand.shape import Side
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer
 from track.association.point_groups import distances_to_nearest
-from track.given import designed_glove
 from track.hand_size import fit_size
+from track.inputs import designed_glove
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from train.glove_labeler import labeler_at_once

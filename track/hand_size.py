@@ -25,9 +25,9 @@ from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
 from track.calibration.solver import levenberg_marquardt, shared_covariance, user_hand
 from track.config import TrackerConfig
+from track.frames import TrackedHand
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedHand
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

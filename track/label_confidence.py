@@ -1,18 +1,307 @@
-"""Calibrated confidence in the labels of a whole take: among labels told 0.9, nine of ten are right.
+"""Calibrated confidence in the labels of a whole take: of labels with confidence 0.9, nine of ten are right.
 
-Two logistic models weigh what a take tells of its points (`track.label_evidence`): one for points with a
-label, one for points without. `python -m benchmarks.doubtful_frames --fit` fits both to simulated captures.
+Points are followed from frame to frame, by their IDs where these last, so that a label can be compared with
+the others of the point's life. Two logistic models weigh this evidence: one for points with a label, one for
+points without. `python -m benchmarks.doubtful_frames --fit` fits both to simulated captures.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
-from gloves.takes.take import Take
-from track.label_evidence import Evidence, evidence_of
+from gloves.takes.take import LOST, Take
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
+from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import point_distance
+from track.kinematics.joint_prior import resting_prior
+
+LABELED: Final = (
+    "other labels in its life",
+    "frames without a label in its life",
+    "residual",
+    "residual in a short life",
+    "markers not seen",
+    "biases of the hand",
+    "improbable digit",
+)
+"""What is told of a point with a label."""
+UNLABELED: Final = (
+    "labels in its life",
+    "a free marker within 10 mm",
+    "a free marker within 30 mm",
+    "a free marker within 30 mm in a short life",
+    "a point within 30 mm",
+    "points beside it and a lost hand",
+    "markers not seen",
+    "biases of the hand",
+)
+"""What is told of a point without a label."""
+_LEAST_RESIDUAL: Final = 0.0003  # [m] that a marker is usually off, at least: the noise of optical systems
+_FEWEST: Final = 10  # frames that tell how far a marker is usually off
+_LINK: Final = 0.015  # [m] that a point moves in its hand from frame to frame at most, where IDs do not last
+_EXCHANGE: Final = 0.005  # [m] that points jump at least whose IDs were exchanged
+_BESIDE: Final = 0.1  # [m] within which points are those of one hand
+_SHORT: Final = 20.0  # frames of a life that tells nothing by being short
+_FAR: Final = 1.0  # [m] in the place of what is not there
+_MOST_OFF: Final = 100.0  # usual residuals; more tells no more
+
+
+class Evidence(NamedTuple):
+    """What is told of P points of a take, in the order of its frames."""
+
+    points: Int[np.ndarray, "P"]
+    """Which points of the take's list these are."""
+    labels: Int[np.ndarray, "P"]
+    """Its label, -1 for none."""
+    markers: Int[np.ndarray, "P"]
+    """Its label, or that of the nearest marker without a point."""
+    labeled: Float[np.ndarray, "L 7"]
+    """What is told of the points with a label, see `LABELED`."""
+    unlabeled: Float[np.ndarray, "U 8"]
+    """What is told of those without one, see `UNLABELED`."""
+
+
+def evidence_of(take: Take) -> Evidence:
+    """What a take with poses tells of the labels of its points; those of rigid bodies are left out."""
+    count = take.hand_labels[-1].stop
+    listed = take.point_list
+    chosen = np.flatnonzero(listed.labels < count)
+    frames, points, labels = (
+        listed.frames[chosen],
+        listed.points[chosen],
+        listed.labels[chosen].astype(np.int64),
+    )
+    owners = np.repeat(np.arange(len(take.hands)), [len(part) for part in take.hand_labels])
+    expected = np.concatenate([take.pose_markers(side) for side in take.sides], axis=1)
+    centers = np.stack([expected[:, owners == hand].mean(axis=1) for hand in range(len(take.hands))], axis=1)
+    starts = np.searchsorted(frames, np.arange(take.num_frames + 1))
+    lives = _follow(points, listed.ids[chosen].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
+    own, others, length = _lives(lives, labels, count)
+    of_life, short = np.log1p(others / own), np.log(_SHORT / np.minimum(length, _SHORT))
+    which, free = np.flatnonzero(labels >= 0), np.flatnonzero(labels < 0)
+    seen = take.observed(range(count))
+    residuals, markers = np.linalg.norm(seen - expected, axis=-1), labels.copy()
+    markers[free], near = _surroundings(points, labels, starts, expected, _BESIDE, _FAR)
+    of_hand = _of_hands(take, np.isfinite(seen[..., 0]), owners)[frames, owners[markers]]
+    label, frame = labels[which], frames[which]
+    off = np.fmax(residuals[frame, label] / _usual(residuals)[label], 1.0)
+    off = np.minimum(np.nan_to_num(off, nan=3.0), _MOST_OFF)
+    labeled = [
+        of_life[which],
+        np.log1p((length - own - others) / own)[which],
+        off - 1.0,
+        np.log(off) * short[which],
+        *of_hand[which].T,
+        _improbable(take, owners)[frame, label],
+    ]
+    is_lost = (take.status == LOST).any(axis=1)[frames[free]]
+    unlabeled = [
+        of_life[free],
+        np.exp(-near[0] / 0.01),
+        np.exp(-near[0] / 0.03),
+        np.exp(-near[0] / 0.03) * short[free],
+        np.exp(-near[1] / 0.03),
+        np.log1p(near[2]) * is_lost,
+        *of_hand[free].T,
+    ]
+    return Evidence(chosen, labels, markers, np.stack(labeled, axis=1), np.stack(unlabeled, axis=1))
+
+
+def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
+    """How far each marker is usually off its pose [m]."""
+    known = np.isfinite(residuals).sum(axis=0) >= _FEWEST
+    usual = np.full(residuals.shape[1], np.nan)
+    usual[known] = np.nanmedian(residuals[:, known], axis=0)
+    usual[~known] = np.median(usual[known]) if known.any() else _LEAST_RESIDUAL
+    bounded: NDArray[np.float64] = np.maximum(usual, _LEAST_RESIDUAL)
+    return bounded
+
+
+def _lives(
+    lives: Int[np.ndarray, "P"], labels: Int[np.ndarray, "P"], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Frames in the life of each point with its label, with another one, and of the whole life."""
+    pairs = lives * (count + 1) + labels + 1
+    _, inverse, counts = np.unique(pairs, return_inverse=True, return_counts=True)
+    own, with_label, length = counts[inverse], np.bincount(lives, labels >= 0), np.bincount(lives)
+    others = with_label[lives].astype(np.int64) - np.where(labels >= 0, own, 0)
+    return own, others, length[lives]
+
+
+def _of_hands(
+    take: Take, seen: Bool[np.ndarray, "T K"], owners: Int[np.ndarray, "K"]
+) -> Float[np.ndarray, "T H 2"]:
+    """What is told of a hand: its markers that are not seen, and how far off the glove its markers are."""
+    values = np.zeros((*take.status.shape, 2))
+    for hand, side in enumerate(take.sides):
+        values[:, hand, 0] = np.log1p(20.0 * (1.0 - seen[:, owners == hand].mean(axis=1)))
+        values[:, hand, 1] = np.log1p(1e3 * np.linalg.norm(take.marker_bias(side), axis=1).mean())
+    return values
+
+
+def _improbable(take: Take, owners: Int[np.ndarray, "K"]) -> Float[np.ndarray, "T K"]:
+    """How far from those of resting hands the angles of each marker's digit are; 0 for the palm."""
+    prior, n = resting_prior(), NUM_JOINTS // len(DIGITS)
+    digits = np.concatenate(
+        [[BONES[bone].digit for bone in hand.attachment.main_bones] for hand in take.hands]
+    )
+    improbable = np.zeros((take.num_frames, len(digits)))
+    for digit in range(len(DIGITS)):
+        part = slice(n * digit, n * digit + n)
+        precision = np.linalg.inv(prior.covariance[part, part])
+        off = take.qpos[..., 7:][..., part] - prior.angles[part]
+        square = np.nan_to_num(np.einsum("thi,ij,thj->th", off, precision, off)) / n
+        own = np.flatnonzero(digits == digit)
+        improbable[:, own] = np.log1p(square)[:, owners[own]]
+    return improbable
+
+
+@kernel
+def _surroundings(
+    points: Float[np.ndarray, "P 3"],
+    labels: Int[np.ndarray, "P"],
+    starts: Int[np.ndarray, "T+1"],
+    expected: Float[np.ndarray, "T K 3"],
+    beside: float,
+    far: float,
+) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "3 U"]]:
+    """What is around the points without a label.
+
+    Args:
+        points: Points of all frames [m].
+        labels: Their labels, -1 for none.
+        starts: First point of each frame, and the number of points.
+        expected: Markers of the poses [m], NaN where a hand has none.
+        beside: Distance [m] within which points are counted.
+        far: Distance [m] in the place of one from what is not there.
+
+    Returns:
+        The nearest marker without a point; its distance and that of the nearest other point [m], and the
+        number of points without a label beside it.
+    """
+    count = (labels < 0).sum()
+    marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), far)
+    near[2], u = 0.0, 0
+    for frame in range(len(starts) - 1):
+        first, last = starts[frame], starts[frame + 1]
+        free = np.ones(expected.shape[1], dtype=np.bool_)
+        for i in range(first, last):
+            if labels[i] >= 0:
+                free[labels[i]] = False
+        for i in range(first, last):
+            if labels[i] >= 0:
+                continue
+            for k in range(len(free)):
+                if free[k]:
+                    distance = point_distance(points[i], expected[frame, k])
+                    if distance < near[0, u]:
+                        near[0, u], marker[u] = distance, k
+            for j in range(first, last):
+                if i != j:
+                    distance = point_distance(points[i], points[j])
+                    near[1, u] = min(near[1, u], distance)
+                    near[2, u] += labels[j] < 0 and distance < beside
+            u += 1
+    return marker, near
+
+
+@kernel
+def _follow(
+    points: Float[np.ndarray, "P 3"],
+    ids: Int[np.ndarray, "P"],
+    starts: Int[np.ndarray, "T+1"],
+    centers: Float[np.ndarray, "T H 3"],
+    link: float,
+    exchange: float,
+) -> Int[np.ndarray, "P"]:
+    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged.
+
+    Args:
+        points: Points of all frames [m].
+        ids: The system's IDs, -1 for none.
+        starts: First point of each frame, and the number of points.
+        centers: Middle of each hand's markers [m]; the points around it move with it.
+        link: Step [m] to a point of the next frame at most, where IDs do not last.
+        exchange: Step [m] at least of points whose IDs were exchanged.
+    """
+    lives, number = np.full(len(points), -1), 0
+    for frame in range(len(starts) - 1):
+        first, last = starts[frame], starts[frame + 1]
+        before = starts[frame - 1] if frame else first
+        predicted, current = points[before:first].copy(), points[first:last]
+        if frame:
+            _move(predicted, centers[frame - 1], centers[frame])
+        source = np.full(last - first, -1)
+        for j in range(len(source)):
+            for i in range(len(predicted)):
+                if ids[first + j] >= 0 and ids[first + j] == ids[before + i]:
+                    source[j] = i
+        if 2 * (source >= 0).sum() < min(len(source), len(predicted)):
+            for j in range(len(source)):
+                i = _nearest(predicted, current[j], link)
+                source[j] = i if i >= 0 and _nearest(current, predicted[i], link) == j else -1
+        else:
+            _undo_exchanges(predicted, current, source, exchange)
+        for j in range(len(source)):
+            lives[first + j] = lives[before + source[j]] if source[j] >= 0 else number
+            number += source[j] < 0
+    return lives
+
+
+@kernel
+def _move(
+    points: Float[np.ndarray, "N 3"], old: Float[np.ndarray, "H 3"], new: Float[np.ndarray, "H 3"]
+) -> None:
+    """Move the points near hands as the middles of these move [m]."""
+    for i in range(len(points)):
+        hand = _nearest(old, points[i], 0.2)
+        if hand >= 0 and not np.isnan(new[hand, 0]):
+            points[i] += new[hand] - old[hand]
+
+
+@kernel
+def _undo_exchanges(
+    predicted: Float[np.ndarray, "Q 3"],
+    points: Float[np.ndarray, "N 3"],
+    source: Int[np.ndarray, "N"],
+    exchange: float,
+) -> None:
+    """Exchange the sources of two points that both jump, if each is where the other one was predicted.
+
+    Args:
+        predicted: The points of the frame before where they are predicted [m].
+        points: Points of the frame [m].
+        source: Which of `predicted` each is, -1 for none; overwritten.
+        exchange: Least jump [m].
+    """
+    for j in range(len(source)):
+        for m in range(j):
+            one, other = source[j], source[m]
+            if one < 0 or other < 0:
+                continue
+            kept, also = (
+                point_distance(predicted[one], points[j]),
+                point_distance(predicted[other], points[m]),
+            )
+            changed = point_distance(predicted[one], points[m]) + point_distance(predicted[other], points[j])
+            if min(kept, also) >= exchange and changed < 0.5 * (kept + also):
+                source[j], source[m] = other, one
+
+
+@kernel
+def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], most: float) -> int:
+    """The point nearest to a place, -1 if it is farther than `most` [m]."""
+    found = -1
+    for i in range(len(points)):
+        distance = point_distance(points[i], place)
+        if distance < most:
+            most, found = distance, i
+    return found
+
 
 _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 """Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""

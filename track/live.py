@@ -17,15 +17,14 @@ from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take
 from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from handsim.app.messages import LiveStatus
-from track.capture_tracking import OnFrame
-from track.intake import FARTHEST
+from track.captures import OnFrame
+from track.frames import FARTHEST, TrackedFrame
 from track.recorder import Recorder
-from track.setup import TrackerSetup
+from track.settings import TrackerSetup
 from track.sinks.addresses import SinkGroup
 from track.streams.addresses import open_source
 from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream
-from track.tracked_frame import TrackedFrame
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them

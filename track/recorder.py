@@ -32,9 +32,8 @@ from handsim._checks import check_type
 from handsim.app.interrupts import interrupt_behind
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import remove_abandoned
-from track.intake import FARTHEST, LATEST_TIME
+from track.frames import FARTHEST, LATEST_TIME, TrackedFrame
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary

@@ -13,8 +13,7 @@ from gloves.captures.capture import AT_ORIGIN, all_at_origin, runs_of, unit_faul
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.shape import Side
 from track.association.point_groups import distances_to_nearest
-from track.label_confidence import label_confidence
-from track.label_evidence import Evidence, evidence_of
+from track.label_confidence import Evidence, evidence_of, label_confidence
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
@@ -28,7 +27,7 @@ _APART: Final = 0.2  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 
 
-class Doubt(NamedTuple):
+class SuspectSpan(NamedTuple):
     """Frames that deserve a look."""
 
     first: int
@@ -149,7 +148,7 @@ def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
     return [f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"] if np.isfinite(rms).any() else []
 
 
-def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
+def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[SuspectSpan, ...]:
     """Spans in which a label is probably wrong or missing; those with the most such frames first.
 
     Args:
@@ -165,14 +164,14 @@ def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
     if evidence is not None:
         markers[evidence.points] = evidence.markers
     least = np.fmin(_least_in_frames(take, confidence), 1.0)
-    found: list[tuple[float, Doubt]] = []
+    found: list[tuple[float, SuspectSpan]] = []
     around, apart = round(_AROUND * take.rate), _APART * take.rate
     for first, last in _joined(runs_of(minimum_filter1d(least, 2 * around + 1) < _CERTAIN), apart):
         worst = first + int(least[first : last + 1].argmin())
         point = points.of(worst).start + int(np.nanargmin(confidence[points.of(worst)]))
         of, why = _words(take, worst, int(points.labels[point]), int(markers[point]))
         why += f", {100 * least[worst]:.0f} %"
-        found.append((float((1.0 - least[first : last + 1]).sum()), Doubt(first, last, worst, of, why)))
+        found.append((float((1.0 - least[first : last + 1]).sum()), SuspectSpan(first, last, worst, of, why)))
     found.sort(key=lambda entry: (-entry[0], entry[1].first))
     return tuple(doubt for _, doubt in found[:most])
 

@@ -31,9 +31,8 @@ from track.association.labeler_review import LabelerReview
 from track.association.point_linking import PointHistory
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
-from track.given import AnyLabeler, designed_glove
-from track.intake import IncomingFrame, Intake
-from track.tracked_frame import TrackedBody, TrackedFrame, TrackedHand
+from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
+from track.inputs import AnyLabeler, designed_glove
 from track.user import User, as_user
 from train.glove_labeler import load_labeler
 
@@ -87,7 +86,7 @@ class Tracker:
         self.bodies = tuple(bodies)
         self.config = config
         asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
-        self._intake = Intake(config.silence)
+        self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [HandState(hand, config, origin=self.user.origin(hand.side)) for hand in self.hands]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]

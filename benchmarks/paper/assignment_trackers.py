@@ -19,7 +19,7 @@ from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError
 from handsim.kernels.integration import move, velocity_of
-from track.tracked_frame import TrackedFrame, TrackedHand
+from track.frames import TrackedFrame, TrackedHand
 
 NEAR: Final = 0.01
 """Upper bound of the distance of a new point from the predicted position of a lost marker [m]."""

@@ -24,7 +24,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from track.bodies.rigid_body import RigidTemplate
-from track.tracked_frame import FrameTracker
+from track.frames import FrameTracker
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
-from track.tracked_frame import TrackedFrame, TrackedHand
+from track.frames import TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
 
 RADIUS: Final = 0.2

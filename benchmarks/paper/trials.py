@@ -12,7 +12,7 @@ from jaxtyping import Float
 from benchmarks.paper.take_evaluation import is_right, is_valid, seen_frame
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from track.tracked_frame import FrameTracker
+from track.frames import FrameTracker
 
 _FRAMES_BEFORE: Final = 60  # frames that a tracker sees before all points are hidden
 _FRAMES_HIDDEN: Final = 120  # a second

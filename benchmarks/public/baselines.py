@@ -21,9 +21,9 @@ from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from handsim.files.json_files import claim
 from handsim.hand.shape import NUM_QPOS
-from track.setup import measure_hands
+from track.captures import measure_hands
+from track.frames import FrameTracker
 from track.streams.frame_source import capture_frames
-from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler

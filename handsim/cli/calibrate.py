@@ -41,12 +41,12 @@ def calibrate(
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
     """
-    from track import capture_calibration
+    from track import captures
 
     check_ending(out, ".json")
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("") as (bar, task):
-        user = capture_calibration.calibrate(
+        user = captures.calibrate(
             capture,
             glove,
             hands=hands,

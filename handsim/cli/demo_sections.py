@@ -27,7 +27,7 @@ from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.illustrations.scene import PosedHand
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from train.data.augmentation import Corruption, corrupt
 from train.data.shards import Dataset
 from train.evaluate import CLEAN, evaluate_labeler

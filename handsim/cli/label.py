@@ -37,7 +37,7 @@ def label(
     from handsim.app.messages import print_line
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
-    from track.capture_labeling import label_capture
+    from track.captures import label_capture
     from train.threads import label_on
 
     label_on(threads)

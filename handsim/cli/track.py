@@ -17,10 +17,10 @@ from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 from handsim.hand.shape import Side
 from track.config import Size
-from track.tracked_frame import TrackedFrame
+from track.frames import TrackedFrame
 
 if TYPE_CHECKING:
-    from track.capture_tracking import OnFrame
+    from track.captures import OnFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
     from track.sinks.addresses import SinkGroup
@@ -78,8 +78,7 @@ def track(
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
     from track.live import track_live
-    from track.settings import TrackSettings
-    from track.setup import TrackerSetup, warm_up
+    from track.settings import TrackerSetup, TrackSettings, warm_up
     from track.sinks.addresses import open_sinks
     from track.streams.frame_source import StreamedFrame
 
@@ -120,7 +119,7 @@ def _track_file(
     """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
     from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
-    from track.capture_tracking import track_capture
+    from track.captures import track_capture
     from track.live import LiveTake
 
     corrections = corrections_path(out)

@@ -20,7 +20,7 @@ from track.network_address import LOOPBACK
 from track.viewer.server import address_of, opened_server
 
 if TYPE_CHECKING:
-    from track.setup import TrackerSetup
+    from track.settings import TrackerSetup
     from track.viewer.contents import Content
 
 
@@ -66,8 +66,7 @@ def view(
         time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
     """
     from handsim.cli.options import check_take_file, chosen_hands
-    from track.settings import TrackSettings
-    from track.setup import USUAL_SIZE, TrackerSetup
+    from track.settings import USUAL_SIZE, TrackerSetup, TrackSettings
     from track.viewer.contents import open_content
 
     if (file is None) == (live is None):
@@ -129,7 +128,7 @@ def _view_live(
     from handsim.space.rig import load_rig
     from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
-    from track.setup import warm_up
+    from track.settings import warm_up
     from track.streams.addresses import open_source
     from track.viewer.live_view import LiveView
 

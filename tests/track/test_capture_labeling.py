@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from track.capture_labeling import label_capture
-from track.capture_tracking import track_capture
+from track.captures import label_capture, track_capture
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

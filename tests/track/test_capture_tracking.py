@@ -26,7 +26,7 @@ from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from track.config import TrackerConfig
 from track.recorder import TakeRecorder
 from track.streams.addresses import open_source
@@ -193,9 +193,9 @@ from numba.core.registry import CPUDispatcher
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from track.label_confidence import label_confidence
-from track.setup import warm_up
+from track.settings import warm_up
 from track.streams.frame_source import checked_frames
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

@@ -10,11 +10,9 @@ import pytest
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning
 from track import hand_check
-from track.capture_labeling import label_capture
-from track.capture_tracking import track_capture
+from track.captures import label_capture, measure_hands, track_capture
 from track.hand_check import check_scale
 from track.hand_size import sample_frames
-from track.setup import measure_hands
 from track.streams.frame_source import checked_frames
 from track.user import nominal_user
 from train.glove_labeler import load_labeler

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gloves.takes.take import LOST, Take
-from track.capture_tracking import track_capture
-from track.label_confidence import label_confidence
-from track.label_evidence import evidence_of
+from track.captures import track_capture
+from track.label_confidence import evidence_of, label_confidence
 from train.simulation.takes import simulate_take
 
 FRAMES = 120

@@ -12,7 +12,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import LOST, Take
 from handsim.errors import HandSimWarning
 from track.calibration.frames import CalibrationError
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from track.kinematics.pose_solver import PoseSolver
 from track.take_calibration import calibrate_take, kept_user
 from track.user import MEASURED, User, nominal_user

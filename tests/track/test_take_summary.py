@@ -11,8 +11,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
-from track.capture_tracking import track_capture
-from track.take_summary import doubts_of, frame_confidence, runs_of, summarize, suspicions
+from track.captures import track_capture
+from track.take_summary import find_suspect_spans, frame_confidence, runs_of, summarize, suspicions
 from train.simulation.takes import simulate_take
 
 FRAMES = 40
@@ -116,26 +116,28 @@ def test_doubtful_frames_are_listed_by_the_stored_confidence_where_there_are_no_
         qpos=np.full(tracked.qpos.shape, np.nan),
         confidence=confidence,
     )
-    doubts = doubts_of(take)
+    doubts = find_suspect_spans(take)
     assert [doubt[:3] for doubt in doubts] == [(3, 12, 5), (27, 29, 28)], "more of the first is wrong"
     assert doubts[0].words == f"{take.label_names[take.labels[5, columns[1]]]} labeled, 30 %"
-    assert doubts_of(take, most=1) == doubts[:1]
+    assert find_suspect_spans(take, most=1) == doubts[:1]
     assert frame_confidence(take)[[5, 28, 34, 35]].tolist() == [0.3, 0.1, 0.9, 0.99]
 
 
 def test_doubtful_frames_of_a_tracked_take(tracked):
-    assert doubts_of(tracked) == (), "nothing is wrong"
+    assert find_suspect_spans(tracked) == (), "nothing is wrong"
     column = int(np.flatnonzero((tracked.labels[10:20] == 3).all(axis=0))[0])
     labels, status, qpos = tracked.labels.copy(), tracked.status.copy(), tracked.qpos.copy()
     labels[10:16, column] = -1
-    (missed,) = doubts_of(dataclasses.replace(tracked, labels=labels))
+    (missed,) = find_suspect_spans(dataclasses.replace(tracked, labels=labels))
     assert missed.first <= 10 and missed.last >= 15 and 10 <= missed.worst <= 15
     assert missed.words.startswith(f"{tracked.label_names[3]} without a label, ")
     labels = np.where(
         np.arange(FRAMES)[:, None] < 20, tracked.labels, np.where(tracked.labels < 19, -1, tracked.labels)
     )
     status[20:, 0], qpos[20:, 0] = LOST, np.nan
-    (lost,) = doubts_of(dataclasses.replace(tracked, labels=labels, status=status, qpos=qpos))
+    (lost,) = find_suspect_spans(dataclasses.replace(tracked, labels=labels, status=status, qpos=qpos))
     assert lost.first >= 15 and lost.last == FRAMES - 1
     known = np.where(np.isfinite(tracked.points[..., 0]), 1.0, np.nan)
-    assert doubts_of(dataclasses.replace(tracked, labels=labels, confidence=known)) == (), "it was corrected"
+    assert find_suspect_spans(dataclasses.replace(tracked, labels=labels, confidence=known)) == (), (
+        "it was corrected"
+    )

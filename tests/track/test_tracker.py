@@ -13,7 +13,7 @@ from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
-from track.tracked_frame import TrackedFrame
+from track.frames import TrackedFrame
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

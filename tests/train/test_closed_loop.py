@@ -14,7 +14,7 @@ from handsim.cli.main import main
 from handsim.hand.model import hand_keypoints
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from train.data.shards import Dataset
 from train.simulation.takes import simulate_take
 

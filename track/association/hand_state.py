@@ -22,12 +22,12 @@ from handsim.kernels.kernel import kernel
 from track.association.assignment import peak_log_odds
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.config import HandOrigin, TrackerConfig
+from track.frames import Spreads
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import SpreadModel
-from track.tracked_frame import Spreads
 
 # Process model.
 _LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand

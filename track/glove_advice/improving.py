@@ -14,9 +14,9 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, load_layou
 from handsim._checks import check_count, check_number
 from handsim.callbacks import OnStep, no_step
 from handsim.space.rig import CameraRig, as_rig
-from track.given import AnyGlove
 from track.glove_advice.improvement import Improvement, Worth
 from track.glove_advice.trials import CAPTURES, Trial, try_layout, verdict
+from track.inputs import AnyGlove
 from train.any_layout.learned_gloves import learned_labeler
 
 _FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one

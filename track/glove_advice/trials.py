@@ -19,11 +19,10 @@ from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
 from handsim.hand.shape import Side
 from handsim.space.rig import CameraRig
-from track.capture_labeling import label_capture
-from track.capture_tracking import track_capture
+from track.captures import label_capture, track_capture
 from track.config import BOTH
 from track.hand_size import sample_frames
-from track.setup import measured_user
+from track.settings import measured_user
 from track.streams.frame_source import checked_frames
 from train.labelers.protocol import Labeler
 from train.metrics import LabelCounts

@@ -19,7 +19,7 @@ from track.config import Size
 from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
-from track.take_summary import Doubt, doubts_of, summarize, suspicions
+from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
 from train.metrics import percent
 from train.reports.plot_style import picture
@@ -55,7 +55,7 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
     """
     out = Path(out)
     check_ending(out, ".html")
-    hands, doubts = hand_figures(take), doubts_of(take, most=None)
+    hands, doubts = hand_figures(take), find_suspect_spans(take, most=None)
     sections = [_summary_section(take), _calibration_section(take)]
     for hand in hands:
         sections += _hand_sections(take, hand)
@@ -198,7 +198,7 @@ def _residuals_section(take: Take, hand: HandFigures) -> Section:
     return Section(f"{hand.side.capitalize()} hand: residuals", text, pictures=[(drawn, _SHADES)])
 
 
-def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section:
+def _doubts_section(take: Take, doubts: Sequence[SuspectSpan], source: str) -> Section:
     command = f"handsim view {shlex.quote(source)}"
     if not doubts:
         return Section("Doubtful frames", "No label is probably wrong or missing.")

@@ -17,7 +17,7 @@ from gloves.takes.take import STATUSES, Take
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track.reports.hand_figures import RANGE, HandFigures
-from track.take_summary import Doubt
+from track.take_summary import SuspectSpan
 
 TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 """How their names end: frames, ranges of motion, markers, frames to look at."""
@@ -35,7 +35,7 @@ def table_paths(page: Path) -> tuple[Path, ...]:
     return tuple(page.with_suffix(ending) for ending in TABLES)
 
 
-def tables_of(take: Take, hands: Sequence[HandFigures], doubts: Sequence[Doubt]) -> tuple[Table, ...]:
+def tables_of(take: Take, hands: Sequence[HandFigures], doubts: Sequence[SuspectSpan]) -> tuple[Table, ...]:
     """The tables of a take, in the order of `TABLES`."""
     return _frames(take, hands), _joints(hands), _markers(take, hands), _doubts(take, doubts)
 
@@ -96,7 +96,7 @@ def _markers(take: Take, hands: Sequence[HandFigures]) -> Table:
     return Table(header, rows)
 
 
-def _doubts(take: Take, doubts: Sequence[Doubt]) -> Table:
+def _doubts(take: Take, doubts: Sequence[SuspectSpan]) -> Table:
     """Frames to look at, the worst first; `frame` is the one to go to."""
     header = ["first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"]
     rows: list[list[object]] = []

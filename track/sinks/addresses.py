@@ -16,6 +16,7 @@ from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
 from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedFrame
 from track.network_address import split_address
 from track.sinks.datagrams import document_sink, osc_sink
 from track.sinks.documents import FORMATS, encoder_of
@@ -23,7 +24,6 @@ from track.sinks.lab_streaming import LabStreamingSink
 from track.sinks.message import LiveSink, MessageEncoder
 from track.sinks.websocket import WebSocketSink
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
 
 VALID: Final = (
     "osc://host:port",

@@ -16,8 +16,8 @@ from gloves.takes.take import label_names
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedFrame, TrackedHand
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame, TrackedHand
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""

@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from gloves.captures.text import HIGHEST_RATE
-from track.intake import LATEST_TIME
+from track.frames import LATEST_TIME
 from track.streams.frame_source import StreamedFrame
 
 WINDOW: Final = 8

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture, check_place, check_unit
 from gloves.optics.identities import number_runs
-from track.intake import FARTHEST
+from track.frames import FARTHEST
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from track.intake import FARTHEST, LATEST_TIME
+from track.frames import FARTHEST, LATEST_TIME
 from track.streams.frame_order import FrameOrder
 from track.streams.frame_source import FrameSource, StreamedFrame
 

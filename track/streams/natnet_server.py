@@ -17,7 +17,7 @@ from gloves.optics.identities import number_runs
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import CaptureError, choices
-from track.given import read_points
+from track.inputs import read_points
 from track.network_address import LOOPBACK
 from track.streams import natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version

@@ -10,8 +10,8 @@ import numpy as np
 
 from gloves.takes.take import label_names
 from handsim.hand.shape import NUM_QPOS
+from track.frames import TrackedFrame
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.viewer.frame_view import FrameView
 from track.viewer.recordings import Recording, ShownFrame, shown_body

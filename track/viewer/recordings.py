@@ -15,7 +15,7 @@ from gloves.captures.capture import Capture
 from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.hand.model import HandModel
 from handsim.space.rig import CameraRig, as_rig, list_rigs
-from track.take_summary import Doubt, doubts_of, frame_confidence
+from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
@@ -84,7 +84,7 @@ class Recording(ABC):
         bodies: tuple[ShownBody, ...] = (),
         rig: CameraRig | None = None,
         curves: tuple[Curve, ...] = (),
-        doubts: tuple[Doubt, ...] = (),
+        doubts: tuple[SuspectSpan, ...] = (),
         has_hands: bool = True,
         has_filled: bool = True,
     ) -> None:
@@ -124,7 +124,7 @@ class TakeRecording(Recording):
 
     def replace(self, take: Take) -> None:
         """Show the same frames with other labels and poses."""
-        self._take, self.curves, self.doubts = take, _curves(take), doubts_of(take)
+        self._take, self.curves, self.doubts = take, _curves(take), find_suspect_spans(take)
         self._filled = np.concatenate([take.filled(side) for side in take.sides], axis=1)
         self._markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
 

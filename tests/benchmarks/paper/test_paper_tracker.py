@@ -15,7 +15,7 @@ from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.hand.shape import JOINT_NAMES
-from track.tracked_frame import TrackedFrame
+from track.frames import TrackedFrame
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
 from train.simulation.takes import simulate_take

@@ -19,8 +19,8 @@ from benchmarks.paper.take_evaluation import (
 from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.hand.shape import NUM_QPOS, SIZES
+from track.frames import TrackedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
-from track.tracked_frame import TrackedFrame, TrackedHand
 from train.simulation.takes import simulate_take
 
 

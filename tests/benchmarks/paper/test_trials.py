@@ -15,7 +15,7 @@ from benchmarks.paper.trials import (
 from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from track.tracked_frame import TrackedFrame, TrackedHand
+from track.frames import TrackedFrame, TrackedHand
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take

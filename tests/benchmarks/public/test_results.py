@@ -15,7 +15,7 @@ from benchmarks.public.manifest import label_names
 from benchmarks.public.results import find_results, read_result
 from gloves.captures.capture import Capture, labeled_columns, unlabeled_frames
 from gloves.captures.formats import write_capture
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 
 NAME = "hand-controller-hard-1"
 LABELS = label_names()

@@ -32,9 +32,9 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track import capture_tracking
+from track import captures
 from track.bodies.body_file import load_body
-from track.capture_tracking import track_capture
+from track.captures import track_capture
 from track.recorder import Recorder
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
@@ -442,8 +442,8 @@ def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypat
         one.bind(("127.0.0.1", 0))
         address = f"udp://127.0.0.1:{one.getsockname()[1]}"
         out, now = tmp_path / "take.npz", [50.0]
-        monkeypatch.setattr(capture_tracking, "monotonic", lambda: now[0])
-        monkeypatch.setattr(capture_tracking, "sleep", lambda seconds: now.append(now.pop() + seconds))
+        monkeypatch.setattr(captures, "monotonic", lambda: now[0])
+        monkeypatch.setattr(captures, "sleep", lambda seconds: now.append(now.pop() + seconds))
         assert main(["track", str(capture), "--out", str(out), "--size", "M", "--send", address]) == 0
         assert now[0] - 50.0 == pytest.approx((FRAMES - 1) / 120), "it waited until each frame's time"
         one.setblocking(False)

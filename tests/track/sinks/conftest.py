@@ -13,9 +13,9 @@ from gloves.takes.points import Status
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
 from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedBody, TrackedFrame, TrackedHand
 from track.sinks.message import LiveMessage, MessageEncoder
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedBody, TrackedFrame, TrackedHand
 
 
 @functools.cache

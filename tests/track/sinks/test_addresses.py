@@ -11,10 +11,10 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
+from track.frames import TrackedFrame, TrackedHand
 from track.sinks import addresses
 from track.sinks.addresses import VALID, SinkGroup, open_sink, open_sinks
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame, TrackedHand
 
 SOURCE = """
 class Counter:

@@ -12,7 +12,7 @@ from benchmarks.paper.take_evaluation import seen_frame
 from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
-from track.tracked_frame import TrackedFrame
+from track.frames import TrackedFrame
 from track.tracker import Tracker
 
 NUM_MARKERS = 38

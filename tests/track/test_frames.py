@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from handsim.errors import ArgumentError
-from track.intake import Intake
+from track.frames import FrameValidator
 
 NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
 TIMES = st.one_of(st.integers(-(10**9), 10**9).map(lambda number: 1e-3 * number), st.just(np.nan))
@@ -23,7 +23,7 @@ IDS = st.one_of(st.integers(-3, 5), st.integers(-(2**63), 2**63 - 1))
 
 def clock(times: list[float]) -> tuple[np.ndarray, list[tuple[str, ...]]]:
     """What the times of a stream's frames become, and what is said of them."""
-    intake = Intake()
+    intake = FrameValidator()
     taken = [intake.check_frame(*NOTHING, time) for time in times]
     return np.array([one.time for one in taken]), [one.notes for one in taken]
 
@@ -76,7 +76,7 @@ def test_a_time_that_cannot_be_does_not_break_the_clock(odd):
 def test_what_is_kept_are_points_of_the_frame_each_with_an_id_of_its_own(points, data):
     ids = data.draw(arrays(np.int64, len(points), elements=IDS))
     given_points, given_ids = points.copy(), ids.copy()
-    taken = Intake().check_frame(points, ids, 0.0)
+    taken = FrameValidator().check_frame(points, ids, 0.0)
     np.testing.assert_array_equal(points, given_points)
     np.testing.assert_array_equal(ids, given_ids)
     usable = np.isfinite(points).all(axis=1) & (np.nan_to_num(np.abs(points)) < 1e3).all(axis=1)
@@ -99,4 +99,4 @@ def test_stamps_that_lie_together_are_told_apart():
 def test_points_and_ids_that_do_not_fit_are_the_callers_mistake():
     for points, ids in [(np.zeros((2, 3)), np.zeros(3)), (np.zeros((2, 2)), np.zeros(2)), (np.zeros(3), [1])]:
         with pytest.raises(ArgumentError, match="expected"):
-            Intake().check_frame(points, np.asarray(ids, dtype=int), 0.0)
+            FrameValidator().check_frame(points, np.asarray(ids, dtype=int), 0.0)

@@ -20,9 +20,9 @@ from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.hand.shape import NUM_QPOS
+from track.frames import TrackedHand
 from track.label_confidence import label_confidence
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedHand
 from track.tracker import Tracker
 from track.user import User
 from train.labelers.protocol import Labeler

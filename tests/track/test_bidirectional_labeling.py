@@ -8,7 +8,7 @@ import numpy as np
 
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED
-from track.both_directions import _events_of, _exchanges, _is_likelier
+from track.bidirectional_labeling import _events_of, _exchanges, _is_likelier
 
 
 def test_runs_of_exchanged_hands_are_found():

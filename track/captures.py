@@ -1,0 +1,360 @@
+"""From a capture to hands: its labels, their motion, or the hands themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, Final
+
+import numpy as np
+
+from gloves.captures.capture import Capture
+from gloves.fit import GloveFit
+from gloves.layout import load_layout
+from gloves.optics.identities import number_runs
+from gloves.takes.corrections import Correction, find_pins, load_corrections, told
+from gloves.takes.points import PointList
+from gloves.takes.take import Take, label_names
+from handsim.callbacks import OnStep, Progress, no_progress, no_step
+from handsim.errors import CaptureError, HandSimWarning
+from handsim.hand.shape import NUM_QPOS, Side
+from track.association.initialization import FEWEST_POINTS
+from track.association.point_linking import change_of_distances
+from track.association.single_frames import label_alone
+from track.bidirectional_labeling import label_both_ways
+from track.calibration.frames import CalibrationError
+from track.config import BOTH, Size
+from track.corrected_take import correct_take
+from track.frames import TrackedFrame
+from track.hand_check import check_hands, check_scale
+from track.hand_size import sample_frames
+from track.inputs import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.label_confidence import label_confidence
+from track.recorder import TakeRecorder
+from track.settings import (
+    AnyHands,
+    TrackerSetup,
+    TrackSettings,
+    as_designed,
+    choose_user,
+    found_user,
+    measured_user,
+)
+from track.sinks.addresses import SinkGroup
+from track.streams.frame_source import StreamedFrame, checked_frames
+from track.take_calibration import calibrate_take, kept_user, leaves_markers
+from track.take_summary import no_points
+from track.tracker import Tracker
+from track.user import MEASURED, User, checked_sides
+from train.glove_labeler import load_labeler
+
+_COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
+_CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most
+_MOST: Final = 0.5  # share of these pairs that change no more
+
+
+def label_capture(
+    capture: AnyCapture,
+    glove: AnyGlove = "dense19",
+    *,
+    hands: AnyHands | None = None,
+    labeler: AnyLabeler = None,
+    progress: Progress = no_progress,
+) -> Take:
+    """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
+
+    Their size is measured in the capture unless they are given. The take holds labels alone; `track_capture`
+    gives poses.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        hands: A user, hands in their gloves or the path of a user's file; or sides, those of the glove when
+            not given.
+        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        progress: Called with the number of frames that are done, and of all frames.
+
+    Returns:
+        A take whose `labels` (T, N) are indices into its `label_names`, -1 for none, and whose `confidence`
+        (T, N) is from 0 to 1. The names are those of both hands: `right:ThumbTip`, `left:ThumbTip`.
+
+    Raises:
+        ArgumentError: The points are not in meters, or a frame holds more than 512.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
+        LayoutError: The glove is unknown.
+        WeightsError: The labeler is unknown, or knows other markers.
+
+    Warns:
+        HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
+    """
+    layout = load_layout(glove)
+    network = load_labeler(layout, labeler)
+    source = capture_of(capture)
+    frames = checked_frames(source)
+    worn = [side for side in BOTH if side in layout.sides]
+    user, is_measured = choose_user(layout, worn if hands is None else hands, "auto")
+    sample = sample_frames(frames)
+    check_scale(sample, user, network)
+    if is_measured:
+        user = found_user(sample, layout, user.sides, network) or user
+    check_hands(sample, user, network, options=("--glove",))
+
+    def told(count: int) -> None:
+        progress(count, len(frames))
+
+    present = np.isfinite(source.positions[..., 0])
+    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    settings["glove"] = str(glove) if isinstance(glove, str | Path) else layout.name
+    take = Take.of_truth(
+        user.hands,
+        np.full((source.num_frames, len(user), NUM_QPOS), np.nan),
+        source.positions,
+        number_runs(present),
+        np.full(present.shape, -1, dtype=np.int16),
+        rate=source.rate,
+        settings=settings,
+    )
+    if _is_continuous(frames):
+        labeled = label_both_ways(take, frames, user, network, told)
+    else:
+        found = label_alone([frame.points for frame in frames], user.hands, network, told)
+        labels, confidence = (np.concatenate(values) for values in zip(*found, strict=True))
+        points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
+        labeled = dataclasses.replace(take, point_list=points)
+    if (labeled.point_list.labels < 0).all():
+        none = f"no hand found, expected hands in glove '{settings['glove']}' (--glove names another)"
+        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
+    return labeled
+
+
+def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
+    """Whether the frames of a capture follow from each other."""
+    pairs = [
+        (one.points, other.points)
+        for one, other in pairwise(frames)
+        if len(one.points) >= FEWEST_POINTS and len(other.points) >= FEWEST_POINTS
+    ]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
+    changes = [change_of_distances(*pairs[number]) for number in chosen]
+    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)
+
+
+OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
+
+
+def track_capture(
+    capture: AnyCapture,
+    settings: TrackSettings | None = None,
+    *,
+    corrections: str | Path | None = None,
+    sinks: SinkGroup | None = None,
+    progress: Progress = no_progress,
+    on_frame: OnFrame | None = None,
+    **options: Any,
+) -> Take:
+    """Track the hands of a capture, as `handsim track` does.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
+        settings: How to track; as `TrackSettings()` when not given.
+        corrections: A file of labels that a person corrected, as `handsim view` saves it beside a take.
+        sinks: Take every frame as it is tracked, from `open_sinks`; the capture is then played at its own
+            rate.
+        progress: Called after each frame with the number of tracked frames and of all frames.
+        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
+        options: Fields of `TrackSettings` that differ from `settings`, as `glove="dense19"`, `size="M"`,
+            `hands="user.json"`, `bodies=["mug"]` or `calibrate=True`.
+
+    Returns:
+        Poses (T, H, 27) [m, rad], labels (T, N) and status of every frame.
+
+    Raises:
+        ArgumentError: The capture is not in meters, or arguments do not go together.
+        CaptureError: The capture cannot be read, most of its points are far from any room, or corrections do
+            not fit it.
+        UserError: A user's file cannot be read.
+        LayoutError: The glove is unknown, or does not fit a hand.
+        WeightsError: The labeler is unknown, or knows other markers.
+    """
+    settings = TrackSettings.of(settings, options)
+    setup = TrackerSetup.of(settings)
+    source = capture_of(capture)
+    pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
+    frames = checked_frames(source)
+    is_measured = setup.is_measured
+    setup = setup.measured(sample_frames(frames))
+    if settings.calibrate:
+        recorder = record_frames(frames, setup.tracker(), progress=progress)
+        setup = _calibrated(recorder.take(source), setup, is_measured=is_measured)
+    recorder = record_frames(frames, setup.tracker(), sinks, on_frame, progress)
+    take = recorder.take(source)
+    named = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
+    take = dataclasses.replace(take, point_list=points, settings={**take.settings, **named, **setup.settings})
+    return take if corrections is None else _corrected(take, Path(corrections), pins)
+
+
+def record_frames(
+    frames: Sequence[StreamedFrame],
+    tracker: Tracker,
+    sinks: SinkGroup | None = None,
+    on_frame: OnFrame | None = None,
+    progress: Progress = no_progress,
+) -> TakeRecorder:
+    """Track all frames; sinks take them at the capture's own rate."""
+    recorder = TakeRecorder(tracker)
+    if sinks:
+        sinks.start(tracker.hands, tracker.bodies)
+    began = monotonic()
+    for frame in frames:
+        tracked = tracker.step(frame.points, frame.ids, frame.time)
+        if sinks:
+            sleep(max(0.0, began + frame.time - monotonic()))
+            sinks.send(frame, tracked)
+        if on_frame is not None:
+            on_frame(frame, tracked)
+        recorder.add(frame, tracked)
+        progress(recorder.num_frames, len(frames))
+    return recorder
+
+
+def _calibrated(take: Take, setup: TrackerSetup, *, is_measured: bool) -> TrackerSetup:
+    """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
+    user = setup.user
+    try:
+        done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, None)
+    except CalibrationError as error:
+        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
+        return setup
+    notes = f"calibrated on the take itself, {user.notes.removeprefix(MEASURED) or user} to begin with"
+    found = kept_user(take, done, user, notes, None)
+    better = {hand.side: hand for hand in found}
+    hands = tuple(better.get(hand.side, hand) for hand in user)
+    settings = {**setup.settings, "user": found.notes}
+    return dataclasses.replace(setup, user=dataclasses.replace(found, hands=hands), settings=settings)
+
+
+def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tuple[Correction, ...]:
+    """The corrections of a file, checked against the capture before the long work."""
+    corrections = load_corrections(path)
+    ids = number_runs(np.isfinite(source.positions[..., 0]))
+    points = PointList.of_tables(source.positions, ids, np.full_like(ids, -1), np.ones(ids.shape))
+    try:
+        find_pins(corrections, points, label_names(setup.user, setup.bodies))
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+    return corrections
+
+
+def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Take:
+    """The take with its corrections; what does not fit is told."""
+    corrected = correct_take(take, corrections)
+    for sentence in told(path, corrected.unfitting):
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
+    return corrected.take
+
+
+def calibrate(
+    capture: AnyCapture,
+    glove: AnyGlove | None = None,
+    *,
+    hands: AnyHands = BOTH,
+    size: Size = "auto",
+    labeler: AnyLabeler = None,
+    progress: Progress = no_progress,
+    on_step: OnStep = no_step,
+) -> User:
+    """Fit hands and gloves to their user, from any capture; one in which every joint moves tells most.
+
+    The capture is labeled by the tracker. If some markers stay unlabeled, it is labeled once more with the
+    calibrated hands. Each hand is solved on two thirds of the time and tried on the rest: where that is no
+    better than the hand before, the hand stays, with a warning. Otherwise it is solved on all frames.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers
+            are not used.
+        glove: Marker layout, or its shipped name or the path of its .toml file; when not given that of
+            `hands`, or dense19 for hands that are measured.
+        hands: Which hands may be in the capture; or hands to begin with, as `track_capture` takes them.
+        size: The size to begin with: XS, S, M, L, XL, or auto, which measures it in the capture.
+        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        progress: Called with what is done of a step, and all there is to do in it.
+        on_step: Called with the name of each step, such as "frames".
+
+    Returns:
+        The hands that are in the capture; its `calibrations` tell of each how it was found: `held_out`,
+        standard errors and `suggestions()` for a better capture. Printed, one is what `notes` keep of it.
+
+    Raises:
+        CalibrationError: No hand is in the capture, or it tells too little of one.
+        ArgumentError: The capture is not in meters, or arguments do not go together.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
+        LayoutError: The glove is unknown, or does not fit a hand.
+        WeightsError: The labeler is unknown, or knows other markers.
+    """
+
+    def told(what: str, done: int, total: int) -> None:
+        on_step(what)
+        progress(done, total)
+
+    setup = TrackerSetup.of(TrackSettings(glove=glove, hands=hands, size=size, labeler=labeler))
+    source = capture_of(capture)
+    frames, user, network = checked_frames(source), setup.user, setup.labeler
+    sample = sample_frames(frames)
+    check_scale(sample, user, network)
+    if setup.is_measured:
+        user = found_user(sample, user.layout, user.sides, network) or user
+    check_hands(sample, user, network)
+    start = as_designed(user) if setup.is_measured else user.hands
+
+    def labeled(hands: Sequence[GloveFit]) -> Take:
+        return record_frames(frames, Tracker(hands, network), progress=partial(told, "frames")).take(source)
+
+    take = labeled(user)
+    done = calibrate_take(take, start, user, told)
+    if leaves_markers(take, done):
+        take = labeled([one.hand for one in done])
+        done = calibrate_take(take, start, user, told)
+    name = Path(capture).name if isinstance(capture, str | Path) else "a capture"
+    notes = f"calibrated from {name}, {user.notes.removeprefix(MEASURED) or user} to begin with"
+    found = kept_user(take, done, user, notes, told)
+    for one in found.calibrations:
+        if not one.is_better:
+            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
+    return found
+
+
+def measure_hands(
+    capture: AnyCapture,
+    glove: AnyGlove = "dense19",
+    *,
+    labeler: AnyLabeler = None,
+    hands: Side | Sequence[Side] = BOTH,
+) -> User:
+    """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        hands: Which hands.
+
+    Returns:
+        The hands, all of one shape; printed, it is their length and breadth. Where no hand is found that
+        shows most of its markers, hands of size M, with a warning.
+
+    Raises:
+        ArgumentError: The capture is not in meters, or a hand is named twice.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
+        LayoutError: The glove is unknown, or does not fit a hand.
+        WeightsError: The labeler is unknown, or knows other markers.
+    """
+    sides = checked_sides(hands)
+    layout = load_layout(glove)
+    frames = checked_frames(capture_of(capture))
+    return measured_user(sample_frames(frames), layout, sides, load_labeler(layout, labeler))
