@@ -14,16 +14,15 @@ import mujoco
 import numpy as np
 
 from benchmarks.record import add_save, describe, save_figures
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY
 from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.validity import sample_valid_angles
-from train.simulation.people import sample_hands
+from poses.shapes import HIGH, LOW, sample_valid_angles
+from train.simulation.scenes import sample_hands
 
 CHECKED = 20  # frames per hand that MuJoCo repeats
 

@@ -33,19 +33,19 @@ from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import right_hands
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit, nominal_fit
+from gloves.fit import GloveFit, attach_markers, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONES, SIDES, SIZES, HandShape, sample_shape, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
-from poses.shapes.touch import FINGERS, is_touching, thumb_contact
+from poses.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
 from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
-from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+from train.simulation.scenes import CalibrationTakeConfig
+from train.simulation.takes import simulate_calibration
 
 OFF, SLIP, LIFT = 0.08, 0.005, 0.0003
 WRONG, LASTING = 0.01, 30  # share of labels, frames that an exchange lasts on the average

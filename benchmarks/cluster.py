@@ -29,13 +29,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.app.cluster import chosen_workers
-from handsim.app.workers import run_jobs
+from handsim.app.workers import chosen_workers, run_jobs
 from render.config import RenderConfig
 from render.session import render_take
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
+from train.simulation.training_frames import DatasetConfig
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 

@@ -27,10 +27,9 @@ from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
 from track.tracker import Tracker
 from track.user import MEASURED, User
-from train.glove_labeler import load_labeler
-from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.simulation.room_settings import KINDS
-from train.simulation.takes import simulate_take
+from train.labelers.storage import load_labeler
+from train.simulation.scenes import KINDS, CalibrationTakeConfig
+from train.simulation.takes import simulate_calibration, simulate_take
 
 EVERY = 4  # frames
 

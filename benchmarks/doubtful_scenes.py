@@ -13,7 +13,7 @@ from benchmarks.real_scenes import CONDITIONS, make_scene
 from gloves.takes.take import Take
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
-from train.simulation.room_settings import OpticsOptions
+from train.simulation.room import OpticsOptions
 from train.simulation.takes import simulate_take
 
 KINDS = ("single-hand", "hand-hand", "hand-pen", "hand-controller")

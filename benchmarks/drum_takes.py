@@ -21,8 +21,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from gloves.optics.identities import number_runs
-from gloves.optics.mirrors import reflect
+from gloves.optics.ghosts import reflect
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.take import Take
 from train.simulation.room import label_false_points
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.people import right_hands
 from benchmarks.record import add_save, describe, save_figures
-from gloves.attachment import Attachment, attach_markers
+from gloves.fit import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.model import HandModel, skinned_jacobian
 from handsim.hand.shape import JOINTS, HandShape, shape_from_measures

@@ -10,9 +10,8 @@ from jaxtyping import Float
 from gloves.layout import load_layout
 from handsim.space.rig import as_rig
 from train.data.shards import row_dtype
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.people import sample_hands
-from train.simulation.training_frames import simulate_frames
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, simulate_frames
 
 _SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 

@@ -16,14 +16,13 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from gloves.attachment import Attachment, attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
 from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
-from poses.motion.motions import sample_motion
-from poses.shapes.validity import sample_valid_angles
+from poses.motion import sample_motion
+from poses.shapes import sample_valid_angles
 from track.kinematics.pose_solver import PoseSolver
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]

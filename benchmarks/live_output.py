@@ -26,13 +26,13 @@ from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
 from gloves.takes.take import Take
 from track.settings import warm_up
-from track.sinks.addresses import open_sinks
+from track.sinks import open_sinks
 from track.streams import natnet
 from track.streams.addresses import open_source
 from track.streams.natnet import ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

@@ -18,11 +18,11 @@ import torch
 
 from benchmarks.people import right_hands
 from benchmarks.record import add_save, describe, save_figures
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rigid_fit
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 
 CANDIDATES = 200
 PAIRS = np.triu_indices(19, 1)

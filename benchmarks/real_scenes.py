@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from gloves.captures.capture import Capture
 from gloves.layout import load_layout
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 
 CONDITIONS = ("clean", "gaps", "close", "new-ids", "exchanged-ids")
 FAST = {"User1/capture1", "User2/capture1", "User2/capture3"}  # three times as fast as 120 Hz would show

@@ -27,7 +27,7 @@ from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.rig_advice.forecast import Forecast, forecast, light_work
 from train.rig_advice.planning import plan_rig
 from train.rig_advice.work import sample_work
-from train.simulation.room_settings import SimulatedKind
+from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
 GLOVE = "dense19"

@@ -21,28 +21,27 @@ import numba
 import numpy as np
 
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.attachment import wear
+from gloves.fit import wear
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import clear_of_mesh
-from gloves.optics.mesh_tree import hand_tree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
-from gloves.optics.visibility import facing_cameras, visible_cameras
+from gloves.optics.visibility import clear_of_mesh, facing_cameras, hand_tree, visible_cameras
 from handsim.hand.model import join_qpos
 from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.light_sources import (
+from poses.shapes import sample_valid_angles
+from train.simulation.room import (
+    SKIN_CHUNK,
+    TWINS,
+    SceneSight,
     marker_radii,
     mirror_images,
+    pack_take,
     sample_light_sources,
     stray_reflections,
 )
-from train.simulation.people import sample_hands
-from train.simulation.room import pack_take
-from train.simulation.room_settings import TWINS
-from train.simulation.sight import SKIN_CHUNK, SceneSight
+from train.simulation.scenes import sample_hands
 from train.simulation.takes import sample_scene, simulate_take
+from train.simulation.training_frames import DatasetConfig
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"

@@ -18,16 +18,21 @@ import numpy as np
 import trimesh
 
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
-from gloves.optics.mesh_tree import hand_tree
-from gloves.optics.visibility import MAX_FACING, free_rays, visible_cameras
+from gloves.optics.visibility import (
+    MAX_FACING,
+    clear_of_body,
+    clear_of_mesh,
+    free_rays,
+    hand_tree,
+    visible_cameras,
+)
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Side, sample_shape
 from handsim.space.rig import CameraRig, list_rigs, named_rig
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 
 CENTER = np.array([0.0, 0.0, 1.1])
 POSES_A_HAND = 50

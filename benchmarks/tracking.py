@@ -45,11 +45,10 @@ from gloves.takes.take import Take
 from track.captures import calibrate
 from track.settings import warm_up
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import simulate_take
+from train.labelers.storage import load_labeler
+from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
+from train.simulation.takes import simulate_calibration, simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""

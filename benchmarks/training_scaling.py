@@ -24,8 +24,8 @@ import torch
 
 from benchmarks.record import describe
 from train.loop import CHECKPOINT
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig
 
 HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main; sys.exit(main())"]
 EVERY = 1.0  # [s] between two looks at the memory

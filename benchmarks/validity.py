@@ -21,11 +21,11 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix
-from poses.contact.two_hands import two_hands_penetration
-from poses.grasps.object_motion import object_penetration
-from poses.motion.scripts import script_names, scripted_motion
-from poses.shapes.couplings import HIGH, LOW
-from train.simulation.room_settings import KINDS
+from poses.grasps import object_penetration
+from poses.motion import script_names, scripted_motion
+from poses.shapes import HIGH, LOW
+from poses.two_hands import two_hands_penetration
+from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 
 SECONDS = 10.0

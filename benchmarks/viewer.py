@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.record import describe
 from gloves.takes.take import load_take
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.frame_view import FrameView
 from track.viewer.recordings import TakeRecording
 from track.viewer.server import opened_server

@@ -26,7 +26,7 @@ import numpy as np
 import viser
 
 from gloves.takes.take import LOST, Take, load_take
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.contents import open_content
 from track.viewer.server import address_of, opened_server
 

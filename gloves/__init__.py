@@ -11,10 +11,10 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from gloves.attachment import Attachment as Attachment
     from gloves.captures.capture import Capture as Capture
     from gloves.captures.formats import read_capture as read_capture
     from gloves.captures.formats import write_capture as write_capture
+    from gloves.fit import Attachment as Attachment
     from gloves.fit import GlovedHand as GlovedHand
     from gloves.fit import GloveFit as GloveFit
     from gloves.fit import attach as attach

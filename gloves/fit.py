@@ -1,22 +1,267 @@
-"""A hand in its glove: the type shared by users' hands, simulated, tracked and drawn ones."""
+"""A hand in its glove: markers on the skin, the bones that carry them, and a point's place on the skin."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
-from gloves.attachment import Attachment, attach_markers
-from gloves.layout import MarkerLayout, load_layout
+from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, load_layout
 from gloves.optics.visibility import visible_cameras
-from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel, load_model
-from handsim.hand.shape import NUM_QPOS, HandShape, Side
+from handsim.errors import ArgumentError, LayoutError
+from handsim.hand.model import HandModel, Site, load_model
+from handsim.hand.shape import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
+from handsim.hand.skin import HandSurface, vertex_normals
+from handsim.kernels.kernel import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
+
+_MOST_FITTINGS: Final = 20
+_WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
+_LARGEST: Final = 100.0  # [m], of a direction and a bone's number too; far more than any hand has
+_SUM_TOLERANCE: Final = 1e-6
+_UNIT_LENGTH: Final = 1e-3  # by which the length of a normal may differ
+_SLACK: Final = 1e-9  # of barycentric weights: a ray through an edge meets a face
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attachment:
+    """Markers of one glove on one hand: rest positions and the weights of the skin under them.
+
+    Raises:
+        ArgumentError: An array does not fit the layout, or holds what it cannot.
+    """
+
+    layout: MarkerLayout
+    points: Float[np.ndarray, "M 3"]
+    """Marker centers at zero angles, in the wrist frame [m]: one radius, and a stalk, above the skin."""
+    normals: Float[np.ndarray, "M 3"]
+    """Outward unit directions of the skin under the markers, at zero angles."""
+    bone_indices: Int[np.ndarray, "M 4"]
+    """The bones that carry each marker."""
+    bone_weights: Float[np.ndarray, "M 4"]
+    """Their shares, summing to one."""
+
+    def __post_init__(self) -> None:
+        for name, width in _WIDTHS.items():
+            shape, expected = getattr(self, name).shape, (self.layout.num_markers, width)
+            if shape != expected:
+                raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
+            if not np.isfinite(getattr(self, name)).all():
+                raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
+            if np.abs(getattr(self, name)).max(initial=0) > _LARGEST:
+                raise ArgumentError(f"{name} holds numbers beyond {_LARGEST:g}, expected markers on a hand")
+        lengths = np.linalg.norm(self.normals, axis=1)
+        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
+            raise ArgumentError("normals are not of unit length, expected the outward directions of markers")
+        bones, shares = self.bone_indices, self.bone_weights
+        if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
+            raise ArgumentError(
+                f"bone_indices are not bones, expected whole numbers from 0 to {NUM_BONES - 1}"
+            )
+        if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= _SUM_TOLERANCE).all()):
+            raise ArgumentError("bone_weights are not shares, expected positive numbers that sum to one")
+
+    @property
+    def main_bones(self) -> Int[np.ndarray, "M"]:
+        """The bone that carries most of each marker."""
+        main: np.ndarray = self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)]
+        return main
+
+    def centers(
+        self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
+    ) -> Float[np.ndarray, "T M 3"]:
+        """Marker centers [m] in the world, for bones from `forward_kinematics` of the same hand."""
+        return self._carried(model, T_world_bone, self.points, 1.0)
+
+    def markers(
+        self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
+    ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
+        """Marker centers [m] and outward unit directions in the world, for bones of the same hand."""
+        normals = self._carried(model, T_world_bone, self.normals, 0.0)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        return self.centers(model, T_world_bone), normals
+
+    def _carried(
+        self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
+    ) -> NDArray[np.float64]:
+        """Points (`last` 1) or directions (0) at the markers, blended over the bones in one product."""
+        inverse = np.linalg.inv(model.rest_transforms)
+        local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
+        weights = np.zeros(local.shape[:2])
+        np.add.at(weights, (np.arange(len(rest))[:, None], self.bone_indices), self.bone_weights)
+        bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
+        carried: NDArray[np.float64] = (weights[..., None] * local).reshape(len(rest), -1) @ bones
+        return carried
+
+    def sites(self, model: HandModel) -> tuple[Site, ...]:
+        """The markers as MuJoCo sites, each on the bone that carries most of it."""
+        bones = self.main_bones
+        inverse = np.linalg.inv(model.rest_transforms)[bones]
+        local = np.einsum("mij,mj->mi", inverse[:, :3, :3], self.points) + inverse[:, :3, 3]
+        return tuple(
+            Site(name, int(bone), position, self.layout.radius)
+            for name, bone, position in zip(self.layout.names, bones, local, strict=True)
+        )
+
+
+def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
+    """Put a glove on a hand: from each marker's point on its bone outwards to the skin."""
+    surface = model.surface
+    rays = np.array([_ray(marker, model) for marker in layout.markers])
+    origins, directions = rays[:, 0], rays[:, 1]
+    markers, faces, bary, distances = _first_exits(origins, directions, surface)
+    if len(markers) < layout.num_markers:
+        marker = layout.markers[int(np.setdiff1d(np.arange(layout.num_markers), markers)[0])]
+        raise LayoutError(
+            f"marker '{marker.name}' meets no skin from {marker.bone} at along {marker.along:g}, "
+            f"across {marker.across:g}; move it onto the hand"
+        )
+    corners = surface.faces[faces]
+    # Skin normals of a few vertices, from the faces around them alone.
+    needed = np.zeros(len(surface.vertices), dtype=np.bool_)
+    needed[corners] = True
+    around = surface.faces[needed[surface.faces].any(axis=1)]
+    normals = np.einsum("mk,mki->mi", bary, vertex_normals(surface.vertices, around)[corners])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = origins + distances[:, None] * directions + layout.heights[:, None] * normals
+    indices, shares = _blend_weights(surface, corners, bary)
+    return Attachment(layout, points, normals, indices, shares)
+
+
+def vary_layout(
+    layout: MarkerLayout, *, along: float, around: float, rng: np.random.Generator
+) -> MarkerLayout:
+    """The same glove with its markers moved at random, as if put on less carefully.
+
+    Args:
+        layout: The glove as designed.
+        along: Standard deviation along the bones [bone lengths]; for the palm also across, at half of it.
+        around: Standard deviation around the bones [rad].
+    """
+
+    def moved(marker: MarkerPlace) -> MarkerPlace:
+        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0).tolist()
+        palm = marker.bone == BONE_NAMES[PALM]
+        return dataclasses.replace(
+            marker,
+            along=min(max(marker.along + (0.5 if palm else 1.0) * along * slip, -0.3), 1.3),
+            around=min(max(marker.around + (0.0 if palm else around) * roll, -math.pi), math.pi),
+            across=marker.across + 0.5 * along * side if palm else 0.0,
+        )
+
+    return dataclasses.replace(layout, markers=tuple(moved(marker) for marker in layout.markers))
+
+
+def wear(
+    layout: MarkerLayout, model: HandModel, *, along: float, around: float, rng: np.random.Generator
+) -> Attachment:
+    """The glove put on with its markers slipped a little (`vary_layout`).
+
+    It is drawn again if a marker is off the hand; after twenty draws it is put on as designed.
+
+    Raises:
+        LayoutError: A marker meets no skin even as designed.
+    """
+    for _ in range(_MOST_FITTINGS):
+        try:
+            return attach_markers(vary_layout(layout, along=along, around=around, rng=rng), model)
+        except LayoutError:
+            continue
+    return attach_markers(layout, model)
+
+
+def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origin [m] and direction of a marker's ray from its bone, at zero angles in the wrist frame."""
+    bone = BONE_NAMES.index(marker.bone)
+    T_wrist_bone = model.rest_transforms[bone]
+    sideways = 1.0 if model.shape.side == "right" else -1.0  # thumb side
+    local = np.array([marker.along * model.skeleton.lengths[bone], 0.0, 0.0])
+    if bone == PALM:
+        local[1] = sideways * marker.across * model.shape.breadth
+    direction = np.array([0.0, sideways * np.sin(marker.around), np.cos(marker.around)])
+    return T_wrist_bone[:3, :3] @ local + T_wrist_bone[:3, 3], T_wrist_bone[:3, :3] @ direction
+
+
+def _first_exits(
+    origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """First exits from the skin along rays: rays that have one, faces, barycentric weights, distances [m]."""
+    exits = _exits(origins, directions, surface.vertices, np.ascontiguousarray(surface.faces))
+    rays = np.flatnonzero(exits[0] >= 0)
+    faces, weights, distances = (each[rays] for each in exits)
+    return rays, faces, weights, distances
+
+
+@kernel
+def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
+    """First exits along rays: faces (R,), -1 for none, barycentric weights (R, 3), distances (R,) [m].
+
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997).
+    """
+    found, weights = np.full(len(origins), -1), np.empty((len(origins), 3))
+    nearest = np.full(len(origins), np.inf)
+    first, second, offset, across, turned = np.empty((5, 3))
+    for f in range(len(faces)):
+        corner = vertices[faces[f, 0]]
+        for i in range(3):
+            first[i] = vertices[faces[f, 1], i] - corner[i]
+            second[i] = vertices[faces[f, 2], i] - corner[i]
+        # A line that meets a triangle comes nearer to its first corner than the longer edge from there.
+        reach = 1.01 * max(_dot(first, first), _dot(second, second))
+        for r in range(len(origins)):
+            for i in range(3):
+                offset[i] = origins[r, i] - corner[i]
+            if _dot(offset, offset) - _dot(offset, directions[r]) ** 2 > reach:
+                continue
+            _cross(directions[r], second, across)
+            determinant = _dot(first, across)
+            if determinant >= 0.0:  # on the way in, or along the face
+                continue
+            _cross(offset, first, turned)
+            u, v = _dot(offset, across) / determinant, _dot(turned, directions[r]) / determinant
+            distance = _dot(second, turned) / determinant
+            if min(u, v, 1.0 - u - v) >= -_SLACK and 0.0 < distance < nearest[r]:
+                found[r], nearest[r] = f, distance
+                weights[r] = (1.0 - u - v, u, v)
+    return found, weights, nearest
+
+
+@kernel(inline=True)
+def _dot(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> float:
+    """Scalar product of two vectors (3,)."""
+    return float(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+@kernel(inline=True)
+def _cross(
+    first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"], product: Float[np.ndarray, "3"]
+) -> None:
+    """Write the vector product (3,) of two vectors (3,)."""
+    product[0] = first[1] * second[2] - first[2] * second[1]
+    product[1] = first[2] * second[0] - first[0] * second[2]
+    product[2] = first[0] * second[1] - first[1] * second[0]
+
+
+def _blend_weights(
+    surface: HandSurface, corners: NDArray[np.int64], bary: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Skin weights interpolated between three vertices each, cut to the strongest four."""
+    full = np.zeros((len(corners), len(BONE_NAMES)))
+    rows = np.arange(len(corners))[:, None]
+    for corner in range(3):
+        vertex = corners[:, corner]
+        shares = bary[:, corner, None] * surface.bone_weights[vertex]
+        np.add.at(full, (rows, surface.bone_indices[vertex]), shares)
+    indices = np.argsort(-full, axis=1, kind="stable")[:, :4]
+    weights = np.clip(np.take_along_axis(full, indices, axis=1), 0.0, None)
+    return indices, weights / weights.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,3 +393,126 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
     np.fill_diagonal(distances, np.inf)
     first, second = divmod(int(distances.argmin()), len(points))
     return fit.layout.names[first], fit.layout.names[second], float(distances[first, second])
+
+
+_STEPS: Final = 12
+_NEAR: Final = 1e-5  # [m]
+_REACHED: Final = 5e-4  # [m]
+_POINTED: Final = 2e-4  # [m]
+_CURVATURE_RADIUS: Final = 0.006  # of the skin of a finger's tip [m]
+_SPACING: Final = 4e-3  # [m] between the skin's vertices, about
+
+
+def place_marker(
+    layout: MarkerLayout, index: int, model: HandModel, point: Float[np.ndarray, "3"]
+) -> MarkerLayout:
+    """The layout with one marker moved to the place on the skin that is nearest to a point.
+
+    The marker stays on its bone where that reaches the point, or else goes to the one that carries the skin
+    there. On the palm it lies straight above or below its place in the palm's plane.
+
+    Args:
+        index: The marker to move.
+        model: The hand that the point is meant on.
+        point: Where the marker's center shall be, in the wrist's frame of the flat hand [m]. A marker on a
+            stalk keeps its height, and comes to stand where the stalk points at this.
+
+    Raises:
+        LayoutError: No marker can be put there.
+    """
+    height = layout.markers[index].height
+    placed = _place_on_skin(_with_height(layout, index, 0.0), index, model, point)
+    return placed if height == 0.0 else _stand_up(placed, index, height, model, point)
+
+
+def _stand_up(
+    layout: MarkerLayout, index: int, height: float, model: HandModel, point: NDArray[np.float64]
+) -> MarkerLayout:
+    """A marker that lies near its place, put on its stalk and moved until the stalk points at a point."""
+    foot = attach_markers(layout, model).points[index]
+    best, least = layout, math.inf
+    for _ in range(_STEPS):
+        standing = _with_height(layout, index, height)
+        worn = attach_markers(standing, model)
+        missed = point - worn.points[index]
+        missed -= (missed @ worn.normals[index]) * worn.normals[index]
+        distance = float(np.linalg.norm(missed))
+        if distance < least:
+            best, least = standing, distance
+        if least < _POINTED:
+            break
+        # On skin as curved as a finger's tip the end of the stalk moves more than its foot.
+        foot = foot + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
+        layout = _place_on_skin(layout, index, model, foot)
+    return best
+
+
+def _with_height(layout: MarkerLayout, index: int, height: float) -> MarkerLayout:
+    marker = dataclasses.replace(layout.markers[index], height=height)
+    return dataclasses.replace(
+        layout, markers=(*layout.markers[:index], marker, *layout.markers[index + 1 :])
+    )
+
+
+def _place_on_skin(
+    layout: MarkerLayout, index: int, model: HandModel, point: NDArray[np.float64]
+) -> MarkerLayout:
+    """The layout with a marker without a stalk on the skin that is nearest to a point."""
+    surface = model.surface
+    nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
+    normal = vertex_normals(surface.vertices, surface.faces)[nearest]
+    aside = point - surface.vertices[nearest]
+    aside -= (aside @ normal) * normal
+    aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _NEAR))
+    center = surface.vertices[nearest] + aside + layout.radius * normal
+    bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
+    best, least = layout, math.inf
+    for bone in dict.fromkeys(bones):
+        candidate, missed = _place_on(layout, index, bone, model, center)
+        if missed < least:
+            best, least = candidate, missed
+        if least < _REACHED:
+            break
+    if math.isinf(least):
+        raise LayoutError(f"marker '{layout.names[index]}' meets no skin there; move it nearer to the hand")
+    return best
+
+
+def _place_on(
+    layout: MarkerLayout, index: int, bone: int, model: HandModel, center: NDArray[np.float64]
+) -> tuple[MarkerLayout, float]:
+    """The layout with a marker's center on one bone as near to a place as can be, and how far it misses [m].
+
+    The layout is the given one, and the distance infinite, where the bone's rays meet no skin.
+    """
+    wanted, start = center, model.rest_transforms[bone]
+    middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
+    best, least = layout, math.inf
+    for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
+        moved = _place(layout.markers[index], bone, model, wanted)
+        markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
+        candidate = dataclasses.replace(layout, markers=markers)
+        try:
+            missed = center - attach_markers(candidate, model).points[index]
+        except LayoutError:  # beside the skin, as beyond a finger's tip
+            wanted = wanted + 0.1 * (middle - wanted)
+            continue
+        distance = float(np.linalg.norm(missed))
+        if distance < least:
+            least, best = distance, candidate
+        if least < _NEAR:
+            break
+        wanted = wanted + missed
+    return best, least
+
+
+def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.float64]) -> MarkerPlace:
+    """The place on a bone whose ray goes through a point."""
+    T_wrist_bone = model.rest_transforms[bone]
+    x, y, z = T_wrist_bone[:3, :3].T @ (point - T_wrist_bone[:3, 3])
+    y *= 1.0 if model.shape.side == "right" else -1.0
+    along = float(np.clip(x / model.skeleton.lengths[bone], *ALONG_RANGE))
+    if bone != PALM:
+        return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z))
+    across = float(np.clip(y / model.shape.breadth, *ACROSS_RANGE))
+    return MarkerPlace(marker.name, BONE_NAMES[bone], along, 0.0 if z >= 0.0 else math.pi, across)

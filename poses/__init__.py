@@ -11,11 +11,11 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from poses.motion.motions import sample_motion as sample_motion
-    from poses.motion.paths import MotionConfig as MotionConfig
-    from poses.shapes.library import load_gestures as load_gestures
-    from poses.shapes.sampling import PoseSampler as PoseSampler
-    from poses.shapes.sampling import sample_poses as sample_poses
-    from poses.shapes.validity import validate as validate
+    from poses.motion import MotionConfig as MotionConfig
+    from poses.motion import sample_motion as sample_motion
+    from poses.shapes import PoseSampler as PoseSampler
+    from poses.shapes import load_gestures as load_gestures
+    from poses.shapes import sample_poses as sample_poses
+    from poses.shapes import validate as validate
 
 __getattr__, __dir__ = lazy_exports(__name__)

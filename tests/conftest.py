@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from handsim.app.interrupts import ENDING
 from handsim.errors import HandSimError
+from handsim.files.signals import ENDING
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -85,7 +85,7 @@ def heeded_signals() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def drawing() -> None:
     """Skips where nothing can be drawn."""
-    from render.painting.gl import offscreen_renderer
+    from render.painting.opengl import offscreen_renderer
 
     try:
         offscreen_renderer(16, 16)

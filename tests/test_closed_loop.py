@@ -11,7 +11,7 @@ from gloves.takes.take import load_take
 from handsim.cli.simulate import simulate
 from handsim.hand.model import HandModel, hand_keypoints
 from render import RenderConfig, draw
-from render.cameras.viewpoints import ViewConfig
+from render.viewpoints import ViewConfig
 from track.captures import track_capture
 from train.simulation.takes import TakeConfig
 

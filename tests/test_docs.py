@@ -7,11 +7,11 @@ import re
 
 import pytest
 
-from poses.shapes.sampling import SAMPLERS
+from poses.shapes import SAMPLERS
 from tests.documents import PAGES, ROOT, blocks_of, name_of, run_blocks
-from track.sinks.addresses import GROUP as SINKS
+from track.sinks import GROUP as SINKS
 from track.streams.addresses import GROUP as SOURCES
-from train.data.own_corruption import CORRUPTIONS
+from train.data.batches import CORRUPTIONS
 from train.labelers.protocol import LABELERS
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")

@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from track.glove_advice.trials import Trial as Trial
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
+    from track.live_message import LiveBody as LiveBody
+    from track.live_message import LiveHand as LiveHand
+    from track.live_message import LiveHeader as LiveHeader
+    from track.live_message import LiveMessage as LiveMessage
+    from track.live_message import LiveSink as LiveSink
     from track.recorder import Recorder as Recorder
     from track.settings import TrackSettings as TrackSettings
-    from track.sinks.addresses import SinkGroup as SinkGroup
-    from track.sinks.addresses import open_sinks as open_sinks
-    from track.sinks.message import LiveBody as LiveBody
-    from track.sinks.message import LiveHand as LiveHand
-    from track.sinks.message import LiveHeader as LiveHeader
-    from track.sinks.message import LiveMessage as LiveMessage
-    from track.sinks.message import LiveSink as LiveSink
+    from track.sinks import SinkGroup as SinkGroup
+    from track.sinks import open_sinks as open_sinks
     from track.streams.addresses import open_source as open_source
     from track.streams.frame_source import StreamedFrame as StreamedFrame
     from track.streams.live_stream import LiveStream as LiveStream

@@ -16,7 +16,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
@@ -45,13 +45,13 @@ from track.settings import (
     found_user,
     measured_user,
 )
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
 from track.user import MEASURED, User, checked_sides
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
 _CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most

@@ -15,13 +15,13 @@ import numpy as np
 
 from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take
-from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from handsim.app.messages import LiveStatus
+from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
 from track.frames import FARTHEST, TrackedFrame
 from track.recorder import Recorder
 from track.settings import TrackerSetup
-from track.sinks.addresses import SinkGroup
+from track.sinks import SinkGroup
 from track.streams.addresses import open_source
 from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream

@@ -29,9 +29,9 @@ from gloves.takes.take import (
     worn_arrays,
 )
 from handsim._checks import check_type
-from handsim.app.interrupts import interrupt_behind
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import remove_abandoned
+from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, TrackedFrame
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker

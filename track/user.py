@@ -11,8 +11,7 @@ from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
 
-from gloves.attachment import Attachment
-from gloves.fit import GloveFit, nominal_fit
+from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_choice, check_type

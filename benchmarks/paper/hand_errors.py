@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.attachment import Attachment
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import PALM

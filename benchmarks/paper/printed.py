@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from train.simulation.room_settings import Kind
+from train.simulation.scenes import Kind
 
 AUGMENTATIONS: Final = ("Base", "Base+O", "Base+G", "Base+O+G")
 """The networks and the test sets of Table 2."""

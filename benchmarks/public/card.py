@@ -11,7 +11,7 @@ from benchmarks.public.answers import load_answers
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from benchmarks.public.manifest import capture_path, label_names, truth_path
 from gloves.captures.formats import read_capture
-from train.simulation.motion import RATE
+from train.simulation.scenes import RATE
 
 _TAGS: Final = ("motion-capture", "hand-tracking", "marker-labeling", "point-cloud", "synthetic", "handsim")
 _SIZES: Final = ((1e3, "n<1K"), (1e4, "1K<n<10K"), (1e5, "10K<n<100K"), (1e6, "100K<n<1M"))

@@ -10,9 +10,10 @@ from typing import Final
 
 import numpy as np
 
+from gloves.optics.ghosts import StrayConfig
 from gloves.optics.reconstruction import OpticsConfig
-from gloves.optics.strays import StrayConfig
-from train.simulation.room_settings import KINDS, RoomConfig, SimulatedKind
+from train.simulation.room import RoomConfig
+from train.simulation.scenes import KINDS, SimulatedKind
 
 BENCHMARK: Final = "handsim-benchmark-1"
 """Name and version, which results are reported with."""

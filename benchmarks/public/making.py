@@ -38,9 +38,8 @@ from handsim.files.outputs import atomic_write, check_free, remove_leftovers
 from handsim.hand.model import HandModel
 from handsim.space.rig import load_rig
 from track.user import User, load_user
-from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
-from train.simulation.room_settings import Kind
+from train.simulation.scenes import Kind, sample_real_like_scene
 from train.simulation.takes import sample_scene
 
 Progress = Callable[[int, int], None]

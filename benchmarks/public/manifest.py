@@ -23,7 +23,7 @@ from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.model import KEYPOINT_NAMES
 from track.user import User, load_user
-from train.simulation.motion import RATE
+from train.simulation.scenes import RATE
 
 MANIFEST: Final = "manifest.json"
 LICENSE: Final = "CC-BY-4.0"

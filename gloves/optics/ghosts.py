@@ -1,17 +1,178 @@
-"""Ghosts, points that are not markers: mirror images in shiny surfaces near the hand, stray reflections."""
+"""Points that are not markers: mirror images in shiny surfaces near the hand, and stray reflections."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from gloves.optics.mirrors import cameras_by_mirror, reflect
 from handsim._checks import check_number, check_span
+from handsim.errors import ArgumentError
+from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import segment_distance_squared
+from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
+
+
+def reflect(
+    points: Float[np.ndarray, "*batch 3"],
+    plane_point: Float[np.ndarray, "*batch 3"],
+    plane_normal: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3"]:
+    """Mirror images of points in planes given by a point and a unit normal [m]."""
+    height = np.einsum("...i,...i->...", points - plane_point, plane_normal)
+    mirrored: NDArray[np.float64] = points - 2.0 * height[..., None] * plane_normal
+    return mirrored
+
+
+def cameras_by_mirror(
+    images: Float[np.ndarray, "T P 3"],
+    plane_point: Float[np.ndarray, "T 3"],
+    plane_normal: Float[np.ndarray, "T 3"],
+    radius: float,
+    rig: CameraRig,
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T P C"]:
+    """Which cameras see which mirror image: in the patch, in view, and with both legs of the path free.
+
+    Args:
+        images: Mirror images of the markers [m]; NaN where there is none.
+        plane_point: Middle of the patch in each frame [m].
+        plane_normal: Unit normal of its shiny side.
+        radius: Radius of the patch [m].
+        segments: Axes of the capsules that block the view, in the world [m].
+    """
+    seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
+    _over_patch(images, plane_point, plane_normal, radius, rig.arrays, segments, radii, seen)
+    return seen
+
+
+@kernel
+def _over_patch(
+    images: Any, plane_point: Any, plane_normal: Any, radius: float, cameras: Any, segments: Any,
+    radii: Any, seen: Any,
+) -> None:  # fmt: skip
+    """Write which cameras see which mirror image into `seen` (T, P, C); arguments as `cameras_by_mirror`."""
+    hit, marker, camera, local = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for t in range(len(images)):
+        point, normal = plane_point[t], plane_normal[t]
+        for p in range(images.shape[1]):
+            behind = 0.0  # how deep the image lies behind the plane
+            for i in range(3):
+                behind += (point[i] - images[t, p, i]) * normal[i]
+            if not behind > 0.0:  # also where there is no image: NaN
+                continue
+            for i in range(3):
+                marker[i] = images[t, p, i] + 2.0 * behind * normal[i]
+            for c in range(len(cameras.sizes)):
+                pose = cameras.T_world_camera[c]
+                ahead, off = 0.0, 0.0
+                local[:] = 0.0
+                for i in range(3):
+                    camera[i] = pose[i, 3]
+                    line = images[t, p, i] - camera[i]
+                    ahead -= line * normal[i]
+                    for k in range(3):
+                        local[k] += line * pose[i, k]
+                if ahead <= behind or not in_picture(
+                    cameras.intrinsics[c], cameras.sizes[c], cameras.lenses[c], local[0], local[1], local[2]
+                ):
+                    continue
+                for i in range(3):
+                    hit[i] = images[t, p, i] + behind / ahead * (camera[i] - images[t, p, i])
+                    off += (hit[i] - point[i]) ** 2
+                seen[t, p, c] = (
+                    off < radius * radius
+                    and _clear(marker, hit, segments[t], radii)
+                    and _clear(hit, camera, segments[t], radii)
+                )
+
+
+@kernel
+def _clear(start: Any, end: Any, segments: Any, radii: Any) -> bool:
+    """Whether the line between two points (3,) [m] meets no capsule (axes (K, 2, 3) and radii (K,) [m])."""
+    for k in range(len(radii)):
+        if segment_distance_squared(start, end, segments[k, 0], segments[k, 1]) < radii[k] * radii[k]:
+            return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class StrayConfig:
+    """Number of reflecting spots, their positions and the duration of their flashes.
+
+    Raises:
+        ArgumentError: A number is out of range.
+    """
+
+    number: float = 1.0
+    """Mean number of reflecting spots, Poisson distributed."""
+    reach: float = 0.12
+    """Radius of the ball around the middle of the carrier in which they lie [m]."""
+    shown: float = 0.4
+    """Mean time that a spot reflects [s]."""
+    hidden: float = 1.0
+    """Mean time that it does not [s]."""
+    camera_share: float = 0.5
+    """Share of the cameras that a spot reflects to."""
+
+    def __post_init__(self) -> None:
+        for name in ("number", "reach", "shown", "hidden"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ArgumentError(f"{name} of strays is {getattr(self, name):g}, expected a number from 0")
+        if self.shown <= 0.0 or not 0.0 <= self.camera_share <= 1.0:
+            raise ArgumentError("strays need a time shown above 0 s and a camera_share from 0 to 1")
+
+
+def sample_strays(
+    T_world_carrier: Float[np.ndarray, "T 4 4"],
+    middle: Float[np.ndarray, "3"],
+    config: StrayConfig,
+    *,
+    rate: float,
+    num_cameras: int,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "T K 3"], Bool[np.ndarray, "T K C"]]:
+    """Strays carried by a hand, an object or the room.
+
+    Args:
+        T_world_carrier: Pose of the carrier.
+        middle: Middle of the ball in which they lie, in the carrier's frame [m].
+        num_cameras: Cameras of the rig.
+
+    Returns:
+        Positions in the world [m], and which cameras each reflects to; occlusion is not tested here.
+    """
+    count = int(rng.poisson(config.number))
+    directions = rng.standard_normal((count, 3))
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    local = middle + config.reach * np.cbrt(rng.random((count, 1))) * directions
+    positions = np.einsum("tij,kj->tki", T_world_carrier[:, :3, :3], local) + T_world_carrier[:, None, :3, 3]
+    shining = np.zeros((len(positions), count), dtype=bool)
+    for number in range(count):
+        shining[:, number] = _flashes(len(positions), config, rate, rng)
+    lit = rng.random((count, num_cameras)) < config.camera_share
+    return positions, shining[..., None] & lit
+
+
+def _flashes(
+    frames: int, config: StrayConfig, rate: float, rng: np.random.Generator
+) -> Bool[np.ndarray, "T"]:
+    """Alternating times of light and dark, exponentially distributed."""
+    shown = rng.random() < config.shown / (config.shown + config.hidden)
+    shining = np.empty(frames, dtype=bool)
+    at = 0
+    while at < frames:
+        mean = config.shown if shown else config.hidden
+        steps = max(1, round(rng.exponential(mean) * rate)) if mean > 0.0 else 0
+        shining[at : at + steps] = shown
+        at, shown = at + steps, not shown
+    return shining
+
 
 MAX_GHOSTS: Final = 4
 """Ghosts kept per frame; more are dropped at random."""

@@ -1,18 +1,322 @@
-"""Visibility of markers: lines of sight past the hand's capsules, facing, and field of view."""
+"""Lines of sight from markers to cameras: past capsules and triangle meshes, facing, and field of view."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from handsim._checks import check_array
+from handsim.errors import ArgumentError
 from handsim.hand.capsules import bounding_spheres
+from handsim.hand.shape import named_shape
+from handsim.hand.skin import build_surface
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
+
+_PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
+
+
+@kernel
+def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
+    """Refit every box (N, 6) [m] to its triangles; written out, because loops over axes take longer.
+
+    `skip`, `spots` and `start` are those of the `MeshTree`, the vertices those of the mesh (V, 3) [m].
+    """
+    for back in range(len(skip)):
+        node = len(skip) - 1 - back
+        if start[node] == start[node + 1]:
+            left = node + 1
+            right = skip[left]
+            for i in range(3):
+                a, b = boxes[left, i], boxes[right, i]
+                boxes[node, i] = a if a < b else b
+                a, b = boxes[left, 3 + i], boxes[right, 3 + i]
+                boxes[node, 3 + i] = a if a > b else b
+            continue
+        lx, ly, lz, hx, hy, hz = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
+        for spot in range(start[node], start[node + 1]):
+            v = spots[spot]
+            x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+            lx, hx = (x if x < lx else lx), (x if x > hx else hx)
+            ly, hy = (y if y < ly else ly), (y if y > hy else hy)
+            lz, hz = (z if z < lz else lz), (z if z > hz else hz)
+        boxes[node, 0], boxes[node, 1], boxes[node, 2] = lx - _PAD, ly - _PAD, lz - _PAD
+        boxes[node, 3], boxes[node, 4], boxes[node, 5] = hx + _PAD, hy + _PAD, hz + _PAD
+
+
+@kernel
+def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
+    """Whether the line from `start` to `end`, each (3,) [m], meets a triangle of the tree."""
+    faces, first, skip = nodes
+    px, py, pz = start[0], start[1], start[2]
+    d = (end[0] - px, end[1] - py, end[2] - pz)
+    ix = 1.0 / d[0] if d[0] != 0.0 else 1e300
+    iy = 1.0 / d[1] if d[1] != 0.0 else 1e300
+    iz = 1.0 / d[2] if d[2] != 0.0 else 1e300
+    # the sides of all boxes that this line meets first
+    nx, ny, nz = (0 if ix > 0.0 else 3), (1 if iy > 0.0 else 4), (2 if iz > 0.0 else 5)
+    node = 0
+    while node < len(skip):
+        near = max(0.0, (boxes[node, nx] - px) * ix)
+        far = min(1.0, (boxes[node, 3 - nx] - px) * ix)
+        t = (boxes[node, ny] - py) * iy
+        near = t if t > near else near
+        t = (boxes[node, 5 - ny] - py) * iy
+        far = t if t < far else far
+        t = (boxes[node, nz] - pz) * iz
+        near = t if t > near else near
+        t = (boxes[node, 7 - nz] - pz) * iz
+        far = t if t < far else far
+        if near > far:
+            node = skip[node]
+            continue
+        for face in range(first[node], first[node + 1]):
+            if _meets_triangle((px, py, pz), d, vertices, faces[face]):
+                return True
+        node += 1
+    return False
+
+
+@kernel(inline=True)
+def _meets_triangle(p: Any, d: Any, vertices: Any, face: Any) -> bool:
+    """Moeller and Trumbore 1997, without a division, for both windings; edges count as hit."""
+    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    fx, fy, fz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    hx, hy, hz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx
+    determinant = ex * hx + ey * hy + ez * hz
+    sx, sy, sz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    qx, qy, qz = sy * ez - sz * ey, sz * ex - sx * ez, sx * ey - sy * ex
+    u = sx * hx + sy * hy + sz * hz
+    v = d[0] * qx + d[1] * qy + d[2] * qz
+    t = fx * qx + fy * qy + fz * qz
+    if determinant < 0.0:
+        determinant, u, v, t = -determinant, -u, -v, -t
+    return bool(
+        determinant > 0.0 and u >= 0.0 and v >= 0.0 and u + v <= determinant and 0.0 <= t <= determinant
+    )
+
+
+@kernel
+def clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) -> Any:
+    """Which lines (T, P, C) meet no triangle.
+
+    Args:
+        vertices: The mesh in every frame (T, V, 3) [m], or in one for all.
+        lines: Starts (T, P, C or 1, 3) [m], ends (T or 1, C, 3) [m], and which lines are needed (T, P, C).
+        nodes: `faces`, `first` and `skip` of the tree.
+        spots: `spots` and `spots_start` of the tree; no spots: the boxes are used as given.
+        boxes: Low and high corner of each node (N, 6) [m], refitted in every frame.
+    """
+    starts, ends, needed = lines
+    clear = np.zeros(needed.shape, dtype=np.bool_)
+    for t in range(needed.shape[0]):
+        mesh, cameras = vertices[min(t, len(vertices) - 1)], ends[min(t, len(ends) - 1)]
+        if len(spots[0]) > 0:
+            refit(mesh, nodes[2], spots[0], spots[1], boxes)
+        for p in range(needed.shape[1]):
+            for c in range(needed.shape[2]):
+                start = starts[t, p, min(c, starts.shape[2] - 1)]
+                if needed[t, p, c] and np.isfinite(start[0] + start[1] + start[2]):
+                    clear[t, p, c] = not _meets(start, cameras[c], mesh, nodes, boxes)
+    return clear
+
+
+_LEAF: Final = 4  # triangles of a leaf at most
+
+
+class MeshTree:
+    """A tree of axis-aligned boxes around a mesh's triangles.
+
+    The surface-area heuristic splits the mesh as given here; later frames only refit the boxes. Only faces
+    matter, so one tree serves all meshes that share them (`hand_tree` serves all hands).
+
+    Nodes are stored in depth-first order, a left child right after its parent, and `skip` is the node that
+    follows when a branch is left out: a search needs no stack, and a refit is one backward pass.
+
+    Args:
+        vertices: Rest positions [m].
+        faces: Triangles of either winding.
+
+    Raises:
+        ArgumentError: There is no triangle, an array has another shape, or a face names no vertex.
+    """
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        self.vertices: NDArray[np.float64] = np.ascontiguousarray(
+            check_array("vertices", vertices, (None, 3))
+        )
+        faces = np.asarray(faces)
+        if self.vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise ArgumentError(
+                f"vertices {self.vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)"
+            )
+        if faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise ArgumentError(
+                f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
+            )
+        corners = self.vertices[faces]
+        order, self.first, self.skip = _build(corners.min(axis=1), corners.max(axis=1))
+        self.faces: NDArray[np.int32] = np.ascontiguousarray(faces[order], dtype=np.int32)
+        """Triangles, those of leaf n from `first[n]` to `first[n + 1]`; other nodes own none."""
+        self.spots, self.spots_start = _leaf_vertices(self.faces, self.first)
+        self.boxes: NDArray[np.float64] = np.empty((len(self.skip), 6))
+        """Low and high corner of each node [m] around the vertices given here."""
+        refit(self.vertices, self.skip, self.spots, self.spots_start, self.boxes)
+
+
+@functools.cache
+def hand_tree() -> MeshTree:
+    """The tree of every hand's skin: size, side and pose change only the positions of its vertices."""
+    surface = build_surface(named_shape("M"))
+    return MeshTree(surface.vertices, surface.faces)
+
+
+@kernel
+def _build(low: Any, high: Any) -> Any:
+    """Order of the triangles (F,) by their boxes, first triangle of every node (N + 1,), and `skip` (N,)."""
+    count = len(low)
+    centers = low + high
+    order = np.arange(count)
+    first = np.zeros(2 * count + 1, dtype=np.int32)
+    skip = np.zeros(2 * count, dtype=np.int32)
+    stack = [(0, count, -1)]  # begin, end, the left sibling
+    nodes = 0
+    while len(stack) > 0:
+        begin, end, left = stack.pop()
+        if left >= 0:
+            skip[left] = nodes
+        first[nodes] = begin
+        if end - begin > _LEAF:
+            middle = begin + _split(order[begin:end], low, high, centers)
+            stack.append((middle, end, nodes + 1))
+            stack.append((begin, middle, -1))
+        nodes += 1
+    first[nodes] = count
+    skip[0] = nodes
+    for node in range(nodes):  # a right child is left out together with its parent
+        if first[node + 1] == first[node]:
+            right = skip[node + 1]
+            skip[right] = skip[node]
+    return order, first[: nodes + 1], skip[:nodes]
+
+
+@kernel
+def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
+    """Sort a node's triangles along an axis and return where to cut them: least sum of count x box area."""
+    count = len(order)
+    least, cut = np.inf, _LEAF
+    best = order.copy()
+    after = np.empty(count)
+    for axis in range(3):
+        sequence = order[np.argsort(centers[order, axis], kind="mergesort")]
+        for backwards in (True, False):
+            box_low, box_high = np.full(3, np.inf), np.full(3, -np.inf)
+            for step in range(count):
+                index = count - 1 - step if backwards else step
+                for i in range(3):
+                    box_low[i] = min(box_low[i], low[sequence[index], i])
+                    box_high[i] = max(box_high[i], high[sequence[index], i])
+                x, y, z = box_high - box_low
+                area = x * y + y * z + z * x
+                if backwards:
+                    after[index] = area
+                elif (step + 1) % _LEAF == 0 and step + 1 < count:
+                    cost = area * (step + 1) + after[step + 1] * (count - step - 1)
+                    if cost < least:
+                        least, cut = cost, step + 1
+                        best[:] = sequence
+    order[:] = best
+    return cut
+
+
+@kernel
+def _leaf_vertices(faces: Any, first: Any) -> Any:
+    """The vertices of every node's own triangles, each once, and where each node's list starts (N + 1,)."""
+    nodes = len(first) - 1
+    spots = np.empty(faces.size, dtype=np.int32)
+    start = np.zeros(nodes + 1, dtype=np.int32)
+    found = 0
+    for node in range(nodes):
+        start[node] = found
+        for face in range(first[node], first[node + 1]):
+            for corner in range(3):
+                vertex, known = faces[face, corner], False
+                for other in range(start[node], found):
+                    known = known or spots[other] == vertex
+                if not known:
+                    spots[found] = vertex
+                    found += 1
+    start[nodes] = found
+    return spots[:found].copy(), start
+
+
+def clear_of_mesh(
+    tree: MeshTree,
+    vertices: Float[np.ndarray, "T V 3"],
+    points: Float[np.ndarray, "T P 3"] | Float[np.ndarray, "T P C 3"],
+    cameras: Float[np.ndarray, "C 3"],
+    needed: Bool[np.ndarray, "T P C"],
+) -> Bool[np.ndarray, "T P C"]:
+    """Which of the needed lines from point to camera, in the world, meet no triangle of their frame's mesh.
+
+    A line that starts inside a closed mesh is not clear. NaN points are never clear. Points [m] are one for
+    all cameras, or one for each. Lines that are not needed cost nothing and count as not clear.
+    """
+    vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+    starts, ends = _check_lines(points, cameras, needed)
+    expected_shape = (len(needed), *tree.vertices.shape)
+    if vertices.shape != expected_shape:
+        raise ArgumentError(f"vertices has shape {vertices.shape}, expected {expected_shape}")
+    if not np.isfinite(vertices.sum()):
+        raise ArgumentError("vertices holds NaN or infinite values, expected finite numbers")
+    nodes, spots = (tree.faces, tree.first, tree.skip), (tree.spots, tree.spots_start)
+    lines = (starts, ends[None], np.asarray(needed, dtype=np.bool_))
+    clear: NDArray[np.bool_] = clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes))
+    return clear
+
+
+def clear_of_body(
+    tree: MeshTree,
+    T_world_body: Float[np.ndarray, "T 4 4"],
+    points: Float[np.ndarray, "T P 3"] | Float[np.ndarray, "T P C 3"],
+    cameras: Float[np.ndarray, "C 3"],
+    needed: Bool[np.ndarray, "T P C"],
+) -> Bool[np.ndarray, "T P C"]:
+    """`clear_of_mesh` for a rigid body: lines are transformed into its frame, the tree is used as built."""
+    poses = check_array("T_world_body", T_world_body, (len(needed), 4, 4))
+    starts, ends = _check_lines(points, cameras, needed)
+    rotations, positions = poses[:, :3, :3], poses[:, None, :3, 3]
+    if not np.allclose(rotations.transpose(0, 2, 1) @ rotations, np.eye(3), atol=1e-6):
+        raise ArgumentError("T_world_body scales or shears, expected rotations and translations alone")
+    starts = np.ascontiguousarray((starts - positions[:, None]) @ rotations[:, None])
+    ends = np.ascontiguousarray((ends - positions) @ rotations)
+    nodes, no_refit = (tree.faces, tree.first, tree.skip), (tree.spots[:0], tree.spots_start)
+    lines = (starts, ends, np.asarray(needed, dtype=np.bool_))
+    clear: NDArray[np.bool_] = clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes)
+    return clear
+
+
+def _check_lines(
+    points: NDArray[np.float64], cameras: NDArray[np.float64], needed: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Starts (T, P, 1 or C, 3), which may be NaN, and ends (C, 3) of the lines."""
+    starts = np.ascontiguousarray(points, dtype=np.float64)
+    ends = np.ascontiguousarray(check_array("cameras", cameras, (None, 3)))
+    shapes = ((*needed.shape[:2], 3), (*needed.shape, 3))
+    if needed.ndim != 3 or starts.shape not in shapes or ends.shape != (needed.shape[2], 3):
+        raise ArgumentError(
+            f"points {starts.shape}, cameras {ends.shape} and needed {needed.shape} do not fit together, "
+            "expected (T, P, 3) or (T, P, C, 3), (C, 3) and (T, P, C)"
+        )
+    return (starts[:, :, None] if starts.ndim == 3 else starts), ends
+
 
 MAX_FACING: Final = np.deg2rad(85.0)
 """Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""

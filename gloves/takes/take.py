@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from gloves.attachment import Attachment
 from gloves.captures.capture import Capture, labeled_columns
 from gloves.captures.formats import write_capture
-from gloves.fit import GlovedHand, GloveFit
+from gloves.fit import Attachment, GlovedHand, GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import SCHEMA, names_of, read_archive, settings_of, write_archive
 from gloves.takes.points import (

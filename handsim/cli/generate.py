@@ -9,18 +9,18 @@ import numpy as np
 import tyro
 
 from gloves.layout import load_layout
-from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
 from handsim.app.progress import named_steps, print_above, progress_bar
+from handsim.app.workers import chosen_workers
 from handsim.hand.shape import SIDES
 from handsim.space.rig import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
 from train.data.shards import Dataset
 from train.reports.dataset_page import REPORT, write_dataset_page
-from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
-from train.simulation.room_settings import SimulatedKind
+from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import WRIST_VOLUME, simulate_take
+from train.simulation.training_frames import DatasetConfig
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 

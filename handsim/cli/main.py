@@ -16,10 +16,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from handsim import __version__
-from handsim.app.interrupts import Stopped, signals_raise
 from handsim.app.messages import told_warnings
 from handsim.cli.command_table import COMMANDS, PresetCommand, load
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
+from handsim.files.signals import Stopped, signals_raise
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
 

@@ -10,10 +10,10 @@ import numpy as np
 import tyro
 
 from handsim._checks import check_count
-from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
-from track.network_address import LOOPBACK
+from handsim.files.signals import interrupt_flag
+from track.streams import LOOPBACK
 from track.streams.natnet import COMMAND_PORT
 
 if TYPE_CHECKING:

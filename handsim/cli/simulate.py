@@ -12,9 +12,8 @@ import tyro
 from gloves.captures.capture import UNLABELED, Capture, run_lengths
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.takes.take import SUFFIX, Take, load_take
-from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
-from handsim.app.workers import run_jobs
+from handsim.app.workers import chosen_workers, run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_free, check_memory, check_outputs, written_together
 from train.simulation.takes import TakeConfig, record_config

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from track.captures import OnFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
-    from track.sinks.addresses import SinkGroup
+    from track.sinks import SinkGroup
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
@@ -79,7 +79,7 @@ def track(
     from handsim.cli.options import chosen_hands
     from track.live import track_live
     from track.settings import TrackerSetup, TrackSettings, warm_up
-    from track.sinks.addresses import open_sinks
+    from track.sinks import open_sinks
     from track.streams.frame_source import StreamedFrame
 
     _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from handsim.app.interrupts import InterruptFlag, interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
+from handsim.files.signals import InterruptFlag, interrupt_flag
 from handsim.hand.shape import Side
 from track.config import Size
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.server import address_of, opened_server
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def _draw(name: str, content: Content, video: Path) -> None:
     from track.viewer.video import write_video
 
     check_outputs((name,), (video,))
-    from render.illustrations.clip import write_clip  # OpenCV and the painters
+    from render.illustrations import write_clip  # OpenCV and the painters
 
     recording = content.recording
     if recording is None:

@@ -1,37 +1,185 @@
-"""Signals that ask a process to end, and blocks that they wait for."""
+"""Signals that ask a command to end: put off, as a flag for a loop, or as an exception with what is kept."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import FrameType
 from typing import Final
+
+from handsim.callbacks import Closing
+from handsim.errors import HandSimError
 
 ENDING: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Ctrl-C, the end of a batch job, and a terminal that closes."""
+_AGAIN: Final = 0.05  # [s] after which a signal is sent again whose exception was lost
+
+
+class Stopped(KeyboardInterrupt):
+    """A command was asked to end.
+
+    Args:
+        kept: What is kept and how to go on, a sentence without a capital and a period.
+    """
+
+    def __init__(self, number: int = signal.SIGINT, kept: str = "") -> None:
+        super().__init__(kept)
+        self.number, self.kept = number, kept
+
+    @classmethod
+    def again(cls, stop: KeyboardInterrupt, kept: str) -> Stopped:
+        """The same signal, with what is kept."""
+        return cls(stop.number if isinstance(stop, Stopped) else signal.SIGINT, kept)
+
+
+class InterruptFlag:
+    """Whether a signal to end came; called, it answers."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        """The first signal that came, 0 if none did."""
+
+    def __call__(self) -> bool:
+        """Whether one came."""
+        return self.number != 0
 
 
 @contextmanager
 def signals_wait() -> Iterator[None]:
-    """Signals to end that come within the block are delivered after it.
-
-    Only the main thread is interrupted by signals; in other threads nothing changes.
-    """
+    """Deliver signals to end that come within the block after it."""
     came: list[int] = []
-    with ExitStack() as stack:  # it restores every handler, even where one raises already
-        stack.callback(_send, came)
+    try:
+        with _handled(lambda number, _frame: came.append(number)):
+            yield
+    finally:
+        for number in dict.fromkeys(came):
+            signal.raise_signal(number)
+
+
+@contextmanager
+def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> Iterator[InterruptFlag]:
+    """Within the block the first signal to end raises nothing, but sets the flag that is yielded.
+
+    Args:
+        flag: The flag to set; a new one when None.
+        again: Whether a second signal raises, as in `signals_raise`.
+    """
+    flag, block = flag or InterruptFlag(), _Block()
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if flag() and again:
+            raise _Persistent(number, block)
+        flag.number = flag.number or number
+
+    with _handled(note), block:
+        yield flag
+
+
+class _Block(Closing):
+    """Whether a block of code was left, and the last signal that came in it, 0 if none did."""
+
+    left = False
+    number = 0
+
+    def close(self) -> None:
+        self.left = True
+
+    def send(self, number: int) -> None:
+        """Send a signal to this process unless the block was left."""
+        if not self.left:
+            os.kill(os.getpid(), number)
+
+
+class _Persistent(Stopped):
+    """A `Stopped` that is raised again when it is lost, until a block is left."""
+
+    def __init__(self, number: int, block: _Block) -> None:
+        super().__init__(number)
+        self._block = block
+
+    def __del__(self) -> None:
+        if not self._block.left:  # from another thread: raised here, it would be lost at once
+            threading.Timer(_AGAIN, self._block.send, (self.number,)).start()
+
+
+@contextmanager
+def signals_raise() -> Iterator[None]:
+    """Within the block a signal to end raises `Stopped`, so that a batch job cleans up as after Ctrl-C.
+
+    Compiled code that calls back into Python may swallow the exception; then the signal is sent again. A
+    module that loads may keep it and fail with another error, which counts as the interrupt.
+    """
+    block = _Block()
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        block.number = number
+        raise _Persistent(number, block)
+
+    with _handled(stop), _lost_silently(), block:
+        try:
+            with interrupts_bare():
+                yield
+        except Exception as error:
+            if block.number and not isinstance(error, HandSimError | OSError):
+                raise Stopped(block.number) from error
+            raise
+
+
+@contextmanager
+def interrupts_bare() -> Iterator[None]:
+    """Raise an interrupt that was wrapped in other errors as itself, so that `except` finds it."""
+    try:
+        yield
+    except Exception as error:
+        stop = interrupt_behind(error)
+        if stop is None:
+            raise
+        raise stop from error
+
+
+def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """The interrupt that an error comes from, if one does.
+
+    Compiled code that is interrupted ends in a `SystemError`, and a module that loads in an `ImportError`,
+    wrapped again by each call that it passes. An error that was met while the interrupt was handled, such as
+    a full disk, counts as itself.
+    """
+    below: BaseException | None = error
+    while below is not None and not isinstance(below, KeyboardInterrupt):
+        below = below.__cause__ or (None if isinstance(below, HandSimError | OSError) else below.__context__)
+    return below
+
+
+@contextmanager
+def _lost_silently() -> Iterator[None]:
+    """Print no traceback of a lost `Stopped`, whose signal is sent again."""
+    others = sys.unraisablehook
+
+    def tell(lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, Stopped):
+            others(lost)
+
+    sys.unraisablehook = tell
+    try:
+        yield
+    finally:
+        sys.unraisablehook = others
+
+
+@contextmanager
+def _handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Give signals to end to a handler; only the main thread gets any, and ignored ones stay ignored."""
+    with ExitStack() as stack:  # it restores every handler, even where one that is restored raises at once
         if threading.current_thread() is threading.main_thread():
             for number in ENDING:
                 before = signal.getsignal(number)
                 if before not in (signal.SIG_IGN, None):
                     stack.callback(signal.signal, number, before)
-                    signal.signal(number, lambda number, _frame: came.append(number))
+                    signal.signal(number, handler)
         yield
-
-
-def _send(came: list[int]) -> None:
-    for number in dict.fromkeys(came):
-        signal.raise_signal(number)

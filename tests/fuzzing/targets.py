@@ -23,7 +23,7 @@ from handsim.files.json_files import claim, load_json
 from handsim.space.objects import load_object
 from handsim.space.rig import CameraRig, load_rig
 from handsim.space.rig_formats import import_cameras, load_cameras
-from render.scenery.photographs import draw_photo, photo_files
+from render.scenery.backgrounds import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
@@ -88,13 +88,13 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.attachment import _ray, attach_markers, vary_layout
+from gloves.fit import _ray, attach_markers, vary_layout
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel, build_spec, join_qpos

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gloves.layout
-from gloves.layout import load_layout, starter_layout
-from gloves.layout_text import moved_text
+from gloves.layout import load_layout, moved_text, starter_layout
 from handsim.hand.shape import BONE_NAMES
 
 DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")

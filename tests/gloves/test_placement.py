@@ -9,10 +9,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gloves.attachment import attach_markers
-from gloves.fit import nominal_fit
+from gloves.fit import attach_markers, nominal_fit, place_marker
 from gloves.layout import load_layout
-from gloves.placement import place_marker
 from handsim.hand.model import HandModel
 from handsim.hand.skin import vertex_normals
 

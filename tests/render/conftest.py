@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gloves.attachment import Attachment, attach_markers
+from gloves.fit import Attachment, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import Side

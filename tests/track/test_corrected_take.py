@@ -13,7 +13,7 @@ from gloves.takes.corrections import NO_MARKER, Correction
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.errors import CaptureError
 from handsim.hand.model import join_qpos
-from poses.shapes.sampling import sample_poses
+from poses.shapes import sample_poses
 from track.corrected_take import correct_take
 from track.kinematics.pose_solver import solve_pose
 

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from train.config import CNNConfig, default_config
-from train.data.augmentation import Corruption
+from train.data.batches import Corruption
 from train.data.shards import Dataset
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
-from train.labelers.storage import CARD, WEIGHTS, load_network
+from train.evaluation import evaluate_labeler
+from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
 from train.loop import train_labeler
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
+from train.settings import CNNConfig, default_config
 from train.simulation.generation import make_dataset
+from train.simulation.training_frames import DatasetConfig, SceneMix
 
 CONFIG = dataclasses.replace(default_config("cnn"), samples=48, batch=16, average_every=2, precision="32")
 

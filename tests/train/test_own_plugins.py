@@ -14,10 +14,10 @@ from handsim._plugins import load_plugin
 from handsim.app.workers import run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
-from poses.shapes.sampling import load_sampler
-from train.data.own_corruption import own_cloud
+from poses.shapes import load_sampler
+from train.data.batches import own_cloud
 from train.data.shards import Dataset
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 SOURCE = '''
 import numpy as np
@@ -65,7 +65,7 @@ def fewer(markers, *, rng):
 
 def job(name, number):
     from handsim import HandModel
-    from poses.shapes.sampling import load_sampler
+    from poses.shapes import load_sampler
     assert load_sampler(name)(HandModel.named("S"), 3, rng=np.random.default_rng(number)).shape == (3, 20)
     return number
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from handsim.kernels.kernel import kernel
 from track.association.candidates import DigitCandidates
 from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses
-from train.matching.assignment import assign
+from train.labelers.matching import assign
 
 
 def match_log_odds(

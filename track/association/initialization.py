@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS
-from poses.shapes.library import LIBRARIES, gestures_of
+from poses.shapes import LIBRARIES, gestures_of
 from track.association.assignment import match_log_odds, match_points, peak_log_odds
 from track.association.frame_state import targets_of
 from track.association.hand_state import HandState

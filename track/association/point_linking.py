@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handsim.space.transforms import rigid_fit
 from track.association.frame_state import FrameState, Numbering
-from train.matching.assignment import assign
+from train.labelers.matching import assign
 
 _LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
 # Distance of a point from its prediction [m], before hands are aligned and after each alignment.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, bones_of
-from poses.shapes.touch import FINGERS, thumb_contact
+from poses.touch import FINGERS, thumb_contact
 from track.calibration.skin_coordinates import (
     Corners,
     Skin,

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import Attachment
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.shape import BONES, DIGITS
 from track.kinematics.pose_solver import PoseSolver

@@ -1,7 +1,7 @@
 """Coordinates on the skin of a hand whose shape changes: a triangle, barycentric coordinates and a height.
 
 The mesh is that of the right hand, subdivided once (Han et al. 2018, section 4.5). The height is along the
-interpolated vertex normal, as `gloves.attachment` measures a marker's radius. A point at fixed coordinates
+interpolated vertex normal, as `gloves.fit` measures a marker's radius. A point at fixed coordinates
 follows the skin when the shape changes.
 """
 
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from gloves.attachment import Attachment
+from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
 from handsim.hand.shape import NUM_BONES, HandShape, named_shape
 from handsim.hand.skin import build_surface, catmull_clark, vertex_normals

@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, JOINTS, NUM_JOINTS, PALM

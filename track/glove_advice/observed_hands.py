@@ -14,10 +14,14 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.rig import ROOM_CENTER, CameraRig
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import FrameScene, sample_frame_scene
-from train.simulation.people import sample_hands, wear_gloves
-from train.simulation.training_frames import HandFrames, observe_scene
+from train.simulation.scenes import sample_hands, wear_gloves
+from train.simulation.training_frames import (
+    DatasetConfig,
+    FrameScene,
+    HandFrames,
+    observe_scene,
+    sample_frame_scene,
+)
 
 _POSES_EACH: Final = 60  # of a person
 

@@ -10,17 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import Attachment, wear
-from gloves.fit import GloveFit
+from gloves.fit import Attachment, GloveFit, wear
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from gloves.optics.visibility import visible_cameras
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import pose_spreads
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import sample_single_hand
-from train.simulation.people import sample_hands
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, sample_single_hand
 
 _TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
 _JOINT_POSES: Final = 6  # of a person, from which the joints' spread is taken
@@ -35,7 +33,7 @@ class Columns(NamedTuple):
     seen: Bool[np.ndarray, "T P"]
     """By two cameras or more."""
     worn: tuple[dict[str, NDArray[Any]], ...]
-    """The tables of each person's `gloves.attachment.Attachment`."""
+    """The tables of each person's `gloves.fit.Attachment`."""
 
     def chosen(self, columns: Sequence[int] | Int[np.ndarray, "Q"]) -> Columns:
         """Some columns in this order."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels.kernel import kernel
-from poses.shapes.library import LIBRARIES, gestures_of
+from poses.shapes import LIBRARIES, gestures_of
 from track.kinematics.levenberg_marquardt import eliminate, invert_positive, solve_positive
 
 # Little is known of a hinge after it, so that a digit with one marker that was bent as few are finds back.

@@ -1,1 +1,48 @@
-"""Live streams of points."""
+"""Live streams of points, and the addresses of the command line: `scheme://host:port?option=value`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+from urllib.parse import parse_qsl, urlsplit
+
+from handsim.errors import ArgumentError, choices
+
+LOOPBACK: Final = "127.0.0.1"
+
+
+class NetworkAddress(NamedTuple):
+    """The parts of an address."""
+
+    host: str
+    """This machine's loopback address where none was named."""
+    port: int
+    options: Mapping[str, str]
+
+
+def split_address(
+    address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None
+) -> NetworkAddress:
+    """Take `scheme://host:port?option=value` apart.
+
+    Args:
+        options: The valid values of each option, the usual one first.
+        port: The usual port; an address must have one where there is none.
+    """
+    scheme = address.partition("://")[0]
+    try:
+        parts = urlsplit(address)
+        given = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query)))
+        host, number = parts.hostname or LOOPBACK, port if parts.port is None else parts.port
+    except ValueError:
+        number = None
+    if number is None or parts.path not in ("", "/") or parts.fragment or parts.username is not None:
+        suffix = "" if port is None else f" or {scheme}://host"
+        raise ArgumentError(f"'{address}' is not an address, expected {scheme}://host:port{suffix}")
+    for name, value in given.items():
+        if name not in options:
+            nothing = f"unknown option '{name}', there are none"
+            raise ArgumentError(f"{address}: {choices(name, options, noun='option') if options else nothing}")
+        if value not in options[name]:
+            raise ArgumentError(f"{address}: {choices(value, options[name], noun=name)}")
+    return NetworkAddress(host, number, {name: given.get(name, valid[0]) for name, valid in options.items()})

@@ -8,7 +8,7 @@ from typing import Final
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
-from track.network_address import split_address
+from track.streams import split_address
 from track.streams.live_stream import SILENCE, LiveStream, SourceStream
 from track.streams.point_stream import open_stream
 from track.streams.qualisys import PORT, QualisysSource

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture, check_place, check_unit
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from track.frames import FARTHEST
 
 

@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
-from gloves.optics.identities import number_runs
+from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import CaptureError, choices
 from track.inputs import read_points
-from track.network_address import LOOPBACK
-from track.streams import natnet
+from track.streams import LOOPBACK, natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.fit import GloveFit, attach
-from gloves.layout import MarkerLayout
-from gloves.layout_text import moved_text
-from gloves.placement import place_marker
+from gloves.fit import GloveFit, attach, place_marker
+from gloves.layout import MarkerLayout, moved_text
 from handsim.errors import LayoutError
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import atomic_write

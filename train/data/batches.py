@@ -1,19 +1,252 @@
-"""Batches for training: random rows, stretched and corrupted anew each time."""
+"""Batches for training: random rows, stretched and corrupted anew each time by us or by a user's function."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from handsim._checks import check_callable, check_number, check_rng, check_type, shown_value
+from handsim._plugins import call_plugin, load_plugin, plugin_name
+from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
-from train.data.augmentation import Cloud, Corruption, corrupt
-from train.data.own_corruption import OwnCorruption, draw_cloud
 from train.data.shards import MappedRows
+
+_MOST: Final = 100  # points to add to a cloud or drop from it
+
+
+@dataclass(frozen=True, slots=True)
+class Corruption:
+    """The paper's corruption, as it is drawn for training and for tests.
+
+    Raises:
+        ArgumentError: A number is of another type or out of range.
+    """
+
+    occlude: int = 5
+    """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
+    ghosts: int = 2
+    """Most ghosts added, uniform in the sample's box grown by `margin`."""
+    jitter: float = 0.0
+    """Half width of the uniform noise on each coordinate [m]."""
+    margin: float = 0.1
+    """Growth of the box [share of its sides]."""
+
+    def __post_init__(self) -> None:
+        for name in ("occlude", "ghosts"):
+            check_type(name, getattr(self, name), (int, np.integer), "a whole number")
+            check_number(name, getattr(self, name), 0, _MOST)
+        check_number("jitter", self.jitter, 0.0, 0.1)
+        check_number("margin", self.margin, 0.0, 10.0)
+
+
+class Cloud(NamedTuple):
+    """Clouds of points, padded to one length, in random order."""
+
+    points: Float[np.ndarray, "B N 3"]
+    """[m]; 0 in padding."""
+    present: Bool[np.ndarray, "B N"]
+    """False in padding."""
+    truth: Int[np.ndarray, "B N"]
+    """Marker of each point, -1 for a ghost."""
+
+
+def corrupt(
+    markers: Float[np.ndarray, "B M 3"],
+    corruption: Corruption,
+    *,
+    ghosts: Float[np.ndarray, "B G 3"] | None = None,
+    rng: np.random.Generator,
+) -> Cloud:
+    """Corrupted, shuffled clouds (B, N) of clean markers (B, M).
+
+    Args:
+        markers: Marker positions (B, M, 3) [m]; NaN where a marker is missing already.
+        corruption: How much is drawn at random on top.
+        ghosts: Ghosts that the rig sees (B, G, 3) [m], NaN where there is none.
+        rng: Source of all randomness.
+
+    Returns:
+        Points (B, N, 3) [m], which of them are there (B, N), and the marker of each (B, N), -1 for a ghost.
+
+    Raises:
+        ArgumentError: An argument is of another type or shape.
+    """
+    check_type("corruption", corruption, Corruption, "a Corruption")
+    check_rng(rng)
+    if not isinstance(markers, np.ndarray) or markers.ndim != 3 or markers.shape[2] != 3:
+        raise ArgumentError(f"markers is {shown_value(markers)}, expected an array (B, M, 3) [m]")
+    batch, count = markers.shape[:2]
+    present = np.isfinite(markers).all(-1)
+    positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)
+    present &= ~_draw_drops(batch, count, corruption.occlude, rng)
+    drawn = _draw_ghosts(positions, np.isfinite(markers).all(-1), corruption, rng)
+    parts = [positions, drawn] if ghosts is None else [positions, drawn, ghosts]
+    points = np.concatenate(parts, axis=1)
+    present = np.concatenate([present, *(np.isfinite(part).all(-1) for part in parts[1:])], axis=1)
+    truth = np.full(present.shape, -1)
+    truth[:, :count] = np.arange(count)
+    return shuffled(points, present, truth, rng=rng)
+
+
+def shuffled(
+    points: Float[np.ndarray, "B N 3"],
+    present: Bool[np.ndarray, "B N"],
+    truth: Int[np.ndarray, "B N"],
+    *,
+    rng: np.random.Generator,
+) -> Cloud:
+    """The points [m] that are there in random order, with as little padding as the fullest cloud needs."""
+    order = rng.random(present.shape).argsort(axis=1)
+    order = np.take_along_axis(
+        order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1
+    )
+    width = max(1, int(present.sum(1).max()))
+    order = order[:, :width]
+    present = np.take_along_axis(present, order, 1)
+    points = np.where(present[..., None], np.take_along_axis(points, order[..., None], 1), 0.0)
+    return Cloud(points, present, np.take_along_axis(truth, order, 1))
+
+
+def _draw_drops(batch: int, count: int, most: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Markers to drop (B, M): zero to `most` draws with replacement per row."""
+    dropped = np.zeros((batch, count), dtype=bool)
+    if most:
+        num_draws = rng.integers(0, most + 1, size=batch)
+        draws = rng.integers(0, count, size=(batch, most))
+        taken = np.arange(most) < num_draws[:, None]
+        rows = np.broadcast_to(np.arange(batch)[:, None], draws.shape)
+        dropped[rows[taken], draws[taken]] = True
+    return dropped
+
+
+def _draw_ghosts(
+    positions: NDArray[np.float64], known: NDArray[np.bool_], corruption: Corruption, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Zero to `ghosts` points uniform in each sample's box, NaN where none."""
+    batch, most = len(positions), corruption.ghosts
+    low = np.where(known[..., None], positions, np.inf).min(1)
+    high = np.where(known[..., None], positions, -np.inf).max(1)
+    side = np.where(np.isfinite(high - low), high - low, np.nan)
+    uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, most, 3))
+    ghosts: NDArray[np.float64] = low[:, None] + uniform * side[:, None]
+    num_ghosts = rng.integers(0, most + 1, size=batch)
+    ghosts[np.arange(most) >= num_ghosts[:, None]] = np.nan
+    return ghosts
+
+
+CORRUPTIONS: Final = "handsim.corruptions"
+"""Group of entry points of corruptions."""
+_NOUN: Final = "corruption"
+_FARTHEST: Final = 10.0  # [m] of a point from the markers' middle
+_MOST_POINTS: Final = 512  # points of a cloud
+
+
+class OwnCorruption(Protocol):
+    """Makes clouds as cameras might see them; any function with this signature is one."""
+
+    def __call__(
+        self, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "B N 3"], Int[np.ndarray, "B N"]]:
+        """Corrupt a batch.
+
+        Args:
+            markers: All markers of right hands [m], around each hand's middle; left ones are mirrored.
+            rng: Source of all randomness.
+
+        Returns:
+            Points [m] in any order, NaN in places without a point; and the marker of each, -1 for a ghost.
+        """
+
+
+def draw_cloud(
+    corruption: Corruption | OwnCorruption | str,
+    markers: Float[np.ndarray, "B M 3"],
+    *,
+    rng: np.random.Generator,
+) -> Cloud:
+    """Shuffled clouds (B, N) of clean markers [m] by our corruption or a user's, see `own_cloud`."""
+    if isinstance(corruption, Corruption):
+        return corrupt(markers, corruption, rng=rng)
+    return own_cloud(corruption, markers, rng=rng)
+
+
+def own_cloud(
+    corruption: OwnCorruption | str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
+) -> Cloud:
+    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption.
+
+    Args:
+        corruption: A function like `OwnCorruption`; `module:name` of one or of a class whose instances are;
+            or an entry point of the group `handsim.corruptions`.
+        markers: Clean markers.
+
+    Raises:
+        ArgumentError: There is none of that name, it does not take these arguments, or what it returns has
+            another shape, labels that are none, or points that are half NaN or beyond 10 m.
+        HandSimError: It raised an error.
+    """
+    if isinstance(corruption, str):
+        function = load_plugin(corruption, group=CORRUPTIONS, noun=_NOUN)
+    else:
+        check_callable(_NOUN, corruption, "a Corruption, a function (markers, *, rng), or its module:name")
+        function = corruption
+    name = plugin_name(corruption)
+    returned = call_plugin(function, name, _NOUN, markers.copy(), rng=rng)
+    owner = f"{_NOUN} '{name}'"
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise ArgumentError(f"{owner} returns {type(returned).__name__}, expected the pair points, labels")
+    try:
+        points, labels = np.asarray(returned[0], dtype=np.float64), np.asarray(returned[1])
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{owner} returns no arrays: {error}") from error
+    _check(owner, points, labels, *markers.shape[:2])
+    present = np.asarray(np.isfinite(points).all(axis=-1))
+    return shuffled(points, present, labels.astype(np.int64), rng=rng)
+
+
+def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
+    """Load a corruption and try it on two clouds, before the work.
+
+    Raises:
+        HandSimError: As `own_cloud`.
+    """
+    rng = np.random.default_rng(0)
+    own_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
+
+
+def _check(
+    owner: str, points: NDArray[np.float64], labels: NDArray[np.generic], batch: int, count: int
+) -> None:
+    if points.ndim != 3 or points.shape[0] != batch or points.shape[2] != 3 or points.shape[1] > _MOST_POINTS:
+        raise ArgumentError(
+            f"{owner} returns points of shape {points.shape}, expected ({batch}, N, 3) with N up to "
+            f"{_MOST_POINTS}"
+        )
+    if labels.shape != points.shape[:2] or labels.dtype.kind not in "iu":
+        raise ArgumentError(
+            f"{owner} returns labels of type {labels.dtype} and shape {labels.shape}, expected whole numbers "
+            f"{points.shape[:2]}"
+        )
+    missing = np.isnan(points)
+    if (missing.any(axis=-1) != missing.all(axis=-1)).any() or (np.abs(points) > _FARTHEST).any():
+        raise ArgumentError(
+            f"{owner} returns points of which some coordinates are NaN or beyond {_FARTHEST:g} m, expected "
+            "meters, and NaN for whole points that are missing"
+        )
+    there = ~missing.any(axis=-1)
+    known = np.where(there, labels, -1).astype(np.int64)
+    if known.min(initial=-1) < -1 or known.max(initial=-1) >= count:
+        raise ArgumentError(
+            f"{owner} returns labels from {known.min()} to {known.max()}, expected -1 to {count - 1}"
+        )
+    ordered = np.sort(known, axis=1)
+    if ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
+        raise ArgumentError(f"{owner} returns a marker twice in a cloud, expected each at most once")
 
 
 class Weights(NamedTuple):

@@ -12,9 +12,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from handsim._checks import check_count, check_number
-from train.data.augmentation import Corruption
-from train.data.batches import BatchRecipe, draw_batch
-from train.data.own_corruption import OwnCorruption, check_corruption
+from train.data.batches import BatchRecipe, Corruption, OwnCorruption, check_corruption, draw_batch
 from train.data.shards import Dataset, load_dataset
 
 

@@ -1,7 +1,7 @@
 """Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
 
 A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are drawn
-when training (`train.data.augmentation`). Rows stay in their files (`MappedRows`): the operating
+when training (`train.data.batches`). Rows stay in their files (`MappedRows`): the operating
 system keeps one copy for all processes.
 """
 

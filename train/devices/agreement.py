@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 import torch
 from lightning_fabric import Fabric
 
-from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag
 from handsim.errors import HandSimError
+from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag
 
 T = TypeVar("T")
 

@@ -17,9 +17,9 @@ from typing import Any, Final, Protocol
 from torch import multiprocessing
 from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, start_processes
 
-from handsim.app.interrupts import Stopped, interrupt_flag, signals_raise
 from handsim.app.workers import portable, without_signals
 from handsim.errors import HandSimError
+from handsim.files.signals import Stopped, interrupt_flag, signals_raise
 from train.devices.agreement import PeerError
 from train.devices.world import RENDEZVOUS, World
 

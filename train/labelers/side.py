@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Side
 from handsim.kernels.kernel import kernel
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 
 _MAX_FOURS: Final = 3000
 _POSES: Final = 100  # of each size

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONES, PALM

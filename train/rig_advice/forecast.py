@@ -13,15 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gloves.captures.capture import run_lengths
-from gloves.optics.blobs import MARKER_RADIUS
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
 from handsim.space.rig import FEWEST_CAMERAS, CameraRig
 from train.rig_advice.work import room_of_work
-from train.simulation.light_sources import LightSources, sample_light_sources
-from train.simulation.motion import SceneMotion
-from train.simulation.room import label_false_points
-from train.simulation.room_settings import RoomConfig
-from train.simulation.sight import SceneSight
+from train.simulation.room import (
+    LightSources,
+    RoomConfig,
+    SceneSight,
+    label_false_points,
+    sample_light_sources,
+)
+from train.simulation.scenes import SceneMotion
 
 _ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
 OPTICS: Final = OpticsConfig()
@@ -100,7 +102,7 @@ def light(
     """Cast all lines of sight.
 
     Args:
-        room: Losses and stray reflections of this work, see `train.simulation.room_settings.usual_room`.
+        room: Losses and stray reflections of this work, see `train.simulation.room.usual_room`.
         rng: Source of the strays, and of the spots of markers that are seen past an edge.
 
     Raises:

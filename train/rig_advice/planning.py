@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, load_layout
-from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import MARKER_RADIUS
 from handsim._checks import check_choice, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
@@ -26,9 +26,8 @@ from handsim.space.rig import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, CameraRi
 from train.rig_advice.forecast import OPTICS, Forecast, forecast, light_work
 from train.rig_advice.mounts import MOUNTS, Mount, places
 from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work
-from train.simulation.light_sources import marker_radii
-from train.simulation.motion import SceneMotion
-from train.simulation.sight import SceneSight
+from train.simulation.room import SceneSight, marker_radii
+from train.simulation.scenes import SceneMotion
 
 WEIGHTS: Final = (0.02, 0.4, 0.6, 0.05)
 """What the shares of marker-frames that one, two, three and four cameras see are worth. A point begins with

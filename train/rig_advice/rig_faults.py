@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import MARKER_RADIUS
 from handsim.space.rig import HAND_REACH, ROOM_CENTER, CameraRig
 
 HALF_SIDE: Final = 0.3

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
-from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, CameraRig
 from train.rig_advice.forecast import (
     OPTICS,
@@ -27,9 +27,8 @@ from train.rig_advice.forecast import (
     light_work,
 )
 from train.rig_advice.rig_faults import cube_points, faults
-from train.simulation.light_sources import marker_radii
-from train.simulation.motion import SceneMotion
-from train.simulation.sight import SceneSight
+from train.simulation.room import SceneSight, marker_radii
+from train.simulation.scenes import SceneMotion
 
 _MISSING: Final = 0.05  # share of marker-frames without a point, from which on cameras lack
 _CORNER: Final = (

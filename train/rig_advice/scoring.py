@@ -16,7 +16,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig
 from train.rig_advice.rig_score import RigScore, score_work
 from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work, work_of_take
-from train.simulation.motion import SceneMotion
+from train.simulation.scenes import SceneMotion
 
 _PEOPLE: Final = 2  # of each kind of work
 _FEWEST_FRAMES: Final = 60

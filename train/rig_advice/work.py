@@ -21,9 +21,15 @@ from handsim.hand.motion import BodyMotion
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE
-from train.simulation.motion import MovingObject, SceneMotion
-from train.simulation.real_like import sample_real_like_scene
-from train.simulation.room_settings import KINDS, SIMULATED_KINDS, RoomConfig, SimulatedKind, usual_room
+from train.simulation.room import RoomConfig, usual_room
+from train.simulation.scenes import (
+    KINDS,
+    SIMULATED_KINDS,
+    MovingObject,
+    SceneMotion,
+    SimulatedKind,
+    sample_real_like_scene,
+)
 from train.simulation.takes import sample_scene
 
 GLOVE: Final = "dense19"

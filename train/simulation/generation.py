@@ -15,21 +15,21 @@ from typing import Any, Final
 import numpy as np
 from upath import UPath
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_type, make_settings
 from handsim._plugins import plugin_name
-from handsim.app.interrupts import Stopped, interrupts_bare
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
+from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
 from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
-from poses.shapes.sampling import PoseSampler, load_sampler
+from poses.shapes import PoseSampler, load_sampler
 from train.data.shards import (
     CONFIG,
     MANIFEST,
@@ -44,9 +44,8 @@ from train.data.shards import (
     save_array,
     save_manifest,
 )
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.people import sample_hands
-from train.simulation.training_frames import simulate_frames
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import DatasetConfig, simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
 _SMALL: Final = 50_000_000  # bytes that no disk is asked for

@@ -1,21 +1,363 @@
-"""The simulated capture room: hands and an object move, cameras see them, an optical system makes a take."""
+"""The simulated capture room: what shines, which cameras see it, and the take that comes of it."""
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from gloves.optics.identities import number_runs, pack_columns
-from gloves.optics.reconstruction import Reconstruction, reconstruct
+from gloves.captures.capture import GapCounts
+from gloves.optics.ghosts import StrayConfig, cameras_by_mirror, reflect, sample_strays
+from gloves.optics.reconstruction import (
+    MARKER_RADIUS,
+    OpticsConfig,
+    Reconstruction,
+    number_runs,
+    pack_columns,
+    reconstruct,
+)
+from gloves.optics.visibility import (
+    MeshTree,
+    clear_of_body,
+    clear_of_mesh,
+    facing_cameras,
+    free_rays,
+    hand_tree,
+)
 from gloves.takes.take import RigidBody, Take
-from handsim.space.rig import CameraRig
+from handsim.hand.shape import PALM
+from handsim.space.rig import CameraRig, check_outside
 from handsim.space.transforms import transform_poses
-from train.simulation.light_sources import LightSources, sample_light_sources
-from train.simulation.motion import SceneMotion
-from train.simulation.room_settings import RoomConfig
-from train.simulation.sight import SceneSight
+from train.simulation.scenes import SceneMotion, SimulatedKind
+
+
+@dataclass(frozen=True, slots=True)
+class RoomConfig:
+    """What the cameras and the surfaces of the room do to what is seen."""
+
+    optics: OpticsConfig = field(default_factory=OpticsConfig)
+    """Noise, losses and triangulation of the optical system."""
+    strays: StrayConfig = field(default_factory=StrayConfig)
+    """Stray reflections carried by every hand and by the object."""
+    reflectance: float = 0.5
+    """Share of the mirror images in shiny patches that are bright enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsOptions:
+    """The fields of `OpticsConfig`; those that are not given are the ones fitted to the kind of capture."""
+
+    noise: float | None = None
+    """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius."""
+    partial: float | None = None
+    """Share of a marker's radius within which its visible spot lies, another one for each camera."""
+    marker_radius: float | None = None
+    """Radius of the glove's spheres [m]; the layout's when not given."""
+    roundness: float | None = None
+    """Share of the sum of their radii within which two blobs that touch count as one marker."""
+    blob_loss: float | None = None
+    """Chance that a camera misses a blob it should see."""
+    dropout: float | None = None
+    """Chance per frame that cameras begin to lose their pictures."""
+    dropout_length: float | None = None
+    """Mean number of pictures that they lose then."""
+    dropout_cameras: int | None = None
+    """Number of cameras that lose them together."""
+    min_rays: int | None = None
+    """Rays that must meet for a point to exist."""
+    min_rays_to_start: int | None = None
+    """Rays that must meet for a point that did not exist in the frame before."""
+    max_residual: float | None = None
+    """Largest distance of a ray from its point [m]."""
+    min_angle: float | None = None
+    """Two rays alone must cross at this angle at least [deg]."""
+    min_distance: float | None = None
+    """Points nearer to each other than this are one [m]."""
+
+    def applied(self, optics: OpticsConfig) -> OpticsConfig:
+        """An optical system with these options in the place of its own.
+
+        Raises:
+            ArgumentError: A number is out of range.
+        """
+        given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        return dataclasses.replace(optics, **given)
+
+
+@dataclass(frozen=True, slots=True)
+class TwinSettings:
+    """One of the paper's captures, and the settings that make its simulated twin like it."""
+
+    paper: GapCounts
+    """Table 3."""
+    ghost_ratio: float
+    """Ghosts over expected labels; Table 4."""
+    room: RoomConfig
+    draw: int
+    """Which of many random captures of this kind is the twin: the one nearest to the paper's figures."""
+
+
+def _room(strays: float, **optics: Any) -> RoomConfig:
+    return RoomConfig(
+        optics=OpticsConfig(min_rays_to_start=2, **optics),
+        strays=StrayConfig(number=strays),
+    )
+
+
+def _losses(blob_loss: float, dropout: float, length: float, cameras: int) -> dict[str, float]:
+    return {
+        "blob_loss": blob_loss,
+        "dropout": dropout,
+        "dropout_length": length,
+        "dropout_cameras": cameras,
+    }
+
+
+TWINS: Final[dict[str, TwinSettings]] = {
+    "single-hand": TwinSettings(
+        GapCounts(4785, 44, 2.11, 1.35), 0.0001, _room(0.0, **_losses(0.01, 0.016, 2.2, 6)), draw=8
+    ),
+    "hand-hand": TwinSettings(
+        GapCounts(3312, 331, 4.01, 3.30), 0.1063, _room(7.0, **_losses(0.002, 0.35, 1.5, 4)), draw=8
+    ),
+    "hand-pen": TwinSettings(
+        GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.17, 1.4, 6)), draw=15
+    ),
+    "hand-controller": TwinSettings(
+        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
+    ),
+}
+_ALIKE: Final[dict[str, str]] = {
+    "real-like": "hand-hand",
+    "free": "single-hand",
+}  # kinds whose rooms are alike
+
+
+def usual_room(kind: SimulatedKind) -> RoomConfig:
+    """The room of the paper's capture of a kind, or of the one most like it."""
+    return RoomConfig() if kind == "calibration" else TWINS[_ALIKE.get(kind, kind)].room
+
+
+_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
+SKIN_CHUNK: Final = 16
+"""Frames whose skins are posed at once: so few stay in the processor's cache."""
+
+
+class SceneSight:
+    """What a rig can see of hands and an object in motion."""
+
+    def __init__(self, scene: SceneMotion, rig: CameraRig) -> None:
+        self.scene, self.rig = scene, rig
+        self.T_world_bone = [hand.fit.model.forward_kinematics(hand.qpos) for hand in scene.hands]
+        """Bone frames (T, L, 4, 4) of each hand [m]."""
+
+    @cached_property
+    def markers(self) -> tuple[Float[np.ndarray, "T P 3"], Float[np.ndarray, "T P 3"]]:
+        """Centers [m] and outward unit directions of the hands' markers and then of the object's."""
+        parts = [
+            hand.fit.attachment.markers(hand.fit.model, bones)
+            for hand, bones in zip(self.scene.hands, self.T_world_bone, strict=True)
+        ]
+        for part, moved in zip(parts, self.scene.skin, strict=False):
+            part[0][:] += moved
+        if self.scene.moving_object is not None:
+            rigid_object, pose = (
+                self.scene.moving_object.rigid_object,
+                self.scene.moving_object.motion.T_world_body,
+            )
+            rotation = pose[:, :3, :3]
+            centers = np.einsum("tij,qj->tqi", rotation, rigid_object.markers) + pose[:, None, :3, 3]
+            parts.append((centers, np.einsum("tij,qj->tqi", rotation, rigid_object.marker_normals)))
+        centers, normals = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+        return centers, normals
+
+    @cached_property
+    def capsules(self) -> tuple[Float[np.ndarray, "T K 2 3"], Float[np.ndarray, "K"]]:
+        """Segments [m] and radii [m] of all hands' capsules in the world."""
+        capsules = [hand.fit.model.capsules for hand in self.scene.hands]
+        posed = [part.posed(bones) for part, bones in zip(capsules, self.T_world_bone, strict=True)]
+        radii = [part.radii for part in capsules]
+        return np.concatenate(posed, axis=1), np.concatenate(radii)
+
+    @cached_property
+    def obstacles(self) -> list[tuple[MeshTree, Float[np.ndarray, "T 4 4"]]]:
+        """Meshes of the rigid objects that hide markers, and their poses `T_world_body`."""
+        if self.scene.moving_object is None:
+            return []
+        rigid_object = self.scene.moving_object.rigid_object
+        tree = MeshTree(rigid_object.vertices, rigid_object.faces)
+        return [(tree, self.scene.moving_object.motion.T_world_body)]
+
+    def visible_markers(
+        self, radii: Float[np.ndarray, "P"], *, rng: np.random.Generator
+    ) -> Bool[np.ndarray, "T P C"]:
+        """Which cameras have a free view of each marker, past every skin and the object.
+
+        Args:
+            radii: Radius around each marker's center in which the visible spot lies [m].
+        """
+        markers, normals = self.markers
+        seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
+        for first in range(0, self.scene.num_frames, _CHUNK):
+            part = slice(first, first + _CHUNK)
+            facing = facing_cameras(markers[part], normals[part], self.rig)
+            starts = markers[part, :, None] + _random_offsets(facing.shape, radii, rng)
+            for begin in range(0, len(facing), SKIN_CHUNK):
+                few = slice(begin, begin + SKIN_CHUNK)
+                frames = slice(first + begin, first + begin + SKIN_CHUNK)
+                seen[frames] = self.clear_lines(frames, starts[few], facing[few])
+        return seen
+
+    def clear_lines(
+        self, frames: slice, starts: Float[np.ndarray, "t P C 3"], candidates: Bool[np.ndarray, "t P C"]
+    ) -> Bool[np.ndarray, "t P C"]:
+        """Which candidate lines from the starts [m] to the cameras pass every skin and the object."""
+        clear = candidates
+        for hand in self.scene.hands:
+            vertices = hand.fit.model.skin(hand.qpos[frames])
+            clear = clear_of_mesh(hand_tree(), vertices, starts, self.rig.positions, clear)
+        for tree, poses in self.obstacles:
+            clear = clear_of_body(tree, poses[frames], starts, self.rig.positions, clear)
+        return clear
+
+
+def _random_offsets(
+    shape: tuple[int, int, int], radii: Float[np.ndarray, "P"], rng: np.random.Generator
+) -> Float[np.ndarray, "*shape 3"]:
+    """Random offsets in balls around the sources of the second axis, of these radii [m]."""
+    offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
+    length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
+    scale = (
+        radii.astype(np.float32)[:, None]
+        * np.cbrt(rng.random(shape, dtype=np.float32))
+        / np.maximum(length, 1e-12)
+    )
+    offsets *= scale[..., None]
+    return offsets
+
+
+_MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
+
+
+class LightSources(NamedTuple):
+    """All that shines in a room."""
+
+    positions: Float[np.ndarray, "T S 3"]
+    """[m] in the world."""
+    visible: Bool[np.ndarray, "T S C"]
+    """Cameras with a free view."""
+    labels: Int[np.ndarray, "S"]
+    """Marker of each source; -1 for a source that is not a marker."""
+    radii: Float[np.ndarray, "S"]
+    """[m]."""
+
+
+def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
+    """All that shines, and which cameras have a free view of it.
+
+    Raises:
+        ArgumentError: A camera stands in the hands.
+    """
+    markers, _ = sight.markers
+    check_outside(sight.rig, markers)
+    labels = np.arange(markers.shape[1])
+    moving_object = sight.scene.moving_object
+    if moving_object is not None:
+        count = len(moving_object.rigid_object.markers)
+        if count < _MIN_BODY_MARKERS:
+            labels[len(labels) - count :] = -1  # points like any other: ghosts
+    radii = marker_radii(sight.scene, config.optics)
+    visible = sight.visible_markers(config.optics.partial * radii, rng=rng)
+    parts = [
+        LightSources(markers, visible, labels, radii),
+        *mirror_images(sight, radii, config.reflectance, rng=rng),
+        *stray_reflections(sight, config, rng=rng),
+        *markers_of_others(sight),
+    ]
+    all_positions, all_visible, all_labels, all_radii = zip(*parts, strict=True)
+    return LightSources(
+        np.concatenate(all_positions, 1),
+        np.concatenate(all_visible, 1),
+        np.concatenate(all_labels),
+        np.concatenate(all_radii),
+    )
+
+
+def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
+    """Radii of the hands' markers, and then of the object's [m].
+
+    Args:
+        scene: Hands in their gloves, and perhaps an object.
+        optics: May give the radius of all gloves' markers.
+    """
+    radii = [
+        np.full(hand.fit.layout.num_markers, optics.radius_of(hand.fit.layout.radius)) for hand in scene.hands
+    ]
+    if scene.moving_object is not None:
+        radii.append(np.full(len(scene.moving_object.rigid_object.markers), MARKER_RADIUS))
+    return np.concatenate(radii)
+
+
+def mirror_images(
+    sight: SceneSight, radii: Float[np.ndarray, "P"], reflectance: float, *, rng: np.random.Generator
+) -> list[LightSources]:
+    """Mirror images of all markers in the object's shiny patches, those that a camera ever sees.
+
+    Args:
+        radii: Radii of all markers [m].
+        reflectance: Share of the images that are bright enough.
+    """
+    markers, _ = sight.markers
+    parts: list[LightSources] = []
+    if sight.scene.moving_object is None:
+        return parts
+    pose = sight.scene.moving_object.motion.T_world_body
+    rotation, translation = pose[:, :3, :3], pose[:, :3, 3]
+    for patch in sight.scene.moving_object.rigid_object.shiny:
+        point, normal = rotation @ patch[:3] + translation, rotation @ patch[3:6]
+        bright = np.flatnonzero(rng.random(markers.shape[1]) < reflectance)
+        images = reflect(markers[:, bright], point[:, None], normal[:, None])
+        visible = cameras_by_mirror(images, point, normal, patch[6], sight.rig, *sight.capsules)
+        ever = visible.any(axis=(0, 2))
+        labels = np.full(int(ever.sum()), -1)
+        parts.append(LightSources(images[:, ever], visible[:, ever], labels, radii[bright][ever]))
+    return parts
+
+
+def markers_of_others(sight: SceneSight) -> list[LightSources]:
+    """Markers that belong to no hand, where no hand stands between them and a camera."""
+    others, rig = sight.scene.others, sight.rig
+    if others is None:
+        return []
+    visible = rig.in_view(others) & free_rays(others, rig.positions, *sight.capsules)
+    count = others.shape[1]
+    return [LightSources(others, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))]
+
+
+def stray_reflections(
+    sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator
+) -> list[LightSources]:
+    """Strays carried by hands and object, where nothing stands between them and a camera."""
+    scene, rig = sight.scene, sight.rig
+    carriers = [
+        (bones[:, PALM], np.array([0.6 * hand.fit.model.skeleton.lengths[PALM], 0.0, 0.0]))
+        for hand, bones in zip(scene.hands, sight.T_world_bone, strict=True)
+    ]
+    if scene.moving_object is not None:
+        carriers.append((scene.moving_object.motion.T_world_body, np.zeros(3)))
+    parts = []
+    for pose, middle in carriers:
+        positions, visible = sample_strays(
+            pose, middle, config.strays, rate=scene.rate, num_cameras=len(rig.positions), rng=rng
+        )
+        visible &= rig.in_view(positions) & free_rays(positions, rig.positions, *sight.capsules)
+        count = positions.shape[1]
+        parts.append(LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS)))
+    return parts
 
 
 def record_take(

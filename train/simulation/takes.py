@@ -21,20 +21,22 @@ from handsim._checks import check_choice, check_count, check_type, fill_settings
 from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import SIDES, Side
 from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
-from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
-from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
-from train.simulation.other_markers import MOST_OTHERS, other_markers
-from train.simulation.people import sample_adult_hands, wear_gloves
-from train.simulation.real_like import NUM_FRAMES, sample_real_like_scene
-from train.simulation.room import record_take
-from train.simulation.room_settings import (
+from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
+from train.simulation.scenes import (
+    MOST_OTHERS,
+    NUM_FRAMES,
+    RATE,
     SIMULATED_KINDS,
-    TWINS,
+    CalibrationTakeConfig,
     Kind,
-    OpticsOptions,
-    RoomConfig,
+    SceneMotion,
     SimulatedKind,
-    usual_room,
+    other_markers,
+    sample_adult_hands,
+    sample_calibration_scene,
+    sample_real_like_scene,
+    sample_scene_motion,
+    wear_gloves,
 )
 
 WRIST_VOLUME: Final = 0.5
@@ -176,6 +178,25 @@ def record_config(config: TakeConfig) -> Take:
     return record_take(scene, rig, room, settings, rng=rng)
 
 
+def simulate_calibration(
+    hands: tuple[GloveFit, ...],
+    config: CalibrationTakeConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> Take:
+    """What cameras see of a user who makes a calibration capture with one hand or both.
+
+    Raises:
+        ArgumentError: There are no hands or more than two.
+        PoseError: A hand finds no way from its touches to free motion.
+    """
+    config = config or CalibrationTakeConfig()
+    scene = sample_calibration_scene(hands, config, rng=rng)
+    rig = as_rig(config.rig)
+    settings = {"kind": "calibration", **dataclasses.asdict(config), "rig": rig_setting(rig)}
+    return record_take(scene, rig, RoomConfig(), settings, rng=rng)
+
+
 def _worn_hands(config: TakeConfig, layout: MarkerLayout) -> tuple[Side, ...]:
     """The hands that a capture asks for and the glove is for; a `LayoutError` if there are none."""
     if len(layout.sides) == 1 and set(config.hands) == set(BOTH):
@@ -197,7 +218,7 @@ def sample_scene(
 
     Args:
         layout: The glove on both hands.
-        num_frames: Frames at `train.simulation.motion.RATE`.
+        num_frames: Frames at `train.simulation.scenes.RATE`.
 
     Raises:
         LayoutError: The glove does not fit.

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit, nominal_fit
+from gloves.fit import GloveFit, attach_markers, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel

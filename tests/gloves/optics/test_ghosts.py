@@ -8,8 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.optics.ghosts import MAX_GHOSTS, GhostConfig, sample_ghosts
-from gloves.optics.mirrors import reflect
+from gloves.optics.ghosts import MAX_GHOSTS, GhostConfig, reflect, sample_ghosts
 from handsim.space.rig import named_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))

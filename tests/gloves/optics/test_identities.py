@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gloves.optics.identities import number_runs, pack_columns
+from gloves.optics.reconstruction import number_runs, pack_columns
 
 PRESENT = arrays(np.bool_, st.tuples(st.integers(1, 25), st.integers(1, 8)))
 

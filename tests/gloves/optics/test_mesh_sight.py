@@ -10,17 +10,15 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
-from gloves.optics.mesh_tree import MeshTree, hand_tree
-from gloves.optics.visibility import free_rays
+from gloves.optics.visibility import MeshTree, clear_of_body, clear_of_mesh, free_rays, hand_tree
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.rig import named_rig
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 
 FRAMES = 40
 

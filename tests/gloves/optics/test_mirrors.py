@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from gloves.optics.mirrors import cameras_by_mirror, reflect
-from gloves.optics.strays import StrayConfig, sample_strays
+from gloves.optics.ghosts import StrayConfig, cameras_by_mirror, reflect, sample_strays
 from handsim.space.rig import named_rig
 
 RIG = named_rig("figure5")

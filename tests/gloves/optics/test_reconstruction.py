@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.optics.identities import number_runs, pack_columns
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import OpticsConfig, number_runs, pack_columns, reconstruct
 from handsim.errors import ArgumentError
 from handsim.space.camera import look_at
 from handsim.space.rig import CameraRig, named_rig

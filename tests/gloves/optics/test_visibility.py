@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import (
     MAX_FACING,
@@ -20,7 +20,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.rig import CameraRig, named_rig
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from tests.rigs import mixed_rig
 
 

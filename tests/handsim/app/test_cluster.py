@@ -17,9 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from handsim.app.cluster import ClusterExecutor, _Task, _versions, check_worker, chosen_workers
 from handsim.app.output import open_output
-from handsim.app.workers import run_jobs
+from handsim.app.workers import ClusterExecutor, _Task, _versions, check_worker, chosen_workers, run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError, LayoutError
 from handsim.files.inputs import checksum
@@ -27,10 +26,9 @@ from render.config import RenderConfig
 from render.session import render_take
 from tests.waiting import LONG
 from train.simulation import generation
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
+from train.simulation.training_frames import DatasetConfig, SceneMix
 
 distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
 ROOT = Path(__file__).resolve().parents[3]
@@ -224,7 +222,7 @@ def lack_a_file(number: int) -> int:
 
 def test_a_worker_that_lacks_a_file_is_named(client, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr("handsim.app.cluster.Path.cwd", lambda: tmp_path / "nowhere")
+        patch.setattr("handsim.app.workers.Path.cwd", lambda: tmp_path / "nowhere")
         done = ClusterExecutor(client).submit(lack_a_file, 3)
     with pytest.raises(HandSimError, match=r"^on .*, which does not see .*nowhere: take-3\.npz is not"):
         done.result(LONG)
@@ -269,7 +267,7 @@ def listening(backlog=5):
 
 
 def test_somebody_who_says_nothing(monkeypatch):
-    monkeypatch.setattr("handsim.app.cluster._PATIENCE", 0.2)
+    monkeypatch.setattr("handsim.app.workers._PATIENCE", 0.2)
     with listening() as (_, address):
         with pytest.raises(HandSimError, match=f"answers at tcp://{address}: none within 0.2 s; expected"):
             chosen(f"tcp://{address}")
@@ -278,7 +276,7 @@ def test_somebody_who_says_nothing(monkeypatch):
 
 
 def test_an_address_that_times_out(monkeypatch):
-    monkeypatch.setattr("handsim.app.cluster._PATIENCE", 0.2)
+    monkeypatch.setattr("handsim.app.workers._PATIENCE", 0.2)
     with listening(backlog=0) as (listener, address), socket.socket() as waiting:
         waiting.connect(listener.getsockname())  # and for another there is no room
         with pytest.raises(HandSimError, match=f"answers at tcp://{address}: timed out; expected"):
@@ -312,7 +310,7 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind():
     script = """
 import gc
 import threading
-from handsim.app.cluster import chosen_workers
+from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 gc.set_threshold(1, 1, 1)
 for address in ["tcp://a:b", "tls://localhost:1"] * 3:

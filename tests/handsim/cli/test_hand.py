@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.attachment import attach_markers, wear
-from gloves.fit import GloveFit, attach
+from gloves.fit import GloveFit, attach, attach_markers, wear
 from gloves.layout import load_layout
 from gloves.takes.take import Take, load_take
 from handsim.cli.main import main

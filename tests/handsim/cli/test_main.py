@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 import handsim
-from handsim.app.interrupts import Stopped
 from handsim.cli.main import COMMANDS, main, run
 from handsim.errors import LayoutError
+from handsim.files.signals import Stopped
 
 ROOT = Path(__file__).resolve().parents[3]
 

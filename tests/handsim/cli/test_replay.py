@@ -16,7 +16,7 @@ import pytest
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from tests.waiting import LONG
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.streams.live_stream import LiveStream
 from track.streams.point_stream import open_stream
 

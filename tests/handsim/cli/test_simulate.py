@@ -15,7 +15,7 @@ from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.cli.main import main
-from train.simulation.room_settings import KINDS
+from train.simulation.scenes import KINDS
 
 FRAMES = 60
 

@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.attachment import wear
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from gloves.fit import GloveFit, nominal_fit
+from gloves.fit import GloveFit, nominal_fit, wear
 from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
@@ -40,7 +39,8 @@ from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user
 from track.viewer.corrector import Corrector
-from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+from train.simulation.scenes import CalibrationTakeConfig
+from train.simulation.takes import simulate_calibration
 
 FRAMES = 60
 

@@ -13,9 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.app.interrupts import Stopped, signals_raise
 from handsim.files.outputs import atomic_write, temporary_beside, written_together
-from handsim.files.signals import ENDING
+from handsim.files.signals import ENDING, Stopped, signals_raise
 from tests.renames import fails_at
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
 from handsim.hand.shape import SIDES, sample_shape

@@ -9,8 +9,8 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels.chain import pose_digit_axes
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.contact.contact_closing import digit_parts
-from poses.shapes.couplings import HIGH, LOW
+from poses.contact import digit_parts
+from poses.shapes import HIGH, LOW
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -10,18 +10,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.objects import named_object
-from poses.contact.keeping_apart import keep_apart, point_pen
-from poses.contact.pointing import DISTANCE, PATH, RETREAT, SPEED, TURNING, pointing_path
-from poses.contact.two_hands import two_hands_penetration
-from poses.grasps.grasp_scene import object_penetration, wrist_poses
-from poses.grasps.object_motion import sample_object_motion
-from poses.shapes.validity import resting_angles
+from poses.grasps import object_penetration, wrist_poses
+from poses.object_motion import (
+    DISTANCE,
+    PATH,
+    RETREAT,
+    SPEED,
+    TURNING,
+    keep_apart,
+    point_pen,
+    pointing_path,
+    sample_object_motion,
+)
+from poses.shapes import resting_angles
+from poses.two_hands import two_hands_penetration
 
 RATE = 120.0
 FRAMES = 600

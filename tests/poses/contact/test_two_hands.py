@@ -16,16 +16,16 @@ from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import random_quaternions
-from poses.contact.contact_closing import close_fingers, first_contact, smooth_above, smooth_below
-from poses.contact.passages import MAX_ACCELERATION, MAX_SPEED
-from poses.contact.two_hands import (
-    INTERACTIONS,
-    sample_two_hand_motion,
-    sample_two_hand_poses,
-    two_hands_penetration,
+from poses.contact import (
+    MAX_ACCELERATION,
+    MAX_SPEED,
+    close_fingers,
+    first_contact,
+    smooth_above,
+    smooth_below,
 )
-from poses.shapes.library import gesture_names
-from poses.shapes.validity import is_valid, resting_angles
+from poses.shapes import gesture_names, is_valid, resting_angles
+from poses.two_hands import INTERACTIONS, sample_two_hand_motion, sample_two_hand_poses, two_hands_penetration
 
 DEEPEST = 0.001
 TOUCHING = 0.001

@@ -11,18 +11,22 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS, bones_of, sample_shape, shape_from_measures
 from handsim.space.objects import RigidObject, load_object, named_object, object_names
 from handsim.space.transforms import MIRROR
-from poses.grasps.grasp_scene import GraspScene, grasp_scene
-from poses.grasps.grasping import Hold
-from poses.grasps.hold_library import hold_names, hold_style, place_object, retarget_angles
-from poses.grasps.object_motion import (
+from poses.grasps import (
     MAX_OBJECT_PENETRATION,
+    GraspScene,
+    Hold,
+    grasp_scene,
+    hold_names,
+    hold_style,
     object_penetration,
+    place_object,
+    retarget_angles,
     sample_held_poses,
-    sample_object_motion,
     settle_hold,
 )
-from poses.motion.motions import MotionConfig
-from poses.shapes.validity import MAX_PENETRATION, is_valid
+from poses.motion import MotionConfig
+from poses.object_motion import sample_object_motion
+from poses.shapes import MAX_PENETRATION, is_valid
 
 FACETS = 0.0008  # a mesh of few triangles lies inside the round part it stands for [m]
 

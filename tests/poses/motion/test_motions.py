@@ -14,13 +14,28 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import SIDES, sample_shape
-from poses.motion.motions import MotionConfig, minimum_jerk, motion_through, sample_motion
-from poses.motion.paths import can_be_left, path_to_rest
-from poses.motion.scripts import script_names, script_poses, scripted_motion
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.library import gesture, gesture_names
-from poses.shapes.touch import FINGERS, is_touching
-from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid, resting_angles
+from poses.motion import (
+    MotionConfig,
+    can_be_left,
+    minimum_jerk,
+    motion_through,
+    path_to_rest,
+    sample_motion,
+    script_names,
+    script_poses,
+    scripted_motion,
+)
+from poses.shapes import (
+    HIGH,
+    LOW,
+    MAX_PENETRATION,
+    gesture,
+    gesture_names,
+    is_valid,
+    make_valid,
+    resting_angles,
+)
+from poses.touch import FINGERS, is_touching
 
 
 @given(seed=st.integers(0, 1000), side=st.sampled_from(["left", "right"]))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.space.transforms import quaternion_matrix
-from poses.motion.wrist_paths import WristConfig, wrist_path
+from poses.motion import WristConfig, wrist_path
 
 RATE = 120.0
 

@@ -10,9 +10,18 @@ import pytest
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import SIZES
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.library import LIBRARIES, all_gestures, gesture, gesture_names, gestures_of
-from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid
+from poses.shapes import (
+    HIGH,
+    LIBRARIES,
+    LOW,
+    MAX_PENETRATION,
+    all_gestures,
+    gesture,
+    gesture_names,
+    gestures_of,
+    is_valid,
+    make_valid,
+)
 
 # Random poses blend exactly these, in this order: another sum here means other training sets.
 _BLENDED = "1a3e09876ee645e750ec62f76644780e15ab045294e70693ae700a934acc667d"

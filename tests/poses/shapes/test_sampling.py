@@ -7,10 +7,17 @@ import pytest
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.library import LIBRARIES, gesture, gestures_of, load_gestures
-from poses.shapes.sampling import sample_poses
-from poses.shapes.validity import sample_valid_angles, validate
+from poses.shapes import (
+    HIGH,
+    LIBRARIES,
+    LOW,
+    gesture,
+    gestures_of,
+    load_gestures,
+    sample_poses,
+    sample_valid_angles,
+    validate,
+)
 
 
 def test_poses_are_those_of_training_sets():

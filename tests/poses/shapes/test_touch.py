@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS, SIDES, SIZES, sample_shape
-from poses.shapes.couplings import HIGH, LOW
-from poses.shapes.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
-from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles
+from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
+from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
 
 
 def _measured(model: HandModel, angles: np.ndarray, finger: str) -> tuple[float, np.ndarray]:

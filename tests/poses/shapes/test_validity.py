@@ -10,10 +10,21 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY, SIDES, sample_shape
-from poses.shapes.couplings import HIGH, LOW, apply_couplings
-from poses.shapes.library import all_gestures, gesture, gesture_names
-from poses.shapes.samplers import PoseMix, sample_angles
-from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid, resting_angles, sample_valid_angles
+from poses.shapes import (
+    HIGH,
+    LOW,
+    MAX_PENETRATION,
+    PoseMix,
+    all_gestures,
+    apply_couplings,
+    gesture,
+    gesture_names,
+    is_valid,
+    make_valid,
+    resting_angles,
+    sample_angles,
+    sample_valid_angles,
+)
 
 
 @given(seed=st.integers(0, 10_000), side=st.sampled_from(SIDES))

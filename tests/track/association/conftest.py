@@ -11,7 +11,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import Side
-from poses.shapes.validity import resting_angles
+from poses.shapes import resting_angles
 from track.association.frame_state import FrameState, Numbering
 from track.association.hand_state import HandState
 

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
-from poses.shapes.validity import resting_angles, sample_valid_angles
+from poses.shapes import resting_angles, sample_valid_angles
 from track.association.assignment import peak_log_odds
 from track.association.digit_hypotheses import DigitModel, digit_ranges, empty_hypotheses, evaluate_digit
 from track.config import TrackerConfig

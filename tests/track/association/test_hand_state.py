@@ -8,7 +8,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from poses.shapes.validity import resting_angles
+from poses.shapes import resting_angles
 from track.association.hand_state import MOST_AGE_LOG_ODDS, SEEN_ELSEWHERE, STRAY_LIFETIME, HandState
 
 RATE, KNUCKLE, TIP = 120.0, 4, 6

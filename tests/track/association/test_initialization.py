@@ -10,7 +10,7 @@ from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from track.association.hand_state import HandState
 from track.association.initialization import MOST_POINTS, HandInitializer
 from train import load_labeler

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from poses.motion.motions import sample_motion
+from poses.motion import sample_motion
 from track.association.frame_state import FrameState, Numbering, targets_of
 from track.association.hand_state import HandState, Prediction
 from track.association.label_consistency import EXCHANGE_DISTANCE, exchange_labels, fit_labels, gate_labels

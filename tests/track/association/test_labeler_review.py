@@ -8,13 +8,13 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from poses.shapes.validity import resting_angles
+from poses.shapes import resting_angles
 from track.association.frame_state import FrameState, targets_of
 from track.association.hand_state import HandState, HandTrack
 from track.association.labeler_review import LabelerReview
 from track.config import TrackerConfig
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
+from train.labelers.storage import load_labeler
 
 TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
 KNUCKLE = 4  # of the index finger

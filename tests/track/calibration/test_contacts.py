@@ -7,8 +7,8 @@ import pytest
 
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS
-from poses.shapes.touch import touching_angles
-from poses.shapes.validity import resting_angles
+from poses.shapes import resting_angles
+from poses.touch import touching_angles
 from track.calibration.contacts import (
     PAD_COMPRESSION,
     ContactGeometry,

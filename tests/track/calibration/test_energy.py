@@ -11,8 +11,8 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from handsim.space.transforms import random_quaternions
-from poses.shapes.touch import touching_angles
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
+from poses.touch import touching_angles
 from track.calibration.contacts import initialize_contacts, slide_contacts
 from track.calibration.energy import Estimate, Problem
 from track.calibration.hand_parameters import NUM_PARAMETERS

@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     shape_at,

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import named_shape, sample_shape

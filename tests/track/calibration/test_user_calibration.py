@@ -10,18 +10,17 @@ import pytest
 
 from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit, attach, nominal_fit
+from gloves.fit import GloveFit, attach, attach_markers, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
-from poses.motion.wrist_paths import WristConfig, wrist_path
+from poses.motion import WristConfig, wrist_path
 from track.calibration.skin_coordinates import displace_markers
 from track.calibration.user_calibration import Calibration, HeldOut, calibrate_hand
 from track.user import User, load_user
-from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles
+from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")
 RATE = 30.0

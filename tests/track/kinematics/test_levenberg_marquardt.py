@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from track.kinematics.levenberg_marquardt import (
     MARKER_NOISE,
     eliminate,

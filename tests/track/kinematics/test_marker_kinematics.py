@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
 from handsim.hand.shape import SIDES, sample_shape

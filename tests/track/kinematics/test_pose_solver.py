@@ -8,16 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import SIDES, sample_shape
 from handsim.kernels.integration import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.motion.motions import sample_motion
-from poses.shapes.validity import resting_angles, sample_valid_angles
+from poses.motion import sample_motion
+from poses.shapes import resting_angles, sample_valid_angles
 from track.kinematics.pose_solver import AnglePrior, PoseSolver, solve_pose
 
 INDEX = slice(11, 15)  # of qpos

@@ -14,7 +14,7 @@ from gloves.fit import GloveFit, attach, nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import SIDES
-from poses.shapes.sampling import sample_poses
+from poses.shapes import sample_poses
 from track.config import HandOrigin
 from track.kinematics.joint_prior import resting_prior
 from track.kinematics.marker_kinematics import hand_arrays

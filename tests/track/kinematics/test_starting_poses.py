@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.attachment import attach_markers
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import random_quaternions

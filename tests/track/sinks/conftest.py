@@ -14,7 +14,7 @@ from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedBody, TrackedFrame, TrackedHand
-from track.sinks.message import LiveMessage, MessageEncoder
+from track.live_message import LiveMessage, MessageEncoder
 from track.streams.frame_source import StreamedFrame
 
 

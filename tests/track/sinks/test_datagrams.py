@@ -17,11 +17,10 @@ from pythonosc.osc_server import BlockingOSCUDPServer
 
 from handsim.errors import ArgumentError
 from tests.waiting import LONG, wait_for
-from track.sinks import datagrams
-from track.sinks.addresses import open_sink
-from track.sinks.datagrams import OscEncoder
+from track import sinks
+from track.sinks import open_sink, osc_format
 
-ENCODER = OscEncoder()
+ENCODER = osc_format()
 
 
 @pytest.fixture
@@ -62,7 +61,7 @@ def test_documents_reach_a_socket(query, decode, receiver, message):
 
 def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
     now = [50.0]
-    monkeypatch.setattr(datagrams, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(sinks, "time", SimpleNamespace(monotonic=lambda: now[0]))
     sink = open_sink(f"udp://127.0.0.1:{receiver.getsockname()[1]}?points=yes")
     for number in range(8):
         sink.send(message(number))

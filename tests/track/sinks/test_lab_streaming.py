@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from track.sinks.lab_streaming import channels_of, sample_of
+from track.sinks import channels_of, sample_of
 
 
 def test_every_channel_has_a_name_and_a_unit(message):
@@ -50,7 +50,7 @@ import json, sys, time
 sys.path.insert(0, "tests/track/sinks")
 import pylsl
 from conftest import make_message
-from track.sinks.addresses import open_sink
+from track.sinks import open_sink
 sink = open_sink("lsl:hands")
 sink.send(make_message(0))
 (info,) = pylsl.resolve_byprop("name", "hands", timeout=120.0)

@@ -16,8 +16,8 @@ from websockets.sync.client import connect
 
 from handsim.errors import ArgumentError
 from tests.waiting import LONG, wait_for
-from track.sinks import websocket
-from track.sinks.addresses import open_sink
+from track import sinks
+from track.sinks import open_sink
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_a_slow_client_loses_frames_and_delays_nobody(message):
         while sink.dropped < 50 and sent < 5000:
             sink.send(frame)
             sent += 1
-            wait_for(lambda least=sent - websocket._WAITING // 2: len(got) > least)
+            wait_for(lambda least=sent - sinks._WAITING // 2: len(got) > least)
         assert sink.dropped >= 50, "the slow client lost frames"
         wait_for(lambda: len(got) == sent + 1)
         slow.close()
@@ -158,7 +158,7 @@ def test_it_listens_on_loopback(sink):
 
 
 def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
-    monkeypatch.setattr(websocket, "_FLUSH", LONG)
+    monkeypatch.setattr(sinks, "_FLUSH", LONG)
     sink = open_sink("ws://:0?format=msgpack")
     got: list[bytes] = []
     with connect(url(sink)) as client:

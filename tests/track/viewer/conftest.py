@@ -22,9 +22,9 @@ from gloves.takes.take import COASTING, LOST, TRACKED, RigidBody, Take
 from handsim.hand.model import join_qpos
 from handsim.space.objects import named_object
 from handsim.space.transforms import random_quaternions
-from poses.shapes.sampling import sample_poses
+from poses.shapes import sample_poses
 from tests.waiting import wait_for
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.server import opened_server
 
 FRAMES = 30

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import load_layout, starter_layout
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel

@@ -12,7 +12,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from handsim.errors import ArgumentError, HandSimError
-from track.network_address import LOOPBACK
+from track.streams import LOOPBACK
 from track.viewer.server import address_of, is_own_page, opened_server
 
 

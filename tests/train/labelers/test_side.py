@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
+from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes import sample_valid_angles
 from train.labelers.side import SideClassifier, is_mirror_like
 
 

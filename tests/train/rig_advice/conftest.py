@@ -9,7 +9,7 @@ from gloves.layout import load_layout
 from handsim.space.rig import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.work import sample_work
-from train.simulation.room_settings import RoomConfig
+from train.simulation.room import RoomConfig
 
 SIDES = np.full(3, 0.6)
 

@@ -13,8 +13,8 @@ from handsim.space.rig import named_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train.rig_advice.forecast import camera_losses, covariances, ellipsoid, forecast, light, light_work
-from train.simulation.motion import MovingObject, SceneMotion
-from train.simulation.room_settings import RoomConfig
+from train.simulation.room import RoomConfig
+from train.simulation.scenes import MovingObject, SceneMotion
 from train.simulation.takes import simulate_take
 
 

@@ -12,7 +12,7 @@ from handsim.space.camera import pinhole
 from handsim.space.rig import CameraRig, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.planning import Planning, plan_rig, view_candidates
-from train.simulation.room_settings import RoomConfig
+from train.simulation.room import RoomConfig
 
 
 @pytest.fixture(scope="module")

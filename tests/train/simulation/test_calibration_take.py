@@ -9,10 +9,11 @@ from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel
-from poses.shapes.touch import FINGERS, is_touching
-from poses.shapes.validity import is_valid
+from poses.shapes import is_valid
+from poses.touch import FINGERS, is_touching
 from train.simulation import calibration_take
-from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles, simulate_calibration
+from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
+from train.simulation.takes import simulate_calibration
 
 SHORT = CalibrationTakeConfig(free=1.0, rounds=1)
 

@@ -15,30 +15,29 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
+from handsim.files.signals import Stopped
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
 from handsim.space.rig import as_rig
-from poses.shapes.couplings import HIGH, LOW
+from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import frame_scenes, generation, people
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix
 from train.simulation.generation import make_dataset
-from train.simulation.people import NO_REST
+from train.simulation.scenes import NO_REST
+from train.simulation.training_frames import NO_GRASP, NO_TOUCH, DatasetConfig, SceneMix
 
 CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
 import sys
 from pathlib import Path
 from train.simulation import generation
-from train.simulation.dataset_config import DatasetConfig
+from train.simulation.training_frames import (DatasetConfig)
 generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
     config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)

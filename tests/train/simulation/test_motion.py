@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from train.simulation.motion import RATE
+from train.simulation.scenes import RATE
 from train.simulation.takes import sample_scene
 
 

@@ -11,8 +11,7 @@ import pytest
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.space.transforms import quaternion_matrix
-from train.simulation.motion import SceneMotion
-from train.simulation.real_like import FLESH, NOISE, move_skin, sample_real_like_scene
+from train.simulation.scenes import FLESH, NOISE, SceneMotion, move_skin, sample_real_like_scene
 from train.simulation.takes import sample_scene, simulate_take
 
 FRAMES = 240

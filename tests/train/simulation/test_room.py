@@ -12,8 +12,8 @@ import trimesh
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
+from gloves.optics.ghosts import StrayConfig
 from gloves.optics.reconstruction import OpticsConfig
-from gloves.optics.strays import StrayConfig
 from gloves.optics.visibility import MAX_FACING
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
@@ -22,13 +22,10 @@ from handsim.hand.motion import BodyMotion
 from handsim.space.camera import look_at
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import named_rig
-from poses.motion.motions import sample_motion
+from poses.motion import sample_motion
 from tests.rigs import square_rig
-from train.simulation.light_sources import sample_light_sources
-from train.simulation.motion import MovingObject, SceneMotion
-from train.simulation.room import pack_take, record_take
-from train.simulation.room_settings import RoomConfig
-from train.simulation.sight import SceneSight
+from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources
+from train.simulation.scenes import MovingObject, SceneMotion
 
 RATE = 120.0
 FRAMES = 120

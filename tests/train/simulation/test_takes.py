@@ -18,13 +18,13 @@ from handsim.hand.model import HandModel
 from handsim.space.objects import named_object
 from handsim.space.rig import ROOM_CENTER, as_rig, named_rig
 from handsim.space.transforms import pose_matrices, quaternion_matrix
-from poses.contact.two_hands import two_hands_penetration
-from poses.grasps.object_motion import object_penetration
-from poses.shapes.couplings import HIGH, LOW
+from poses.grasps import object_penetration
+from poses.shapes import HIGH, LOW
+from poses.two_hands import two_hands_penetration
 from tests.rigs import mixed_rig
 from train.simulation import takes
-from train.simulation.motion import RATE
-from train.simulation.room_settings import KINDS, TWINS, OpticsOptions
+from train.simulation.room import TWINS, OpticsOptions
+from train.simulation.scenes import KINDS, RATE
 from train.simulation.takes import WRIST_VOLUME, TakeConfig, record_config, simulate_take
 
 FRAMES = 200

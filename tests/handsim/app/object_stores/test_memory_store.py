@@ -15,11 +15,11 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
-from handsim.app.interrupts import Stopped
 from handsim.app.output import open_output, place_of
 from handsim.app.workers import run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, HandSimError
+from handsim.files.signals import Stopped
 from render.config import RenderConfig
 from render.session import left_out_frames, render_take
 from tests.handsim.app.object_stores.stored_set import (

@@ -21,9 +21,8 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from handsim.app.cluster import chosen_workers
 from handsim.app.output import open_output
-from handsim.app.workers import run_jobs
+from handsim.app.workers import chosen_workers, run_jobs
 from handsim.cli.main import main
 from handsim.errors import HandSimError
 from tests.handsim.app.object_stores.stored_set import (
@@ -43,8 +42,8 @@ ROOT = Path(__file__).resolve().parents[4]
 RUN = f"""
 import sys
 from train.simulation import generation
-from train.simulation.dataset_config import DatasetConfig
-from train.simulation.frame_scenes import SceneMix
+from train.simulation.training_frames import (DatasetConfig)
+from train.simulation.training_frames import SceneMix
 
 generation.ROWS_PER_SHARD = {ROWS}
 config = DatasetConfig(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
@@ -175,7 +174,7 @@ def test_workers_of_a_cluster_share_no_folder(s3, whole, tmp_path, monkeypatch):
     ) as cluster:
         monkeypatch.chdir(here)
         # As on another machine: workers do not see the folder that the command runs in.
-        monkeypatch.setattr("handsim.app.cluster.Path.cwd", lambda: tmp_path / "nowhere")
+        monkeypatch.setattr("handsim.app.workers.Path.cwd", lambda: tmp_path / "nowhere")
         with chosen_workers(cluster.scheduler_address, None, print) as workers:
             make_dataset(CONFIG, "s3://bucket/cluster", workers=workers)
     assert contents(s3.folder / "bucket/cluster") == whole

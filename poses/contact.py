@@ -1,0 +1,475 @@
+"""Two hands brought together until they touch: frames of two hands, and compiled searches for contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d, maximum_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from handsim.hand.capsules import bounding_spheres, overlap_between
+from handsim.hand.model import HandModel, join_qpos
+from handsim.kernels.chain import pose_digit_axes
+from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import segment_distance_squared
+from handsim.space.transforms import quaternion_matrix, rotation_quaternions
+from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
+from poses.shapes import is_valid, sample_valid_angles
+
+FARTHEST: Final = 0.4
+"""Where the search for the first contact begins [m], measured along the axis."""
+NEAREST: Final = -0.15
+"""Where it ends without one [m]."""
+_PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
+_STEP: Final = 0.15  # of all joints together [rad], from open to closed until the first that is blocked
+_HALVINGS: Final = 6  # of that last step, or fewer where that is exact to
+_PRECISION: Final = 0.003  # of all joints together [rad]
+
+
+class Digit(NamedTuple):
+    """The data of a digit that the searches need: three bones, four joints, three capsules."""
+
+    capsules: NDArray[np.int64]
+    """Indices of its capsules among the hand's (3,)."""
+    others: NDArray[np.int64]
+    """Indices of the hand's other capsules (K - 3,)."""
+    offsets: NDArray[np.float64]
+    """Origin of each bone in its parent's frame (3, 3) [m]."""
+    rotations: NDArray[np.float64]
+    """Orientation of each bone in its parent's frame at zero angles (3, 3, 3)."""
+    axes: NDArray[np.float64]
+    """Unit axes of its joints in the frames of the bones they move (4, 3)."""
+    ends: NDArray[np.float64]
+    """Both ends of each capsule in its bone's frame (3, 2, 3) [m]."""
+    radii: NDArray[np.float64]
+    """Radii of its capsules (3,) [m]."""
+    meets: NDArray[np.bool_]
+    """Which capsules of the hand each of its own may collide with (3, K)."""
+    reach: float
+    """Largest distance of its skin from its first joint [m]."""
+
+
+class DigitPaths(NamedTuple):
+    """A digit's path in every frame: the pose of the wrist, and joint angles at the start and at the goal."""
+
+    rotations: NDArray[np.float64]
+    """Orientation of the wrist (T, 3, 3)."""
+    positions: NDArray[np.float64]
+    """Position of the wrist (T, 3) [m]."""
+    start: NDArray[np.float64]
+    """Joint angles at the start (T, 4) [rad]."""
+    goal: NDArray[np.float64]
+    """Joint angles at the goal (T, 4) [rad]."""
+
+
+class Obstacles(NamedTuple):
+    """Capsules that a digit may meet: those of the other hand and of its own."""
+
+    segments: NDArray[np.float64]
+    """Axes in the world (T, K, 2, 3) [m]."""
+    radii: NDArray[np.float64]
+    """Their radii (K,) [m]."""
+    meets: NDArray[np.bool_]
+    """Which of them stop which of the digit's bones (3, K)."""
+    press: float
+    """Depth to which the digit may press into them [m]."""
+
+
+@kernel
+def search_contact(
+    moving: Float[np.ndarray, "T K 2 3"],
+    moving_radii: Float[np.ndarray, "K"],
+    still: Float[np.ndarray, "T L 2 3"],
+    still_radii: Float[np.ndarray, "L"],
+    axis: Float[np.ndarray, "T 3"],
+) -> Any:
+    """Distance (T,) [m] along the axis at which capsules first touch others, by conservative advancement.
+
+    The moving capsules are in the world, at distance zero; the axis is the unit direction in which they back
+    off.
+    """
+    reach = np.empty(len(moving))
+    p, q = np.empty(3), np.empty(3)
+    for frame in range(len(moving)):
+        pairs, spheres = _pairs_in_line(moving[frame], moving_radii, still[frame], still_radii, axis[frame])
+        shift = FARTHEST
+        for _ in range(100):
+            gap = 1e9
+            for number in range(len(pairs)):
+                apart, along, near = spheres[number]
+                if apart + shift * (2.0 * along + shift) >= (near + gap) ** 2:
+                    continue  # spheres around them are farther apart than the nearest pair so far
+                i, j = pairs[number, 0], pairs[number, 1]
+                for k in range(3):
+                    p[k] = moving[frame, i, 0, k] + shift * axis[frame, k]
+                    q[k] = moving[frame, i, 1, k] + shift * axis[frame, k]
+                near = gap + moving_radii[i] + still_radii[j]
+                squared = segment_distance_squared(p, q, still[frame, j, 0], still[frame, j, 1])
+                if near > 0.0 and squared < near * near:
+                    gap = np.sqrt(squared) - moving_radii[i] - still_radii[j]
+            # No point moves faster than the hand, so it can advance by the gap without a touch.
+            shift -= gap + _PRESS
+            if gap + _PRESS < 2e-5 or shift <= NEAREST:
+                break
+        reach[frame] = max(shift, NEAREST)
+    return reach
+
+
+@kernel
+def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
+    """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch.
+
+    And of each pair (P, 3): the squared distance [m^2] of the spheres' centers, its part along the axis [m],
+    and the sum of the spheres' radii [m].
+    """
+    pairs = np.empty((len(moving_radii) * len(still_radii), 2), dtype=np.int64)
+    spheres = np.empty((len(pairs), 3))
+    count = 0
+    for i in range(len(moving_radii)):
+        for j in range(len(still_radii)):
+            along, apart, length, other = 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                between = 0.5 * (moving[i, 0, k] + moving[i, 1, k] - still[j, 0, k] - still[j, 1, k])
+                along += between * axis[k]
+                apart += between * between
+                length += (moving[i, 1, k] - moving[i, 0, k]) ** 2
+                other += (still[j, 1, k] - still[j, 0, k]) ** 2
+            reach = moving_radii[i] + still_radii[j] + 0.5 * (np.sqrt(length) + np.sqrt(other))
+            if apart - along * along < reach * reach:
+                pairs[count, 0], pairs[count, 1] = i, j
+                spheres[count, 0], spheres[count, 1], spheres[count, 2] = apart, along, reach
+                count += 1
+    return pairs[:count], spheres[:count]
+
+
+@kernel
+def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any:
+    """Share (T,) of its path that a digit can follow before it meets something.
+
+    Args:
+        paths: The digit's `DigitPaths`.
+        parts: The `Digit`.
+        obstacles: The `Obstacles`.
+    """
+    share = np.ones(len(paths.start))
+    near = np.empty(len(obstacles.radii), dtype=np.int64)
+    centers, sizes = np.empty((len(near), 3)), np.empty(len(near))
+    angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((4, 3))
+    for frame in range(len(paths.start)):
+        wrist = paths.rotations[frame], paths.positions[frame]
+        count = _within_reach(wrist, parts, obstacles, frame, near)
+        if count == 0:
+            continue
+        bounding_spheres(obstacles.segments[frame], obstacles.radii, centers, sizes)
+        bend = np.abs(paths.goal[frame] - paths.start[frame]).sum()
+        steps = max(1, int(np.ceil(bend / _STEP)))
+        low, high = 0.0, 1.0
+        for step in range(1, steps + _HALVINGS + 1):
+            tried = step / steps if step <= steps and high == 1.0 else (low + high) / 2
+            for joint in range(4):
+                angles[joint] = paths.start[frame, joint] + tried * (
+                    paths.goal[frame, joint] - paths.start[frame, joint]
+                )
+            pose_digit_axes(wrist, angles, parts, bones, scratch)
+            if _blocked(bones, parts, obstacles, frame, near[:count], (centers, sizes)):
+                high = min(tried, 1.0 - 1e-9)
+            else:
+                low = tried
+            if low >= 1.0 or (high - low) * bend < _PRECISION:
+                break
+        share[frame] = low
+    return share
+
+
+@kernel
+def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> int:
+    """Write the indices of the obstacles that a digit can reach into `near` (K,), and count them."""
+    knuckle = wrist[1].copy()
+    for row in range(3):
+        for column in range(3):
+            knuckle[row] += wrist[0][row, column] * parts.offsets[0, column]
+    count = 0
+    for j in range(len(obstacles.radii)):
+        reach = parts.reach + obstacles.radii[j]
+        a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
+        if segment_distance_squared(knuckle, knuckle, a, b) < reach * reach:
+            near[count] = j
+            count += 1
+    return count
+
+
+@kernel
+def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any, spheres: Any) -> bool:
+    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`.
+
+    Obstacles whose bounding spheres, centers (K, 3) [m] and radii (K,) [m], it does not meet cannot be met.
+    """
+    own, size = np.empty((3, 3)), np.empty(3)
+    bounding_spheres(bones, parts.radii, own, size)
+    for i in range(3):
+        for j in near:
+            apart = size[i] + spheres[1][j] - obstacles.press
+            x, y, z = own[i, 0] - spheres[0][j, 0], own[i, 1] - spheres[0][j, 1], own[i, 2] - spheres[0][j, 2]
+            if obstacles.meets[i, j] and x * x + y * y + z * z < apart * apart:
+                reach = parts.radii[i] + obstacles.radii[j] - obstacles.press
+                a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
+                if segment_distance_squared(bones[i, 0], bones[i, 1], a, b) < reach * reach:
+                    return True
+    return False
+
+
+@kernel
+def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
+    """Capsule axes (T, 3, 2, 3) [m] of a digit in the world.
+
+    Args:
+        wrists: Orientations (T, 3, 3) and positions (T, 3) [m] of the wrist.
+        parts: The `Digit`.
+    """
+    posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((4, 3))
+    for frame in range(len(angles)):
+        pose_digit_axes((wrists[0][frame], wrists[1][frame]), angles[frame], parts, posed[frame], scratch)
+    return posed
+
+
+# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each stage has a depth
+# [m] to which a finger presses into the other hand or its own, and the joints of a digit that it moves.
+_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
+_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
+
+
+def first_contact(
+    still: HandModel,
+    still_qpos: Float[np.ndarray, "T 27"],
+    moving: HandModel,
+    moving_qpos: Float[np.ndarray, "T 27"],
+    axis: Float[np.ndarray, "T 3"],
+) -> Float[np.ndarray, "T"]:
+    """Distance along `axis` [m] at which the moving hand, coming from outside, first touches the still one.
+
+    Everything farther out is free. Frames without a contact give `NEAREST`. The axis is the unit direction in
+    the world in which the moving hand backs off; its poses are those at distance zero.
+    """
+    distance: NDArray[np.float64] = search_contact(
+        moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
+        moving.capsules.radii,
+        still.capsules.posed(still.forward_kinematics(still_qpos)),
+        still.capsules.radii,
+        axis,
+    )
+    return distance
+
+
+def close_fingers(
+    model: HandModel,
+    opened: Float[np.ndarray, "T 27"],
+    closed: Float[np.ndarray, "T 20"],
+    strength: Float[np.ndarray, "T 5"],
+    *,
+    other: HandModel,
+    other_qpos: Float[np.ndarray, "T 27"],
+    window: int = 1,
+) -> Float[np.ndarray, "T 20"]:
+    """Joint angles [rad] of fingers that close from one pose towards another until they meet a hand.
+
+    Args:
+        opened: Poses with open fingers.
+        closed: Joint angles [rad] of the fingers if nothing blocks them.
+        strength: Share of the path that each digit closes then.
+        other: The hand that blocks the fingers, besides their own, in its poses.
+        window: Frames over which the paths are smoothed; 1 leaves each frame alone.
+    """
+    busy = np.flatnonzero(strength.max(axis=1) > 0.0)
+    angles = opened[:, 7:].copy()
+    rotations, positions = quaternion_matrix(opened[busy, 3:7]), opened[busy, :3]
+    own = model.capsules.posed(model.forward_kinematics(opened[busy]))
+    others = other.capsules.posed(other.forward_kinematics(other_qpos[busy]))
+    all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
+    for press, joints in _STAGES:
+        for digit in _ORDER:
+            parts = digit_parts(model, digit)
+            columns = slice(4 * digit, 4 * digit + 4)
+            goal = angles[:, columns].copy()
+            goal[:, joints] = closed[:, columns][:, joints]
+            share = np.ones(len(angles))
+            share[busy] = search_closing(
+                DigitPaths(rotations, positions, angles[busy, columns], goal[busy]),
+                parts,
+                Obstacles(
+                    np.concatenate([others, own[:, parts.others]], axis=1),
+                    np.concatenate([other.capsules.radii, model.capsules.radii[parts.others]]),
+                    np.concatenate([all_of_other, parts.meets[:, parts.others]], axis=1),
+                    press,
+                ),
+            )
+            share = smooth_below(share, window) * strength[:, digit]
+            angles[:, columns] += share[:, None] * (goal - angles[:, columns])
+            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, columns], parts)
+    return angles
+
+
+def smooth_above(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
+    """A smooth curve that is nowhere below `values`, smoothed over an odd number of frames."""
+    if window < 3:
+        return values
+    kernel = np.hanning(window + 2)[1:-1]
+    highest = maximum_filter1d(values, window, mode="nearest")
+    smooth: NDArray[np.float64] = convolve1d(highest, kernel / kernel.sum(), mode="nearest")
+    return smooth
+
+
+def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
+    """A smooth curve that is nowhere above `values`, smoothed over an odd number of frames."""
+    return -smooth_above(-values, window)
+
+
+@lru_cache(maxsize=4 * len(_ORDER))
+def digit_parts(model: HandModel, digit: int) -> Digit:
+    """A digit of a hand (0: thumb) as the compiled searches need it."""
+    capsules, skeleton = model.capsules, model.skeleton
+    first = 1 + 3 * digit
+    indices = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
+    meets = np.zeros((len(capsules.bones),) * 2, dtype=bool)
+    pairs = capsules.touching_pairs()
+    meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
+    return Digit(
+        capsules=indices,
+        others=np.setdiff1d(np.arange(len(capsules.bones)), indices),
+        offsets=skeleton.offsets[first : first + 3],
+        rotations=skeleton.rotations[first : first + 3],
+        axes=skeleton.axes[4 * digit : 4 * digit + 4],
+        ends=np.stack([capsules.starts[indices], capsules.ends[indices]], axis=1),
+        radii=capsules.radii[indices],
+        meets=meets[indices],
+        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[indices].max()),
+    )
+
+
+MAX_OVERLAP: Final = 0.001
+"""How deep two hands may press into each other [m]."""
+RATE: Final = 120.0
+"""Frames per second [Hz]."""
+MAX_SPEED: Final = 10.0
+"""Highest joint speed [rad/s]."""
+MAX_ACCELERATION: Final = 200.0
+"""Largest joint acceleration [rad/s^2]."""
+WRIST_SPEED: Final = 1.0
+"""Highest speed of the pair, and of either hand against it between two meetings [m/s]."""
+APPROACH: Final = (0.4, 0.8)
+"""Shortest and longest time to come together or to let go [s]."""
+VOLUME: Final = 0.2
+"""Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
+_TURNING: Final = 8.0  # fastest rotation of one hand against the other [rad/s]
+_DISTANCE: Final = (0.25, 0.45)  # between the wrists of hands that are apart [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """Frames of two hands: the left wrist in the right one's frame, and the joints of both."""
+
+    rotation: Float[np.ndarray, "T 3 3"]
+    """Orientation of the left wrist."""
+    position: Float[np.ndarray, "T 3"]
+    """Position of the left wrist [m]."""
+    right: Float[np.ndarray, "T 20"]
+    """Joint angles of the right hand [rad]."""
+    left: Float[np.ndarray, "T 20"]
+    """Joint angles of the left hand [rad]."""
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+    def at(self, frames: Any) -> Passage:
+        """Some of its frames."""
+        return Passage(self.rotation[frames], self.position[frames], self.right[frames], self.left[frames])
+
+
+def join_passages(passages: list[Passage]) -> Passage:
+    """Passages concatenated in time."""
+    return Passage(
+        np.concatenate([passage.rotation for passage in passages]),
+        np.concatenate([passage.position for passage in passages]),
+        np.concatenate([passage.right for passage in passages]),
+        np.concatenate([passage.left for passage in passages]),
+    )
+
+
+def path_between(
+    right: HandModel,
+    left: HandModel,
+    start: Passage,
+    end: Passage,
+    pause: tuple[float, float],
+    *,
+    rng: np.random.Generator,
+) -> Passage | None:
+    """Frames from one pose to another by way of one where the hands are apart; None when not valid.
+
+    Args:
+        start: Where the path begins, one frame.
+        end: Where it ends, one frame.
+        pause: Shortest and longest rest where the hands are apart [s].
+    """
+    apart = Passage(
+        *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
+    )
+    rest = apart.at(np.zeros(int(rng.uniform(*pause) * RATE), dtype=int))
+    path = join_passages([_straight(start, apart, rng), rest, _straight(apart, end, rng)])
+    return path if valid_frames(right, left, path).all() else None
+
+
+def valid_frames(right: HandModel, left: HandModel, passage: Passage) -> Bool[np.ndarray, "T"]:
+    """Which frames respect ranges, self-penetration and `MAX_OVERLAP`."""
+    overlap = overlap_between(
+        right.capsules,
+        right.forward_kinematics(join_qpos(passage.right)),
+        left.capsules,
+        left.forward_kinematics(placed_qpos(passage.left, passage.rotation, passage.position)),
+    )
+    valid: NDArray[np.bool_] = (
+        is_valid(right, passage.right) & is_valid(left, passage.left) & (overlap <= MAX_OVERLAP)
+    )
+    return valid
+
+
+def placed_qpos(
+    angles: Float[np.ndarray, "T 20"],
+    rotation: Float[np.ndarray, "T 3 3"],
+    position: Float[np.ndarray, "T 3"],
+) -> Float[np.ndarray, "T 27"]:
+    """Qpos of joint angles [rad] with the wrist at these orientations and positions [m]."""
+    return join_qpos(angles, position=position, quaternion=rotation_quaternions(rotation))
+
+
+def _straight(start: Passage, end: Passage, rng: np.random.Generator) -> Passage:
+    """Minimum-jerk frames from a single pose to another, without the first."""
+    rotations = Rotation.from_matrix(np.concatenate([start.rotation, end.rotation]))
+    bend = max(np.abs(end.right - start.right).max(), np.abs(end.left - start.left).max())
+    seconds = max(
+        rng.uniform(*APPROACH),
+        PEAK_SPEED * bend / MAX_SPEED,
+        np.sqrt(PEAK_ACCELERATION * bend / MAX_ACCELERATION),
+        PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _TURNING,
+        PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / WRIST_SPEED,
+    )
+    share = minimum_jerk(int(np.ceil(seconds * RATE)) + 1)
+    along = share[:, None]
+    return Passage(
+        Slerp([0.0, 1.0], rotations)(share).as_matrix(),
+        start.position + along * (end.position - start.position),
+        start.right + along * (end.right - start.right),
+        start.left + along * (end.left - start.left),
+    )
+
+
+def _place_apart(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Orientation (1, 3, 3) and position (1, 3) of the left wrist: from side by side to palm facing palm."""
+    roll = rng.uniform(0.0, np.pi)
+    rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
+    direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
+    return rotation.as_matrix()[None], rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)

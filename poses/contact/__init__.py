@@ -1,1 +1,0 @@
-"""Two hands, and a hand beside an object in the other."""

@@ -1,0 +1,653 @@
+"""Grasps settled by dynamics: fingers close around an object until it stays even when shaken."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from handsim._checks import check_array, check_choice
+from handsim.errors import ArgumentError, PoseError
+from handsim.files.json_files import package_data
+from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
+from handsim.hand.shape import (
+    BONE_NAMES,
+    BONES,
+    DIGITS,
+    JOINTS,
+    NUM_JOINTS,
+    NUM_QPOS,
+    PALM,
+    bones_of,
+    shape_from_measures,
+)
+from handsim.space.objects import RigidObject
+from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions, vector_quaternions
+from poses.shapes import HIGH, LOW, gesture, is_valid
+
+MAX_OBJECT_PENETRATION: Final = 0.0015
+"""Deepest overlap [m] of a hand and the object it holds that counts as valid."""
+_TIMESTEP: Final = 0.002
+_MOTOR_STIFFNESS: Final = 2.0  # [N m/rad]
+_DAMPING: Final = 0.04  # [N m s/rad]
+_ARMATURE: Final = 1e-4  # [kg m^2], tendons and muscles that move along
+# Strongest torque [N m] of a finger's abduction, MCP, PIP and DIP, and of the thumb's four hinges.
+_FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
+_THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
+_FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
+_CONTACT_TIME: Final = (0.005, 1.0)
+_GUIDE_TIME: Final = (0.03, 1.0)  # of a soft constraint that holds the object while fingers close
+_FAR: Final = 0.5  # [m], beyond which distances are not needed
+_GEOMS: Final = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
+}
+
+
+class GraspScene:
+    """One hand and one object, compiled. Poses are in the wrist's frame; the scene itself keeps no state."""
+
+    def __init__(self, model: HandModel, obj: RigidObject) -> None:
+        self.hand = model
+        self.obj = obj
+        self.mj_model: mujoco.MjModel = _build_scene_spec(model, obj).compile()
+        geoms = [self.mj_model.geom(number) for number in range(self.mj_model.ngeom)]
+        self.object_geoms = [geom.id for geom in geoms if geom.name.startswith("object_")]
+        self.hand_geoms = [geom.id for geom in geoms if not geom.name.startswith("object_")]
+
+    def new_data(
+        self, angles: Float[np.ndarray, "20"], T_wrist_object: Float[np.ndarray, "4 4"]
+    ) -> mujoco.MjData:
+        """New MuJoCo state at a pose [rad], [m], with kinematics and contacts computed."""
+        data = mujoco.MjData(self.mj_model)
+        data.eq_active[:] = 0
+        data.qpos[:NUM_JOINTS] = angles
+        data.qpos[NUM_JOINTS:] = pose_to_qpos(T_wrist_object)
+        data.ctrl[:] = angles
+        mujoco.mj_forward(self.mj_model, data)
+        return data
+
+    def object_pose(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """`T_wrist_object` of a state."""
+        return qpos_to_pose(data.qpos[NUM_JOINTS:])
+
+    def distances(self, data: mujoco.MjData, geoms: Sequence[int] | None = None) -> NDArray[np.float64]:
+        """Distance [m] of some of the hand's capsules, or all, to the object (K,), negative inside it."""
+        return np.array(
+            [
+                min(
+                    mujoco.mj_geomDistance(self.mj_model, data, geom, part, _FAR, None)
+                    for part in self.object_geoms
+                )
+                for geom in (self.hand_geoms if geoms is None else geoms)
+            ]
+        )
+
+    def depth(
+        self, angles: Float[np.ndarray, "T 20"], T_wrist_object: Float[np.ndarray, "T 4 4"]
+    ) -> NDArray[np.float64]:
+        """Deepest overlap [m] of hand and object in every frame (T,)."""
+        data = mujoco.MjData(self.mj_model)
+        qpos = np.concatenate([angles, pose_to_qpos(T_wrist_object)], axis=1)
+        depth = np.zeros(len(qpos))
+        first_object = self.object_geoms[0]
+        for frame, row in enumerate(qpos):
+            data.qpos[:] = row
+            mujoco.mj_kinematics(self.mj_model, data)
+            mujoco.mj_collision(self.mj_model, data)
+            if data.ncon:
+                contact = data.contact
+                with_object = contact.geom.max(axis=1) >= first_object
+                depth[frame] = max(0.0, -float(contact.dist[with_object].min(initial=0.0)))
+        return depth
+
+
+@lru_cache(maxsize=16)
+def grasp_scene(model: HandModel, obj: RigidObject) -> GraspScene:
+    """The scene of a hand and an object, compiled once."""
+    return GraspScene(model, obj)
+
+
+def object_penetration(
+    model: HandModel,
+    obj: RigidObject,
+    qpos: Float[np.ndarray, "T 27"],
+    T_world_object: Float[np.ndarray, "T 4 4"],
+) -> Float[np.ndarray, "T"]:
+    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch."""
+    qpos = check_array("qpos", qpos, (None, NUM_QPOS))
+    poses = check_array("T_world_object", T_world_object, (None, 4, 4))
+    if len(qpos) != len(poses):
+        raise ArgumentError(
+            f"qpos has {len(qpos)} frames and T_world_object {len(poses)}, expected equal numbers"
+        )
+    return grasp_scene(model, obj).depth(qpos[:, 7:], np.linalg.inv(wrist_poses(qpos)) @ poses)
+
+
+def wrist_poses(qpos: Float[np.ndarray, "T 27"]) -> NDArray[np.float64]:
+    """`T_world_wrist` (T, 4, 4) of poses."""
+    poses = np.tile(np.eye(4), (len(qpos), 1, 1))
+    poses[:, :3, :3] = quaternion_matrix(qpos[:, 3:7])
+    poses[:, :3, 3] = qpos[:, :3]
+    return poses
+
+
+def pose_to_qpos(poses: Float[np.ndarray, "*batch 4 4"]) -> NDArray[np.float64]:
+    """Position and wxyz quaternion (..., 7) of rigid transforms."""
+    flat = poses.reshape(-1, 4, 4)
+    rows = np.concatenate([flat[:, :3, 3], rotation_quaternions(flat[:, :3, :3])], axis=1)
+    return rows.reshape(*poses.shape[:-2], 7)
+
+
+def qpos_to_pose(qpos: Float[np.ndarray, "7"]) -> NDArray[np.float64]:
+    """Rigid transform (4, 4) of a position and a wxyz quaternion."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = quaternion_matrix(qpos[3:]), qpos[:3]
+    return pose
+
+
+def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
+    spec = build_spec(model.skeleton, model.capsules)
+    spec.option.timestep = _TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 5.0
+    spec.delete(spec.joint("wrist"))
+    # With the palm fixed to the world, MuJoCo no longer treats it as the fingers' parent.
+    for bone in BONES:
+        if bone.parent == PALM:
+            spec.add_exclude(bodyname1=BONE_NAMES[PALM], bodyname2=bone.name)
+    for geom in spec.geoms:
+        geom.condim, geom.friction, geom.solref = 4, _FRICTION, _CONTACT_TIME
+    for number, joint in enumerate(JOINTS):
+        hinge = spec.joint(joint.name)
+        hinge.armature, hinge.damping = _ARMATURE, [_DAMPING, 0.0, 0.0]
+        torque = (_THUMB_TORQUES if number < 4 else _FINGER_TORQUES)[number % 4]
+        motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_position(kp=_MOTOR_STIFFNESS)
+        motor.forcelimited, motor.forcerange = True, [-torque, torque]
+    _add_object(spec, obj)
+    return spec
+
+
+def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
+    body = spec.worldbody.add_body(name="object")
+    body.add_freejoint(name="object")
+    middle = (obj.vertices.min(axis=0) + obj.vertices.max(axis=0)) / 2
+    half = np.ptp(obj.vertices, axis=0) / 2
+    # Inertia of the bounding box: exact enough, and never degenerate.
+    squares = half**2
+    body.mass, body.ipos, body.explicitinertial = obj.mass, middle, True
+    body.inertia = obj.mass / 3 * (squares.sum() - squares) + 1e-6
+    for number, part in enumerate(obj.parts):
+        geom = body.add_geom(
+            name=f"object_{number}",
+            type=_GEOMS[part.kind],
+            pos=part.T_object_part[:3, 3],
+            quat=rotation_quaternions(part.T_object_part[None, :3, :3])[0],
+            condim=4,
+            friction=_FRICTION,
+            solref=_CONTACT_TIME,
+        )
+        if part.kind == "mesh":
+            spec.add_mesh(name=f"object_{number}", uservert=part.vertices.ravel())
+            geom.meshname = f"object_{number}"
+        else:
+            geom.size = part.size
+    spec.worldbody.add_body(name="guide", mocap=True)
+    spec.add_equality(
+        name="guide",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="object",
+        name2="guide",
+        solref=_GUIDE_TIME,
+    )
+
+
+_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
+_SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
+_SLIDE_HALVINGS: Final = 12
+_ANY: Final = "any"  # the entry for objects that have none of their own
+_ROUNDS: Final = 12
+_STIFFNESS: Final = 0.006  # [m/rad]: residual of a tip that weighs as much as a joint's deviation
+_LONGEST_STEP: Final = 0.2  # [rad]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HoldStyle:
+    """One way to hold one object."""
+
+    name: str
+    open: Float[np.ndarray, "20"]
+    """Angles [rad] before the fingers close."""
+    closed: Float[np.ndarray, "20"]
+    """Angles that the motors close to [rad]."""
+    strength: Float[np.ndarray, "20"]
+    """Share of the motors' torques."""
+    palm_up: float
+    """Share of its weight with which the object lies in the palm while the fingers close."""
+    needs: tuple[str, ...]
+    """Bones or digits that must touch the object."""
+    fingers: int
+    """Number of fingers that must touch it."""
+    free: tuple[str, ...]
+    """Digits that may leave the object."""
+    press: tuple[str, ...]
+    """Digits that may tap on it."""
+    scribble: float
+    """Amplitude of a writing wrist [m]; 0 for objects that do not write."""
+    entry: dict[str, Any]
+    """The rest of its entry: placement, axes and variation."""
+
+
+def hold_names(obj: RigidObject) -> tuple[str, ...]:
+    """Names of the ways to hold an object; one loaded from a file has a single way, `"grasp"`."""
+    return tuple(_holds(obj))
+
+
+@lru_cache(maxsize=64)
+def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
+    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them."""
+    holds = _holds(obj)
+    check_choice(name, holds, noun=f"hold of the {obj.name}")
+    entry = holds[name]
+    opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
+    fitted = retarget_angles(model, np.stack([opened, _angles(opened, entry["closed"])]))
+    return HoldStyle(
+        name=name,
+        open=fitted[0],
+        closed=fitted[1],
+        strength=np.repeat(entry["strength"], 4),
+        palm_up=entry["palm_up"],
+        needs=tuple(entry["needs"]),
+        fingers=entry["fingers"],
+        free=tuple(entry["free"]),
+        press=tuple(entry["press"]),
+        scribble=1e-3 * entry.get("scribble", 0.0),
+        entry=entry,
+    )
+
+
+def _holds(obj: RigidObject) -> dict[str, Any]:
+    library = package_data("poses", "holds")["objects"]
+    holds: dict[str, Any] = library.get(obj.name, library[_ANY])
+    return holds
+
+
+def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.float64]:
+    angles = start.copy()
+    for number, digit in enumerate(DIGITS):
+        if digit in digits:
+            angles[4 * number : 4 * number + 4] = np.deg2rad(digits[digit])
+    return angles
+
+
+def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """`T_wrist_object` (4, 4) before the fingers close, varied at random within the style."""
+    model, obj, entry = scene.hand, scene.obj, style.entry
+    mirror = MIRROR if model.shape.side == "left" else np.eye(3)
+    placement, vary = entry["place"], entry["vary"]
+    frame = np.eye(4) if obj.name in package_data("poses", "holds")["objects"] else _box_frame(obj)
+    point = 1e-3 * np.array(placement["point"], dtype=np.float64)
+    point[2] += 1e-3 * rng.uniform(*vary["along"])
+    bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
+    pose = np.eye(4)
+    # Everything is placed for a right hand, then mirrored.
+    if "between" in placement:
+        at = np.mean([_landmark(model, bones, mark) for mark in placement["between"]], axis=0) @ mirror
+        back = _landmark(model, bones, placement["through"]) @ mirror
+        z = back - at
+        x = _perpendicular(z, rng.uniform(0.0, 2 * np.pi))
+    else:
+        length, breadth = model.shape.length, model.shape.breadth
+        at = np.array([placement["under"][0] * length, placement["under"][1] * breadth, 0.0])
+        x, z = (np.array(entry["axes"][name], dtype=np.float64) for name in "xz")
+    z /= np.linalg.norm(z)
+    y = np.cross(z, x)
+    y /= np.linalg.norm(y)
+    rotation = np.stack([np.cross(y, z), y, z], axis=1)
+    jitter = vector_quaternions(np.deg2rad(vary["angle"]) * np.clip(rng.standard_normal((1, 3)), -1.5, 1.5))
+    rotation = quaternion_matrix(jitter)[0] @ rotation
+    at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
+    pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
+    pose[:3, 3] = mirror @ (at - rotation @ point)
+    pose = pose @ np.linalg.inv(frame)
+    return pose if "between" in placement else _slid_to_palm(scene, style, pose)
+
+
+def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
+    """Middle of an object's bounding box, x along its shortest side and z along its longest."""
+    low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
+    shortest, _, longest = np.argsort(high - low, kind="stable")
+    x, z = np.eye(3)[shortest], np.eye(3)[longest]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2
+    return frame
+
+
+def _perpendicular(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """Unit vector (3,) perpendicular to an axis, at an angle [rad] about it."""
+    axis = axis / np.linalg.norm(axis)
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    rotated: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+    return rotated
+
+
+def _landmark(
+    model: HandModel, bones: NDArray[np.float64], mark: tuple[str, float, float, float]
+) -> NDArray[np.float64]:
+    """Point on a bone in the wrist's frame (3,) [m], for either side."""
+    name, along, sideways, back = mark
+    number = BONE_NAMES.index(name)
+    radius = model.capsules.radii[model.capsules.bones == number][0]
+    sideways = -sideways if model.shape.side == "left" else sideways
+    local = np.array([along * model.skeleton.lengths[number], sideways * radius, back * radius])
+    world: NDArray[np.float64] = bones[number, :3, :3] @ local + bones[number, :3, 3]
+    return world
+
+
+def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`T_wrist_object` (4, 4) of the object raised from below until it almost touches the palm."""
+    palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
+    data = scene.new_data(style.open, pose)
+    lowest = data.qpos[NUM_JOINTS + 2]
+
+    def gap(height: float) -> float:
+        data.qpos[NUM_JOINTS + 2] = lowest + height
+        mujoco.mj_kinematics(scene.mj_model, data)
+        return float(scene.distances(data, palm).min())
+
+    low, high = -_SLIDE, 0.0  # free, too high
+    for _ in range(_SLIDE_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if gap(middle) > _GAP else (low, middle)
+    pose[2, 3] += low
+    return pose
+
+
+def retarget_angles(model: HandModel, angles: Float[np.ndarray, "P 20"]) -> Float[np.ndarray, "P 20"]:
+    """Joint angles [rad] that bring the last joints and the tips of a hand where the mean hand has them.
+
+    The mean hand has the same length and breadth. `angles` are its poses; the result differs as little from
+    them as the other proportions need.
+    """
+    shape = model.shape
+    mean = HandModel(shape_from_measures(shape.length, shape.breadth, side=shape.side))
+    targets = _marks(mean, angles)[0]
+    solutions = angles.copy()
+    stiff = _STIFFNESS * np.eye(NUM_JOINTS)
+    for _ in range(_ROUNDS):
+        placed, jacobians = _marks(model, solutions)
+        for number, jacobian in enumerate(jacobians):
+            away = (targets - placed)[number].ravel()
+            residuals = np.concatenate([away, _STIFFNESS * (angles - solutions)[number]])
+            system = np.concatenate([jacobian.reshape(-1, NUM_JOINTS), stiff])
+            step = np.linalg.lstsq(system, residuals, rcond=None)[0]
+            solutions[number] += np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        solutions = np.clip(solutions, LOW, HIGH)
+    return solutions
+
+
+def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Last joints and tips (P, 10, 3) in the wrist's frame [m]; Jacobians (P, 10, 3, 20) [m/rad]."""
+    last = np.array([bones_of(digit)[2] for digit in DIGITS])
+    rest = model.rest_transforms[last]
+    tips = rest[:, :3, 3] + model.skeleton.lengths[last, None] * rest[:, :3, 0]
+    points = np.concatenate([rest[:, :3, 3], tips])
+    indices = np.zeros((len(points), 4), dtype=np.int64)
+    indices[:, 0] = np.tile(last, 2)
+    weights = np.zeros((len(points), 4))
+    weights[:, 0] = 1.0
+    bones = model.forward_kinematics(join_qpos(angles))
+    carried = bones[:, indices[:, 0]] @ np.linalg.inv(model.rest_transforms[indices[:, 0]])
+    placed = np.einsum("pmij,mj->pmi", carried[..., :3, :3], points) + carried[..., :3, 3]
+    return placed, skinned_jacobian(model, bones, points, indices, weights)[..., 6:]
+
+
+_MOST_TRIES: Final = 40
+_LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles between tries
+_RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
+_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
+_GRAVITY: Final = 9.81
+_TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
+_MOST_DRIFT: Final = 0.004  # [m] while shaken
+_MOST_ROTATION: Final = np.deg2rad(8.0)
+_TOUCHING: Final = 0.0005  # [m]
+_DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
+_SLOW: Final = 0.5  # [rad/s], of the hinges at the end
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hold:
+    """A grasp: a hand that holds an object."""
+
+    name: str
+    """The style of the hold, one of `hold_names`."""
+    angles: Float[np.ndarray, "20"]
+    """Joint angles [rad]."""
+    T_wrist_object: Float[np.ndarray, "4 4"]
+    """Pose of the object in the wrist's frame [m]."""
+    contacts: tuple[str, ...]
+    """Names of the hand's capsules that touch the object."""
+
+
+def settle_hold(
+    model: HandModel, obj: RigidObject, *, rng: np.random.Generator, hold: str | None = None
+) -> Hold:
+    """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
+
+    The hold is one of `hold_names`, a random one when not given.
+
+    Raises:
+        ArgumentError: The object has no hold of this name.
+        PoseError: This hand does not get hold of it in forty tries.
+    """
+    names = hold_names(obj) if hold is None else (hold,)
+    scene = grasp_scene(model, obj)
+    why = ""
+    for attempt in range(_MOST_TRIES):
+        style = hold_style(model, obj, names[rng.integers(len(names))])
+        settled = try_hold(scene, _varied(style, attempt, rng), rng=rng)
+        if isinstance(settled, Hold):
+            return settled
+        why = settled
+    raise PoseError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+
+
+def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:
+    """The style with slightly different angles; the change grows with the number of failed tries."""
+    spread = _LOOSENESS[min(attempt, len(_LOOSENESS) - 1)]
+    change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
+    opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
+    return dataclasses.replace(style, open=opened, closed=closed)
+
+
+def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
+    """One try: a hold, or the reason why there is none."""
+    start = place_object(scene, style, rng=rng)
+    data = scene.new_data(style.open, start)
+    _close(scene, data, style, start)
+    _shake(scene, data)  # it settles
+    before = scene.object_pose(data)
+    _shake(scene, data)
+    if not _stayed(scene, data, before):
+        return "it slips"
+    angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
+    if not is_valid(scene.hand, angles[None])[0]:
+        return "the fingers penetrate each other"
+    if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
+        return "the fingers penetrate it"
+    distances = scene.distances(scene.new_data(angles, pose))
+    names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
+    contacts = tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)
+    why = why_not_held(style, set(contacts))
+    if why:
+        return why
+    return Hold(style.name, angles, pose, contacts)
+
+
+def why_not_held(style: HoldStyle, touching: set[str]) -> str:
+    """What a hold by these capsules of the hand lacks; an empty string if it holds."""
+    for need in style.needs:
+        if not any(name.startswith(need) for name in touching):
+            return f"the {need} does not touch it"
+    fingers = sum(any(name.startswith(digit) for name in touching) for digit in DIGITS[1:])
+    return "" if fingers >= style.fingers else "too few fingers touch it"
+
+
+def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
+    """Close the fingers; the object is first guided by a soft spring, then free, or lies in the palm."""
+    model = scene.mj_model
+    guide = pose_to_qpos(start)
+    data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
+    data.eq_active[:] = 1
+    body = model.body("object").id
+    data.xfrc_applied[body, 2] = style.palm_up * scene.obj.mass * _GRAVITY
+    for share in np.arange(1, _RAMP + 1) / _RAMP:
+        _set_targets(scene, data, style, style.open + share * (style.closed - style.open))
+        mujoco.mj_step(model, data, nstep=_CLOSE // _RAMP)
+    data.eq_active[:] = 0
+    for _ in range(_SETTLE // 25):
+        _set_targets(scene, data, style, style.closed)
+        mujoco.mj_step(model, data, nstep=25)
+    data.xfrc_applied[body] = 0.0
+
+
+def _set_targets(
+    scene: GraspScene, data: mujoco.MjData, style: HoldStyle, target: NDArray[np.float64]
+) -> None:
+    """Set the motors' targets, so near to the joint angles that no torque exceeds the style's share.
+
+    A motor at its torque limit would yield to any push; these keep their stiffness in both directions.
+    """
+    here = data.qpos[:NUM_JOINTS]
+    limit = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
+    data.ctrl[:] = here + np.clip(target - here, -limit, limit)
+
+
+def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
+    """Pull the object by its own weight towards the four corners of a tetrahedron, then let it rest."""
+    body = scene.mj_model.body("object").id
+    for corner in _TETRAHEDRON:
+        data.xfrc_applied[body, :3] = scene.obj.mass * _GRAVITY * corner
+        mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
+    data.xfrc_applied[body] = 0.0
+    mujoco.mj_step(scene.mj_model, data, nstep=_REST)
+
+
+def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
+    """Whether the object is where it was, and the fingers are still."""
+    after = scene.object_pose(data)
+    drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
+    rotation = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
+    slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
+    return bool(drift < _MOST_DRIFT and rotation < _MOST_ROTATION and slow and np.isfinite(data.qpos).all())
+
+
+_DEEPEST_HELD: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], room for rounding in the world's frame
+_HALVINGS: Final = 4
+_OPENS: Final = 0.55  # how often a free digit lifts
+_TAPS: Final = 0.3  # how often a pressing digit lifts
+_STILL: Final = 0.3  # how often the object stays as it is
+# Largest opening of a lifted digit [rad]: the thumb's four joints; abduction (either way), MCP, PIP, DIP.
+_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
+_TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
+_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # of digits that hold
+_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # of the object in the hand: [m], [rad]
+
+
+class Held(NamedTuple):
+    """Poses of a hand and the object it holds."""
+
+    angles: NDArray[np.float64]
+    """Joint angles (B, 20) [rad]."""
+    poses: NDArray[np.float64]
+    """`T_wrist_object` (B, 4, 4) [m]."""
+
+
+def sample_held_poses(
+    model: HandModel, obj: RigidObject, hold: Hold, count: int, *, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "B 20"], Float[np.ndarray, "B 4 4"]]:
+    """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
+
+    Returns joint angles [rad], and `T_wrist_object` [m].
+
+    Raises:
+        PoseError: The hold is not valid, such as one of another hand.
+    """
+    scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
+    start = Held(hold.angles[None], hold.T_wrist_object[None])
+    if not is_held_valid(scene, start)[0]:
+        raise PoseError(f"the hold '{hold.name}' is not valid for this hand and the {obj.name}")
+    angles = np.clip(hold.angles + _deviations(style, count, rng), LOW, HIGH)
+    poses = np.tile(hold.T_wrist_object, (count, 1, 1))
+    shift, rotation = (scale * rng.standard_normal((count, 3)).clip(-2.0, 2.0) for scale in _WOBBLE)
+    still = rng.random(count) < _STILL
+    shift[still], rotation[still] = 0.0, 0.0
+    poses[:, :3, 3] += shift
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
+    target = Held(angles, poses)
+    # The path from the hold is bisected, so that what penetrates ends where it touches.
+    share = np.where(is_held_valid(scene, target), 1.0, 0.0)
+    step = 1.0
+    todo = np.flatnonzero(share == 0.0)
+    for _ in range(_HALVINGS if len(todo) else 0):
+        step /= 2
+        nearer = between(start, Held(*(part[todo] for part in target)), share[todo] + step)
+        share[todo] += np.where(is_held_valid(scene, nearer), step, 0.0)
+    nearest = between(start, target, share)
+    return nearest.angles, nearest.poses
+
+
+def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
+    """Poses at shares (B,) of the path from one start to one end or to one end each."""
+    angles = start.angles + share[:, None] * (end.angles - start.angles)
+    poses = np.tile(np.eye(4), (len(share), 1, 1))
+    poses[:, :3, 3] = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
+    rotations = Rotation.from_rotvec(share[:, None] * rotation_between(start, end)).as_matrix()
+    poses[:, :3, :3] = start.poses[:, :3, :3] @ rotations
+    return Held(angles, poses)
+
+
+def rotation_between(start: Held, end: Held) -> NDArray[np.float64]:
+    """Rotation vectors (B, 3) [rad] from one orientation of the object to another, in its own frame."""
+    between = np.swapaxes(start.poses[:, :3, :3], 1, 2) @ end.poses[:, :3, :3]
+    rotation: NDArray[np.float64] = Rotation.from_matrix(between).as_rotvec()
+    return rotation
+
+
+def is_held_valid(scene: GraspScene, held: Held) -> Bool[np.ndarray, "B"]:
+    """Which poses are inside all ranges and penetrate neither the hand nor the object."""
+    valid: NDArray[np.bool_] = is_valid(scene.hand, held.angles)
+    valid[valid] = scene.depth(held.angles[valid], held.poses[valid]) <= _DEEPEST_HELD
+    return valid
+
+
+def _deviations(style: HoldStyle, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Deviation (count, 20) [rad] of every joint from the hold: positive is flexion and abduction."""
+    deviations = _TREMBLE * rng.standard_normal((count, len(DIGITS), 4)).clip(-2.0, 2.0)
+    for index, digit in enumerate(DIGITS):
+        kind = min(index, 1)
+        for digits, most, often in ((style.press, _TAP, _TAPS), (style.free, _LIFT, _OPENS)):
+            if digit not in digits:
+                continue
+            lifts = rng.random(count) < often
+            opening = -most[kind] * rng.uniform(0.0, 1.0, (count, 4)) ** np.array([1.0, 0.7, 0.7, 1.0])
+            opening[:, 0] = most[kind, 0] * rng.uniform(-1.0, 1.0, count)
+            deviations[lifts, index] = opening[lifts]
+    flat: NDArray[np.float64] = deviations.reshape(count, NUM_JOINTS)
+    return flat

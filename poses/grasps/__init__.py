@@ -1,1 +1,0 @@
-"""A hand that holds an object."""

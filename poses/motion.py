@@ -1,0 +1,450 @@
+"""Smooth motion of one hand and its wrist through valid poses, at speeds that a human hand reaches."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from handsim._checks import check_array, check_choice, check_number, check_rng, check_span, check_type
+from handsim.errors import ArgumentError, PoseError, choices
+from handsim.files.json_files import package_data
+from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.motion import HandMotion
+from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape
+from handsim.space.rig import ROOM_CENTER
+from handsim.space.transforms import random_quaternions
+from poses.shapes import (
+    HIGH,
+    LOW,
+    MAX_PENETRATION,
+    gesture,
+    gestures_of,
+    is_valid,
+    make_valid,
+    resting_angles,
+    sample_valid_angles,
+)
+from poses.touch import touching_angles
+
+PEAK_SPEED: Final = 1.875
+"""Peak speed of the minimum-jerk profile, in distances per duration."""
+PEAK_ACCELERATION: Final = 5.7735
+"""Its peak acceleration, in distances per duration squared."""
+# Which digits move first on a path to rest: all at once, one before the others, one after them.
+_AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
+    np.repeat((np.arange(len(DIGITS)) == digit) == first, 4)
+    for first in (True, False)
+    for digit in range(len(DIGITS))
+]
+_ROUNDS: Final = 2
+_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # how far the fingers part before, in shares of the gesture "spread"
+
+
+@dataclass(frozen=True, slots=True)
+class MotionConfig:
+    """Speeds of a hand, and the volume in which its wrist moves.
+
+    Raises:
+        ArgumentError: A number or a pair of numbers is out of range.
+    """
+
+    rate: float = 120.0
+    """Frames per second [Hz]."""
+    max_speed: float = 10.0
+    """Highest joint speed [rad/s]; rapid finger tapping reaches about this."""
+    max_acceleration: float = 200.0
+    """Largest joint acceleration [rad/s^2]."""
+    durations: tuple[float, float] = (0.15, 0.8)
+    """Shortest and longest time of a path that the limits would allow to be quicker [s]."""
+    hold: float = 0.3
+    """Longest rest at a pose [s]."""
+    volume: float = 0.3
+    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    wrist_time: tuple[float, float] = (0.6, 2.0)
+    """Shortest and longest time between two positions of the wrist [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "max_speed", "max_acceleration"):
+            check_number(name, getattr(self, name), 0.0, above=True)
+        for name in ("hold", "volume"):
+            check_number(name, getattr(self, name), 0.0)
+        for name in ("durations", "wrist_time"):
+            check_span(name, getattr(self, name))
+
+
+def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
+    """Share of the path after each of `frames` frames, the last one being 1."""
+    time = np.arange(1, frames + 1) / frames
+    return time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
+
+
+def straight_path(
+    start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Frames (T, 20) [rad] from one pose (left out) to another, of a drawn duration within the limits."""
+    distance = np.abs(target - start).max()
+    quickest = max(
+        PEAK_SPEED * distance / config.max_speed,
+        np.sqrt(PEAK_ACCELERATION * distance / config.max_acceleration),
+    )
+    frames = int(np.ceil(max(quickest, rng.uniform(*config.durations)) * config.rate)) + 1
+    return start + minimum_jerk(frames)[:, None] * (target - start)
+
+
+def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The frames, and a rest in the last pose."""
+    pause = int(rng.uniform(0.0, config.hold) * config.rate)
+    return np.concatenate([path, np.repeat(path[-1:], pause, axis=0)])
+
+
+def path_to_rest(
+    model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid."""
+    # Each round draws other durations, and so other frames: a path close to the limit may pass.
+    for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
+        path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
+        if is_valid(model, path).all():
+            return path
+    raise PoseError("no valid path leads from one of the poses to this hand's rest")
+
+
+def _via_paths(
+    start: NDArray[np.float64], resting: NDArray[np.float64]
+) -> Iterator[list[NDArray[np.float64]]]:
+    """Stops on paths to rest: fingers part or not, the thumb swings out or not, one digit moves first."""
+    spread = gesture("spread")
+    fan = np.where(np.arange(NUM_JOINTS) % 4 == 0, spread - gesture("flat"), 0.0)
+    fan[:4] = 0.0
+    hubs = [np.concatenate([thumb[:4], resting[4:]]) for thumb in (resting, spread, gesture("claw"))]
+    for hub in hubs:
+        for share in _FANS:
+            parted, opened = (np.clip(pose + share * fan, LOW, HIGH) for pose in (start, hub))
+            for ahead in _AHEAD:
+                stops = [parted, np.where(ahead, opened, parted), opened, resting]
+                legs = pairwise([start, *stops])
+                yield [stop for before, stop in legs if not np.array_equal(before, stop)] or [resting]
+
+
+def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.ndarray, "K"]:
+    """Which of these valid poses [rad] have a valid path to rest, and so one from rest."""
+    shares = np.linspace(0.0, 1.0, 32)[:, None]
+    paths = poses[:, None] + shares * (resting_angles(model) - poses[:, None])
+    valid: NDArray[np.bool_] = is_valid(model, paths.reshape(-1, NUM_JOINTS))
+    free: NDArray[np.bool_] = np.all(valid.reshape(-1, len(shares)), axis=1)
+    one_duration, unused = MotionConfig(durations=(0.4, 0.4)), np.random.default_rng(0)
+    for number in np.flatnonzero(~free):
+        with contextlib.suppress(PoseError):
+            path_to_rest(model, poses[number], one_duration, unused)
+            free[number] = True
+    return free
+
+
+_FREE_ROTATION: Final = 0.6  # from position to position, standard deviation about each axis [rad]
+_FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Fingers along +y, back of the hand up."""
+
+
+@dataclass(frozen=True, slots=True)
+class WristConfig:
+    """Positions and orientations of the wrist of a person at a table.
+
+    Raises:
+        ArgumentError: A number or a pair of numbers is out of range.
+    """
+
+    center: tuple[float, float, float] = ROOM_CENTER
+    """Middle of the cube it moves in [m]."""
+    volume: float = 0.3
+    """Half side of that cube [m]."""
+    turning: float = 0.5
+    """Standard deviation of the rotation about each axis, from fingers ahead and palm down [rad]."""
+    times: tuple[float, float] = (0.6, 2.0)
+    """Shortest and longest time between two positions [s]."""
+
+    def __post_init__(self) -> None:
+        check_array("center", self.center, (3,))
+        check_number("volume", self.volume, 0.0)
+        check_number("turning", self.turning, 0.0)
+        check_span("times", self.times)
+
+
+def free_wrist_path(
+    frames: int, config: MotionConfig, *, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
+    """Positions [m] and orientations (wxyz) of a wrist that takes any orientation."""
+    positions, orientations, shares = (
+        [_draw_position(config, rng)],
+        [random_quaternions(1, rng=rng)[0]],
+        [np.zeros(1)],
+    )
+    while sum(map(len, shares)) < frames:
+        positions.append(_draw_position(config, rng))
+        rotation = Rotation.from_rotvec(rng.normal(scale=_FREE_ROTATION, size=3)).as_quat(scalar_first=True)
+        earlier = Rotation.from_quat(orientations[-1], scalar_first=True)
+        orientations.append(
+            (earlier * Rotation.from_quat(rotation, scalar_first=True)).as_quat(scalar_first=True)
+        )
+        steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
+        shares.append(len(positions) - 2 + minimum_jerk(steps))
+    rotated = Rotation.from_quat(np.array(orientations), scalar_first=True)
+    return _quaternions(along(np.array(positions), rotated, np.concatenate(shares)[:frames]))
+
+
+def wrist_path(
+    frames: int, rate: float, config: WristConfig, *, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
+    """Positions [m] and orientations (wxyz) of a wrist whose palm faces mostly down."""
+    shares = [np.zeros(1)]
+    while sum(map(len, shares)) < max(frames, 2):  # interpolation needs two
+        steps = int(rng.uniform(*config.times) * rate) + 1
+        shares.append(len(shares) - 1 + minimum_jerk(steps))
+    count = len(shares)
+    positions = config.center + rng.uniform(-config.volume, config.volume, size=(count, 3))
+    away = Rotation.from_rotvec(rng.normal(scale=config.turning, size=(count, 3)))
+    orientations = away * Rotation.from_matrix(_FORWARD)
+    return _quaternions(along(positions, orientations, np.concatenate(shares)[:frames]))
+
+
+def along(
+    positions: Float[np.ndarray, "K 3"], orientations: Rotation, progress: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "T 3"], Rotation]:
+    """Interpolated positions [m] and orientations; `progress` goes from 0 to K - 1."""
+    keys = np.arange(len(positions))
+    position = np.stack([np.interp(progress, keys, axis) for axis in positions.T], axis=1)
+    return position, Slerp(keys, orientations)(progress)
+
+
+def _quaternions(
+    path: tuple[NDArray[np.float64], Rotation],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    position, orientations = path
+    return position, orientations.as_quat(scalar_first=True)
+
+
+def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    return ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)
+
+
+_MOST_DRAWS: Final = 25
+_POSES_A_DRAW: Final = 8
+
+
+def sample_motion(
+    model: HandModel | HandShape | str,
+    duration: float,
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Random smooth motion of one hand through valid poses, valid at every frame.
+
+    Args:
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
+        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
+        config: Speeds and positions; human ones by default.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: An argument is of another type, or the duration is not positive or less than a step.
+        PoseError: This hand has no room for its fingers, or no path leads out of a pose.
+    """
+    hand, config = load_model(model), config or MotionConfig()
+    check_type("config", config, MotionConfig, "a MotionConfig")
+    check_number("duration", duration, 0.0, above=True)
+    check_rng(rng)
+    frames = count_frames(duration, config)
+    angles = sample_valid_angles(hand, 1, rng=rng)
+    parts, count = [angles], 1
+    while count < frames:
+        part = _next_path(hand, parts[-1][-1], config, rng)
+        parts.append(part)
+        count += len(part)
+    return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
+
+
+def motion_through(
+    model: HandModel | HandShape | str,
+    poses: Float[np.ndarray, "K 20"],
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Smooth motion of one hand from each of the given poses [rad] to the next, valid at every frame.
+
+    It begins in the first pose and rests for a moment at each later one; durations and the wrist's path are
+    random. A shape or the name of a size is a right hand.
+
+    Raises:
+        ArgumentError: There are fewer than two poses, or one is not valid on this hand.
+        PoseError: No path leads out of one.
+    """
+    model = load_model(model)
+    config = config or MotionConfig()
+    poses = check_array("poses", poses, (None, NUM_JOINTS))
+    if poses.ndim != 2 or len(poses) < 2:
+        raise ArgumentError(f"poses has shape {poses.shape}, expected at least two poses, (K, {NUM_JOINTS})")
+    valid = is_valid(model, poses)
+    if not valid.all():
+        raise ArgumentError(
+            f"pose {valid.argmin()} of {len(poses)} is not valid on this hand: out of range or deeper than "
+            f"{1e3 * MAX_PENETRATION:g} mm in itself, expected what poses.shapes.make_valid returns"
+        )
+    angles = np.concatenate([poses[:1], angles_through(model, poses, config, rng=rng)])
+    return with_wrist(angles, config, rng=rng)
+
+
+def count_frames(duration: float, config: MotionConfig) -> int:
+    """Frames of a motion of this duration [s], the first one included."""
+    steps = duration * config.rate
+    if not np.isfinite(steps) or round(steps) < 1:
+        raise ArgumentError(
+            f"the motion is {duration:g} s long, expected a number of at least one step at {config.rate:g} Hz"
+        )
+    return round(steps) + 1
+
+
+def angles_through(
+    model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each.
+
+    Raises:
+        PoseError: No path leads out of a pose.
+    """
+    paths = [straight_path(start, target, config, rng) for start, target in pairwise(poses)]
+    ends = np.cumsum([len(path) for path in paths])
+    valid = np.split(is_valid(model, np.concatenate(paths)), ends[:-1])
+    for number, direct in enumerate(valid):
+        if not direct.all():
+            out = path_to_rest(model, poses[number], config, rng)
+            back = path_to_rest(model, poses[number + 1], config, rng)[-2::-1]
+            paths[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
+    return np.concatenate([held(path, config, rng) for path in paths])
+
+
+def _next_path(
+    model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Frames from one pose to another and a rest there, all valid."""
+    resting = resting_angles(model)
+    for _ in range(_MOST_DRAWS):
+        for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
+            direct = straight_path(start, target, config, rng)
+            if is_valid(model, direct).all():
+                return held(direct, config, rng)
+            around = np.concatenate(
+                [straight_path(start, resting, config, rng), straight_path(resting, target, config, rng)]
+            )
+            if is_valid(model, around).all():
+                return held(around, config, rng)
+    return held(path_to_rest(model, start, config, rng), config, rng)
+
+
+def with_wrist(
+    angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> HandMotion:
+    """The motion of these joint angles [rad] by a hand whose wrist moves from position to position."""
+    position, quaternion = free_wrist_path(len(angles), config, rng=rng)
+    return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
+
+
+FREE: Final = "free"
+"""The name of a motion without a script: what `sample_motion` makes."""
+_POSES_AT_ONCE: Final = 16
+
+
+def _scripts() -> dict[str, dict[str, Any]]:
+    scripts: dict[str, dict[str, Any]] = package_data("poses", "scripts")["scripts"]
+    return scripts
+
+
+def script_names() -> tuple[str, ...]:
+    """Names of all scripts."""
+    return tuple(_scripts())
+
+
+def scripted_motion(
+    model: HandModel | HandShape | str,
+    script: str,
+    duration: float,
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Smooth motion of one hand that follows a named script, valid at every frame.
+
+    Args:
+        model: The hand; a shape or the name of a size is a right one.
+        script: One of `script_names`.
+        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
+        config: Speeds and positions; human ones by default. Except for "free",
+            `durations` and `hold` are those of the script.
+
+    Raises:
+        ArgumentError: There is no such script, or the duration is not positive or less than a step.
+        PoseError: This hand cannot do what the script asks for.
+    """
+    model = load_model(model)
+    check_choice(script, _scripts(), noun="script")
+    if script == FREE:
+        return sample_motion(model, duration, config, rng=rng)
+    entry = _scripts()[script]
+    config = dataclasses.replace(
+        config or MotionConfig(), durations=tuple(entry["durations"]), hold=entry["hold"]
+    )
+    frames = count_frames(duration, config)
+    poses = script_poses(model, script)
+    at = int(rng.integers(len(poses)))
+    parts, count = [poses[at : at + 1]], 1
+    while count < frames:
+        indices = _next_indices(at, len(poses), entry["order"], rng)
+        parts.append(angles_through(model, poses[indices], config, rng=rng))
+        count, at = count + len(parts[-1]), int(indices[-1])
+    return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
+
+
+def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
+    """The poses [rad] a script goes through, as this hand can strike them.
+
+    Touches that this hand's thumb cannot reach and poses without a valid path to rest are left out.
+    """
+    if script not in _scripts() or script == FREE:
+        raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
+    entry = _scripts()[script]
+    if "touches" in entry:
+        poses = _touches(model, entry["touches"])
+    elif "library" in entry:
+        poses = make_valid(model, gestures_of(entry["library"]))
+    else:
+        poses = make_valid(model, np.stack([gesture(name) for name in entry["gestures"]]))
+    poses = poses[np.flatnonzero(can_be_left(model, poses))]
+    if len(poses) < 2:
+        raise PoseError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
+    return poses
+
+
+def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
+    poses: list[NDArray[np.float64]] = []
+    for finger in fingers:
+        with contextlib.suppress(PoseError):  # other fingers remain
+            poses.append(touching_angles(model, finger))
+    return np.array(poses).reshape(-1, NUM_JOINTS)
+
+
+def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
+    """Indices of the next poses, the present one first."""
+    if order == "in turn":
+        steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
+    else:
+        steps = rng.integers(1, count, size=_POSES_AT_ONCE)
+    return (at + np.concatenate([[0], np.cumsum(steps)])) % count

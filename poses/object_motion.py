@@ -1,0 +1,367 @@
+"""Motion of a hand with an object: it plays with it, points with it, keeps away from the other hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+
+from handsim.errors import ArgumentError, PoseError
+from handsim.hand.capsules import overlap_between
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.space.objects import RigidObject
+from handsim.space.transforms import axis_angle_matrix
+from poses.grasps import (
+    GraspScene,
+    Held,
+    Hold,
+    HoldStyle,
+    between,
+    grasp_scene,
+    hold_names,
+    hold_style,
+    is_held_valid,
+    object_penetration,
+    pose_to_qpos,
+    rotation_between,
+    sample_held_poses,
+    settle_hold,
+    why_not_held,
+    wrist_poses,
+)
+from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
+from poses.shapes import MAX_PENETRATION
+
+_VARIANTS: Final = 12  # drawn at once
+_MOST_DRAWS: Final = 20
+_HOLDS: Final = 3  # grasps of one style that a motion goes between
+_SHIFTS: Final = 0.15  # how often the object shifts in the hand
+_LOOSEST: Final = 0.003  # [m] between the object and the digits that hold it, while it shifts
+_SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
+_MARGIN: Final = 0.9  # of the fastest and of the largest acceleration, for the steps between frames
+
+
+def sample_object_motion(
+    model: HandModel, obj: RigidObject, duration: float, *, rng: np.random.Generator
+) -> tuple[HandMotion, BodyMotion]:
+    """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
+
+    It has `round(duration * rate) + 1` frames.
+
+    Raises:
+        ArgumentError: The duration is not positive.
+        PoseError: This hand does not get hold of the object, or finds no valid path out of a hold.
+    """
+    config = MotionConfig()
+    if not 0.0 < duration < np.inf:
+        raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
+    frames = round(duration * config.rate) + 1
+    names = hold_names(obj)
+    name = names[rng.integers(len(names))]
+    holds = [settle_hold(model, obj, hold=name, rng=rng) for _ in range(_HOLDS)]
+    player = _Player(grasp_scene(model, obj), hold_style(model, obj, name), holds, config, rng)
+    parts = [Held(holds[0].angles[None], holds[0].T_wrist_object[None])]
+    count, current = 1, 0
+    while count < frames:
+        part, current = player.next_part(parts[-1], current)
+        parts.append(part)
+        count += len(part.angles)
+    angles, held = (np.concatenate(rows)[:frames] for rows in zip(*parts, strict=True))
+    position, quaternion = free_wrist_path(frames, config, rng=rng)
+    position = position + _scribble(frames, player.style.scribble, config.rate, rng=rng)
+    qpos = join_qpos(angles, position=position, quaternion=quaternion)
+    return HandMotion(qpos, config.rate), BodyMotion(wrist_poses(qpos) @ held, config.rate)
+
+
+@dataclass(frozen=True, slots=True)
+class _Player:
+    """Moves a hand from one variant of its holds to the next."""
+
+    scene: GraspScene
+    style: HoldStyle
+    holds: list[Hold]
+    config: MotionConfig
+    rng: np.random.Generator
+
+    def next_part(self, last: Held, current: int) -> tuple[Held, int]:
+        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index."""
+        start = Held(last.angles[-1:], last.poses[-1:])
+        if self.rng.random() < _SHIFTS:
+            other = int(self.rng.integers(len(self.holds)))
+            part = self._path(start, self._home(other))
+            if other != current and is_held_valid(self.scene, part).all() and self._keeps_touch(part):
+                return self._rested(part), other
+        model, obj = self.scene.hand, self.scene.obj
+        for _ in range(_MOST_DRAWS):
+            angles, poses = sample_held_poses(model, obj, self.holds[current], _VARIANTS, rng=self.rng)
+            paths = (
+                self._path(start, Held(angles[[number]], poses[[number]])) for number in range(_VARIANTS)
+            )
+            for part in (*paths, self._path(start, self._home(current))):
+                if is_held_valid(self.scene, part).all():
+                    return self._rested(part), current
+        raise PoseError(f"no valid path out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
+
+    def _home(self, number: int) -> Held:
+        return Held(self.holds[number].angles[None], self.holds[number].T_wrist_object[None])
+
+    def _path(self, start: Held, target: Held) -> Held:
+        config = self.config
+        distance = np.abs(target.angles - start.angles).max()
+        quickest = max(
+            PEAK_SPEED * distance / (_MARGIN * config.max_speed),
+            np.sqrt(PEAK_ACCELERATION * distance / (_MARGIN * config.max_acceleration)),
+            PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
+            PEAK_SPEED * float(np.linalg.norm(rotation_between(start, target)[0])) / _ROLLING,
+        )
+        frames = int(np.ceil(max(quickest, self.rng.uniform(*config.durations)) * config.rate)) + 1
+        return between(start, target, minimum_jerk(frames))
+
+    def _rested(self, path: Held) -> Held:
+        pause = int(self.rng.uniform(0.0, self.config.hold) * self.config.rate)
+        return Held(*(np.concatenate([part, np.repeat(part[-1:], pause, axis=0)]) for part in path))
+
+    def _keeps_touch(self, held: Held) -> bool:
+        """Whether the digits that hold the object stay near it, at the quarters and halfway."""
+        scene = self.scene
+        names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
+        for number in len(held.angles) * np.array([1, 2, 3]) // 4:
+            distances = scene.distances(scene.new_data(held.angles[number], held.poses[number]))
+            near = {name for name, gap in zip(names, distances, strict=True) if gap < _LOOSEST}
+            if why_not_held(self.style, near):
+                return False
+        return True
+
+
+def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Small quick loops of a writing wrist (T, 3) [m], whose size swells and fades."""
+    time = np.arange(frames) / rate
+    loops = np.zeros((frames, 3))
+    for axis in range(3):
+        for frequency in rng.uniform(1.0, 3.5, size=2):
+            loops[:, axis] += 0.5 * np.sin(2 * np.pi * (frequency * time + rng.random()))
+    swell = 0.5 + 0.5 * np.sin(2 * np.pi * (rng.uniform(0.1, 0.3) * time + rng.random()))
+    return size * swell[:, None] ** 2 * loops
+
+
+_MOST_RETREATS: Final = 12
+_RETREAT_STEP: Final = 0.003  # [m] beyond what is needed
+_SMOOTHING: Final = 0.25  # [s] over which the pen draws back
+
+
+def point_pen(
+    holder: HandModel,
+    other: HandModel,
+    pen: RigidObject,
+    held: tuple[HandMotion, BodyMotion],
+    other_motion: HandMotion,
+    path: Float[np.ndarray, "T 4 4"],
+) -> tuple[HandMotion, BodyMotion]:
+    """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
+
+    Args:
+        pen: Its tip is its first marker, its body goes from there along its z axis.
+        held: Motion of fingers and pen relative to the wrist; the wrist's own motion is computed here.
+        path: Poses of the pen with its tip at the origin, from `pointing_path`.
+
+    Raises:
+        PoseError: Something touches even when drawn back.
+    """
+    motion, body = held
+    T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
+    T_world_pen = path @ _rotated_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    qpos = motion.qpos.copy()
+    qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+    led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+    return keep_apart(holder, other, pen, led, other_motion, path[:, :3, 2])
+
+
+def keep_apart(
+    holder: HandModel,
+    other: HandModel,
+    obj: RigidObject,
+    held: tuple[HandMotion, BodyMotion],
+    other_motion: HandMotion,
+    direction: Float[np.ndarray, "T 3"],
+) -> tuple[HandMotion, BodyMotion]:
+    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand."""
+    motion, body = held
+    back = np.zeros(len(direction))
+    for _ in range(_MOST_RETREATS):
+        qpos, poses = motion.qpos.copy(), body.T_world_body.copy()
+        qpos[:, :3] += back[:, None] * direction
+        poses[:, :3, 3] += back[:, None] * direction
+        deep = np.maximum(
+            overlap_between(
+                holder.capsules, holder.forward_kinematics(qpos),
+                other.capsules, other.forward_kinematics(other_motion.qpos),
+            ),
+            object_penetration(other, obj, other_motion.qpos, poses),
+        )  # fmt: skip
+        if deep.max() <= MAX_PENETRATION:
+            return HandMotion(qpos, motion.rate), BodyMotion(poses, motion.rate)
+        needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
+        window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
+        back = uniform_filter1d(maximum_filter1d(needed, window), window)
+    raise PoseError("the hands touch, however far one of them draws back")
+
+
+def _rotated_to_the_arm(
+    T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Pen in the path's frame: its tip at the origin, rotated about itself until the wrist is at +x."""
+    wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
+    away = np.arctan2(wrist[1], wrist[0])
+    rotation = np.eye(4)
+    rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
+    shift = np.eye(4)
+    shift[:3, 3] = -tip
+    return rotation @ shift
+
+
+DISTANCE: Final = (0.006, 0.02)
+"""Smallest and largest distance of the tip from its target [m]."""
+SPEED: Final = 0.6
+"""Highest speed of the tip between still targets, without the retreat [m/s]; slow paths take longer."""
+TURNING: Final = 3.0
+"""The same for the rotation of the pen [rad/s]."""
+RETREAT: Final = 0.05
+"""Distance that the tip draws back between two targets [m]."""
+_STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
+PATH: Final = (0.4, 0.9)
+"""Shortest and longest time from target to target [s]."""
+_TILT: Final = 0.6  # lean of the pen from the outward direction, standard deviation of the tangent
+_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
+"""Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
+_ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
+_CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
+_MOST_LEAN: Final = 1.0  # as a tangent
+_BEHIND: Final = -0.2  # targets that face away from the pen by more, as a cosine, are not pointed at
+_STEADY: Final = 0.15  # [s] over which outward directions are smoothed, standard deviation
+
+
+def pointing_path(
+    positions: Float[np.ndarray, "T M 3"],
+    outward: Float[np.ndarray, "T M 3"],
+    rate: float,
+    *,
+    speed: float = SPEED,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "T 4 4"]:
+    """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
+
+    Args:
+        positions: Possible targets, moving in the world [m].
+        outward: Unit directions from which each can be reached.
+        speed: Highest speed of the tip [m/s], see `SPEED`.
+    """
+    outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
+    visits = _plan(positions, outward, rate, speed, rng)
+    share = np.concatenate([visit.share for visit in visits])
+    number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
+    now = np.arange(len(positions))
+    share, number = share[now], number[now]
+
+    def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        target = np.array([visit.target for visit in visits])[which]
+        lean = np.stack([visit.lean for visit in visits])[which]
+        distance = np.array([visit.distance for visit in visits])[which]
+        axis = _axes(outward[now, target], lean)
+        return positions[now, target] + distance[:, None] * axis, axis
+
+    (here, axis_here), (there, axis_there) = at(number), at(number + 1)
+    blend = share[:, None]
+    axis = _between(axis_here, axis_there, blend)
+    lift = RETREAT * np.sin(np.pi * blend) ** 2
+    return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
+
+
+@dataclass(frozen=True, slots=True)
+class _Visit:
+    """One target, and the path from it to the next."""
+
+    target: int
+    distance: float
+    lean: Float[np.ndarray, "3"]
+    share: Float[np.ndarray, "S"]
+    """Share of the path after each frame."""
+
+
+def _plan(
+    positions: Float[np.ndarray, "T M 3"],
+    outward: Float[np.ndarray, "T M 3"],
+    rate: float,
+    speed: float,
+    rng: np.random.Generator,
+) -> list[_Visit]:
+    """Visits for all frames, and one more where the last path leads."""
+    visits: list[_Visit] = []
+    frame = 0
+    target, lean = _draw(outward[0], rng)
+    while frame < len(positions):
+        here, axis = positions[frame], _axes(outward[frame, target], lean)
+        following, next_lean = _draw(outward[frame], rng)
+        next_axis = _axes(outward[frame, following], next_lean)
+        turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
+        seconds = max(
+            rng.uniform(*PATH),
+            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / speed,
+            PEAK_SPEED * turn / TURNING,
+        )
+        stay = np.zeros(max(1, round(rng.uniform(*_STAY) * rate)))
+        share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])
+        visits.append(_Visit(target, rng.uniform(*DISTANCE), lean, share))
+        frame, target, lean = frame + len(share), following, next_lean
+    return [*visits, _Visit(target, rng.uniform(*DISTANCE), lean, np.zeros(0))]
+
+
+def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[int, Float[np.ndarray, "3"]]:
+    """A target that can be reached now, and the lean of the pen there."""
+    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
+    target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
+    lean = _TILT * rng.standard_normal(3)
+    lean -= (lean @ outward[target]) * outward[
+        target
+    ]  # sideways, or a rotation of the target would swing the pen
+    return target, lean * min(1.0, _MOST_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
+
+
+def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
+    """Directions of the pen at targets: off the skin, and never far from upright, smoothly in both."""
+    axis = outward + lean
+    facing = np.einsum("...i,...i->...", axis, outward)[..., None]
+    axis = axis + np.clip(0.5 - facing, 0.0, None) * outward
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    upright = np.broadcast_to(_UPRIGHT, axis.shape)
+    angle = np.arccos(np.clip(axis @ _UPRIGHT, -1.0, 1.0))[..., None]
+    return _between(upright, axis, _CONE * np.tanh(angle / _CONE) / np.maximum(angle, 1e-9))
+
+
+def _between(
+    start: Float[np.ndarray, "*T 3"], end: Float[np.ndarray, "*T 3"], share: Float[np.ndarray, "*T 1"]
+) -> Float[np.ndarray, "*T 3"]:
+    """Directions after a share of the shortest rotation from one to another."""
+    angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
+    mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
+    mixed = np.where(angle > 1e-6, mixed, start)
+    between: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12)
+    return between
+
+
+def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
+    """Poses with +z along `axis`, by the shortest rotation from upright, where +x points to the arm."""
+    x = _ARM - (_ARM @ _UPRIGHT) * _UPRIGHT
+    x /= np.linalg.norm(x)
+    # The shortest rotation from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
+    middle = axis + _UPRIGHT
+    x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
+    pose = np.tile(np.eye(4), (len(origin), 1, 1))
+    pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
+    pose[:, :3, 3] = origin
+    return pose

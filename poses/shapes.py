@@ -1,0 +1,470 @@
+"""Single poses of one hand: named gestures, couplings of joints, random draws, and which poses are valid."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from handsim._checks import check_array, check_callable, check_choice, check_number, check_rng, check_type
+from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
+from handsim.errors import ArgumentError, PoseError, choices
+from handsim.files.json_files import package_data
+from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
+
+LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
+"""Names of all libraries; no two hold the same name."""
+_GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, positive to the thumb
+
+
+@cache
+def _library(library: str) -> dict[str, NDArray[np.float64]]:
+    check_choice(library, LIBRARIES, noun="library")
+    data = package_data("poses", library)
+    shapes = package_data("poses", "gestures")  # those of single digits serve all libraries
+    gestures: dict[str, NDArray[np.float64]] = {}
+    for name, entry in data["gestures"].items():
+        fingers = np.array([_numbers(finger, shapes["fingers"]) for finger in entry["fingers"]])
+        fingers[:, 0] += entry.get("spread", 0.0) * _GESTURE_SPREAD
+        thumb = _numbers(entry["thumb"], shapes["thumbs"])
+        gestures[name] = np.deg2rad(np.concatenate([thumb, fingers.ravel()]))
+    return gestures
+
+
+def _numbers(digit: str | list[float], shapes: dict[str, list[float]]) -> NDArray[np.float64]:
+    """Four angles [deg] of a digit that is named or written out."""
+    return np.array(shapes[digit] if isinstance(digit, str) else digit, dtype=np.float64)
+
+
+def gesture_names(library: str = "gestures") -> tuple[str, ...]:
+    """Names of all gestures of one library.
+
+    Raises:
+        ArgumentError: There is no such library.
+    """
+    return tuple(_library(library))
+
+
+def gesture(name: str) -> Float[np.ndarray, "20"]:
+    """Joint angles [rad] of a named gesture of any library, in the order of `topology.JOINTS`.
+
+    Raises:
+        ArgumentError: No library holds this name.
+    """
+    for library in LIBRARIES:
+        if name in _library(library):
+            return _library(library)[name].copy()
+    names = [known for library in LIBRARIES for known in _library(library)]
+    raise ArgumentError(choices(name, names, noun="gesture"))
+
+
+def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
+    """Joint angles [rad] of every gesture of one library, in the order of `gesture_names(library)`.
+
+    Raises:
+        ArgumentError: There is no such library.
+    """
+    return np.stack(list(_library(library).values()))
+
+
+def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
+    """Joint angles [rad] of every named gesture of all libraries, in the order of `topology.JOINTS`."""
+    return {name: angles.copy() for library in LIBRARIES for name, angles in _library(library).items()}
+
+
+def all_gestures() -> Float[np.ndarray, "G 20"]:
+    """Joint angles [rad] of the gestures that random poses are blended from: the library "gestures".
+
+    The other libraries are left out, so that a seed keeps giving the same training set.
+    """
+    return gestures_of("gestures")
+
+
+LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
+HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
+
+_NO_ABDUCTION_AT: Final = np.deg2rad(85.0)  # MCP flexion at which abduction has shrunk to the share below
+_ABDUCTION_LEFT: Final = 0.25
+_DIP_SHARE: Final = 2.0 / 3.0
+_DIP_BELOW: Final = np.deg2rad(32.0)  # how far the DIP may be below or above its share of the PIP
+_DIP_ABOVE: Final = np.deg2rad(28.0)
+# How much more than its neighbor a finger's MCP may flex [rad]: index-middle, middle-ring, ring-little.
+_MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
+
+
+def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
+    """The same angles (T, 5, 4), one row per digit; a view, so writing to it writes to `angles`."""
+    return angles.reshape(*angles.shape[:-1], 5, 4)
+
+
+def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
+    """Nearest-by-clamping angles [rad] that respect ranges and couplings."""
+    coupled = np.clip(angles, LOW, HIGH)
+    fingers = finger_view(coupled)[:, 1:]
+    flexion = fingers[..., 1]
+    for near, far, apart in ((1, 0, 0), (1, 2, 1), (2, 3, 2)):
+        limit = _MCP_APART[apart]
+        flexion[:, far] = np.clip(flexion[:, far], flexion[:, near] - limit, flexion[:, near] + limit)
+    left = 1.0 - (1.0 - _ABDUCTION_LEFT) * np.clip(flexion / _NO_ABDUCTION_AT, 0.0, 1.0)
+    low, high = LOW.reshape(5, 4)[1:, 0], HIGH.reshape(5, 4)[1:, 0]
+    fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
+    follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
+    fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
+    inside: np.ndarray = np.clip(coupled, LOW, HIGH)
+    return inside
+
+
+_FLEXION_NOISE: Final = np.deg2rad(6.0)
+_ABDUCTION_NOISE: Final = np.deg2rad(2.0)
+_SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
+# How often the fingers part: index-middle, middle-ring, ring-little.
+_SPLIT: Final = np.array([0.3, 0.2, 0.25])
+_ALIKE: Final = 0.993
+# How much curl may grow from index to little, standard deviation in the latent.
+_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
+_CURL_DIP_SHARE: Final = 0.68
+_DIP_LAG: Final = np.deg2rad(6.0)
+_DIP_NOISE: Final = np.deg2rad(9.0)
+_MCP_OPEN, _MCP_CLOSED = np.deg2rad([-18.0, 92.0])
+_PIP_OPEN, _PIP_CLOSED = np.deg2rad([-3.0, 112.0])
+_FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviation of fanning, index to little
+
+
+@dataclass(frozen=True, slots=True)
+class PoseMix:
+    """How often each source of poses is drawn; the shares are normalized.
+
+    Raises:
+        ArgumentError: A share is negative, or all are zero.
+    """
+
+    gestures: float = 0.45
+    """Blends of two named gestures, each digit a little ahead or behind."""
+    curls: float = 0.50
+    """Correlated finger curls: neighbors move together, any finger may leave the others."""
+    anywhere: float = 0.05
+    """Uniform within the ranges."""
+
+    def __post_init__(self) -> None:
+        for name in ("gestures", "curls", "anywhere"):
+            check_number(name, getattr(self, name), 0.0)
+        check_number(
+            "the sum of gestures, curls and anywhere",
+            self.gestures + self.curls + self.anywhere,
+            0.0,
+            above=True,
+        )
+
+
+DEFAULT_MIX: Final = PoseMix()
+
+
+def sample_angles(
+    count: int, mix: PoseMix = DEFAULT_MIX, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    """Random joint angles [rad] inside ranges and couplings; digits may still touch.
+
+    `poses.shapes` makes such poses valid.
+    """
+    shares = np.array([mix.gestures, mix.curls, mix.anywhere])
+    source = rng.choice(3, size=count, p=shares / shares.sum())
+    angles = np.empty((count, len(LOW)))
+    for number, draw in enumerate((_blend_gestures, _curl_fingers, _anywhere)):
+        chosen = source == number
+        angles[chosen] = draw(int(chosen.sum()), rng)
+    return apply_couplings(angles)
+
+
+def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    library = all_gestures()
+    first, second = library[rng.integers(len(library), size=(2, count))]
+    progress = rng.uniform(-0.1, 1.1, size=(count, 1)) + 0.12 * rng.standard_normal((count, 5))
+    weight = np.repeat(np.clip(progress, 0.0, 1.0), 4, axis=1)
+    angles: NDArray[np.float64] = (1.0 - weight) * first + weight * second
+    noise = np.stack([_shared_normals(count, rng, digits=5) for _ in range(4)], axis=2) * _FLEXION_NOISE
+    noise[..., 0] *= _ABDUCTION_NOISE / _FLEXION_NOISE
+    flat: NDArray[np.float64] = noise.reshape(count, 20)
+    angles += flat
+    return angles
+
+
+def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    from scipy.special import ndtr
+
+    angles = _thumbs(count, rng)
+    digits = finger_view(angles)
+    within = rng.uniform(0.3, 1.0, size=(count, 1))  # how much the two joints of one finger move together
+    splits = rng.random((count, 3)) < _SPLIT
+    knuckles = _grouped(splits, rng.standard_normal((count, 4)))
+    middles = within * knuckles + np.sqrt(1 - within**2) * _grouped(splits, rng.standard_normal((count, 4)))
+    knuckles += _SLOPE * rng.standard_normal((count, 1))
+    middles += _SLOPE * rng.standard_normal((count, 1))
+    digits[:, 1:, 1] = _MCP_OPEN + (_MCP_CLOSED - _MCP_OPEN) * ndtr(1.15 * knuckles)
+    digits[:, 1:, 2] = _PIP_OPEN + (_PIP_CLOSED - _PIP_OPEN) * ndtr(1.3 * middles)
+    digits[:, 1:, 3] = (
+        _CURL_DIP_SHARE * digits[:, 1:, 2] - _DIP_LAG + _DIP_NOISE * _shared_normals(count, rng)
+    )
+    fan, sway = rng.standard_normal((2, count, 1))
+    digits[:, 1:, 0] = fan * _FAN_SPREAD + sway * _SWAY + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
+    return angles
+
+
+def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
+    """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
+    common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
+    mixed: NDArray[np.float64] = np.sqrt(0.75) * common + np.sqrt(0.25) * own
+    return mixed
+
+
+def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard normals (T, 4), alike within a group of neighboring fingers, drawn anew at each split."""
+    grouped = normals.copy()
+    for finger in range(1, 4):
+        along = _ALIKE * grouped[:, finger - 1] + np.sqrt(1 - _ALIKE**2) * normals[:, finger]
+        grouped[:, finger] = np.where(splits[:, finger - 1], normals[:, finger], along)
+    return grouped
+
+
+def _thumbs(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Thumbs that oppose (palmar abduction comes with flexion) and fold (MCP and IP bend together)."""
+    angles = np.zeros((count, 20))
+    reach, sweep, fold, tip = rng.standard_normal((4, count))
+    angles[:, 0] = np.deg2rad(14.0) * reach
+    angles[:, 1] = np.deg2rad(6.0) + np.deg2rad(15.0) * (0.6 * reach + 0.8 * sweep)
+    angles[:, 2] = np.deg2rad(22.0) + np.deg2rad(16.0) * (0.3 * sweep + 0.95 * fold)
+    angles[:, 3] = np.deg2rad(24.0) + np.deg2rad(22.0) * (0.4 * fold + 0.3 * sweep + 0.87 * tip)
+    return angles
+
+
+def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    return rng.uniform(LOW, HIGH, size=(count, len(LOW)))
+
+
+MAX_PENETRATION: Final = 0.001
+"""Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
+_HALVINGS: Final = 4
+_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
+_ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
+_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])
+
+
+def is_valid(
+    model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
+) -> Bool[np.ndarray, "T"]:
+    """Which poses are inside all ranges and penetrate no deeper than `max_penetration` [m]."""
+    inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
+    free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
+    return inside & free
+
+
+def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
+    """Which poses this hand can strike: in range, and at most 1 mm deep in itself (`MAX_PENETRATION`).
+
+    Args:
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
+        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; the wrist may be anywhere.
+
+    Raises:
+        ArgumentError: `model` is none of these, or `qpos` is not (T, 27) or not finite.
+    """
+    return is_valid(load_model(model), check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
+
+
+def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
+    """A valid relaxed pose of this hand, its fingers fanned just as far as their girth needs."""
+    fans = np.arange(0.0, 13.0, 2.0)
+    tries = np.tile(gesture("relaxed"), (len(fans), 1))
+    tries[:, 4::4] += fans[:, None] * _FAN
+    valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
+    if not valid.any():
+        raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
+    resting: NDArray[np.float64] = tries[valid.argmax()]
+    return resting
+
+
+def make_valid(
+    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"]
+) -> Float[np.ndarray, "T 20"]:
+    """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
+
+    The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
+    enough. The path to rest is bisected a few times, so that a fist that was too tight ends as a fist whose
+    fingers touch.
+
+    Args:
+        model: The hand; a shape or the name of a size is a right one.
+
+    Raises:
+        PoseError: This hand has no valid pose at rest.
+    """
+    model = load_model(model)
+    resting = resting_angles(model)
+    result = np.array(angles, dtype=np.float64)
+    todo = np.flatnonzero(~is_valid(model, result))
+    for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
+        target = result[todo]
+        end = np.where(moving, resting, target)
+        helps = is_valid(model, end)
+        result[todo[helps]] = _nearest_valid(model, end[helps], target[helps])
+        todo = todo[~helps]
+    return result
+
+
+def _nearest_valid(
+    model: HandModel, valid_end: NDArray[np.float64], target: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The last valid poses that bisection finds between valid ends and target poses."""
+    low, high = np.zeros(len(target)), np.ones(len(target))  # share of the target pose: valid, invalid
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        valid = is_valid(model, valid_end + middle[:, None] * (target - valid_end))
+        low, high = np.where(valid, middle, low), np.where(valid, high, middle)
+    return valid_end + low[:, None] * (target - valid_end)
+
+
+def sample_valid_angles(
+    model: HandModel, count: int, mix: PoseMix = DEFAULT_MIX, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    """Random valid poses [rad] of one hand, inside ranges, couplings and `MAX_PENETRATION`."""
+    return make_valid(model, sample_angles(count, mix, rng=rng))
+
+
+SAMPLERS: Final = "handsim.pose_samplers"
+"""Group of entry points of pose samplers."""
+_NOUN: Final = "pose sampler"
+_EXPECTED: Final = "a function (model, num_poses, *, rng), module:name of one, or its entry point"
+_WIDEST: Final = 2.0 * np.pi  # [rad], no joint turns so far
+_FARTHEST: Final = 100.0  # [m] of a wrist from the origin
+
+
+class PoseSampler(Protocol):
+    """Draws joint angles for one hand; any function with this signature is one."""
+
+    def __call__(
+        self, model: HandModel, num_poses: int, *, rng: np.random.Generator
+    ) -> Float[np.ndarray, "T 20"] | Float[np.ndarray, "T 27"]:
+        """Draw poses, which need not be valid.
+
+        Args:
+            model: The hand.
+            num_poses: Number of poses, T.
+            rng: Source of all randomness.
+
+        Returns:
+            Joint angles [rad], in the order of `handsim.hand.shape.JOINTS`; or whole poses: wrist position
+            [m], wrist orientation (wxyz) and these angles.
+        """
+
+
+def mixed_angles(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T 20"]:
+    """The sampler that training sets use: gestures, finger curls and uniform angles in the default mix.
+
+    Joint angles [rad] are inside ranges and couplings, the same for every hand; digits may still touch.
+    """
+    return sample_angles(num_poses, rng=rng)
+
+
+def sample_poses(
+    model: HandModel | HandShape | str,
+    num_poses: int,
+    sampler: PoseSampler | str = mixed_angles,
+    *,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "T 27"]:
+    """Random valid poses of one hand, with the wrist at the origin unless the sampler says where it is.
+
+    Poses that leave a range or penetrate the hand deeper than 1 mm are moved towards rest until they are
+    valid.
+
+    Args:
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
+        num_poses: Number of poses, T.
+        sampler: Draws joint angles or whole poses; by default a mix of gestures, finger curls and uniform
+            angles. A function, `module:name` of one, or its entry point.
+        rng: Source of all randomness.
+
+    Returns:
+        Wrist position [m], wrist orientation (wxyz) and joint angles [rad] of every pose.
+
+    Raises:
+        ArgumentError: An argument is of another type, `num_poses` is not positive, or the sampler returned
+            another shape or numbers that are not finite.
+        PoseError: This hand has no valid pose at rest: its fingers are too thick for its breadth.
+    """
+    hand = load_model(model)
+    check_type("num_poses", num_poses, (int, np.integer), "a number of poses")
+    check_rng(rng)
+    if num_poses < 1:
+        raise ArgumentError(f"num_poses is {num_poses}, expected a positive number")
+    drawn = checked_sampler(sampler)(hand, num_poses, rng=rng)
+    qpos = join_qpos(make_valid(hand, drawn[:, -NUM_JOINTS:]))
+    qpos[:, :-NUM_JOINTS] = qpos[:, :-NUM_JOINTS] if drawn.shape[1] == NUM_JOINTS else drawn[:, :-NUM_JOINTS]
+    return qpos
+
+
+def load_sampler(sampler: PoseSampler | str) -> PoseSampler:
+    """A user's sampler, or the one of a name, behind checks of what it returns; it is tried once.
+
+    Args:
+        sampler: A function like `PoseSampler`; `module:name` of one or of a class whose instances are; or an
+            entry point of the group `handsim.pose_samplers`.
+
+    Returns:
+        A sampler of finite joint angles (T, 20) [rad] or whole poses (T, 27).
+
+    Raises:
+        ArgumentError: There is none of that name, it does not take a sampler's arguments, or what it returns
+            for two poses of a hand of size M has another shape or is not finite.
+        HandSimError: It raised an error.
+    """
+    checked = checked_sampler(sampler)
+    checked(HandModel.named("M"), 2, rng=np.random.default_rng(0))
+    return checked
+
+
+def checked_sampler(sampler: PoseSampler | str) -> PoseSampler:
+    """As `load_sampler`, but not tried."""
+    if not isinstance(sampler, str):
+        names = ", ".join(list_plugins(SAMPLERS))
+        check_callable("sampler", sampler, _EXPECTED + (f"; valid names: {names}" if names else ""))
+    return functools.partial(_drawn, sampler)
+
+
+def _drawn(
+    sampler: PoseSampler | str, model: HandModel, num_poses: int, *, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    name = plugin_name(sampler)
+    function = load_plugin(sampler, group=SAMPLERS, noun=_NOUN) if isinstance(sampler, str) else sampler
+    owner = f"what {_NOUN} '{name}' returns"
+    drawn = call_plugin(function, name, _NOUN, model, num_poses, rng=rng)
+    try:
+        values = np.asarray(drawn, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{owner} is {type(drawn).__name__}, expected joint angles [rad]") from error
+    if values.shape not in ((num_poses, NUM_JOINTS), (num_poses, NUM_QPOS)):
+        raise ArgumentError(
+            f"{owner} has shape {values.shape}, expected ({num_poses}, {NUM_JOINTS}) joint angles or "
+            f"({num_poses}, {NUM_QPOS}) whole poses"
+        )
+    check_array(owner, values, values.shape)
+    widest = np.abs(values[:, -NUM_JOINTS:]).max()
+    if widest > _WIDEST:
+        raise ArgumentError(f"{owner} holds an angle of {widest:.4g} rad; are these degrees?")
+    return values if values.shape[1] == NUM_JOINTS else _unit_wrists(owner, values)
+
+
+def _unit_wrists(owner: str, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Whole poses with quaternions of length one."""
+    lengths = np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    if lengths.min() < 1e-6:
+        raise ArgumentError(f"{owner} holds a quaternion of zeros (numbers 3 to 6, wxyz), expected length 1")
+    farthest = np.abs(qpos[:, :3]).max()
+    if farthest > _FARTHEST:
+        raise ArgumentError(f"{owner} holds a wrist {farthest:.4g} m away; are these millimeters?")
+    return np.concatenate([qpos[:, :3], qpos[:, 3:7] / lengths, qpos[:, 7:]], axis=1)

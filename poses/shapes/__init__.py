@@ -1,1 +1,0 @@
-"""Single poses of one hand."""

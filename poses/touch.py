@@ -1,0 +1,233 @@
+"""Thumb and finger that touch: solved for one person's hand, with the position of the contact.
+
+A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
+A real hand gives this kind of ground truth without any instrument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from handsim._checks import check_array, check_choice
+from handsim.errors import PoseError
+from handsim.hand.capsules import Capsules
+from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape, bones_of
+from handsim.kernels.kernel import kernel
+from handsim.kernels.segments import segment_distance_squared
+from poses.shapes import HIGH, LOW, MAX_PENETRATION, gesture, is_valid, make_valid
+
+FINGERS: Final = DIGITS[1:]
+MAX_OVERLAP: Final = 0.0006
+"""Deepest overlap [m] of the two last bones of a solved touch; the least is 0."""
+MIN_FACING: Final = 0.5
+"""Smallest cosine between a pad's direction and the direction to the other bone in a solved touch."""
+_PAD: Final = 0.6  # where the pad is, as a share of the last bone's capsule
+# One unit of the sum of squares: meters of overlap, of penetration elsewhere, between the pads; radians.
+_OVERLAP_SCALE: Final = 5e-5
+_DIG_SCALE: Final = 1e-4
+_PAD_SCALE: Final = 3e-2
+_FACING_WEIGHT: Final = 5.0
+_ANGLE_WEIGHTS: Final = 2.0 * np.array([1.0, 1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
+_TARGET_FACING: Final = 0.55
+_MOST_ROUNDS: Final = 4
+_STEP: Final = 1e-6  # of the finite differences [rad]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThumbContact:
+    """Relative position of the last bones of thumb and one finger in each frame."""
+
+    finger: str
+    """Which finger."""
+    overlap: Float[np.ndarray, "T"]
+    """How deep the two capsules overlap [m]; negative: the gap between them."""
+    thumb_point: Float[np.ndarray, "T 3"]
+    """The thumb's point nearest to the finger, in the frame of the thumb's last bone [m]."""
+    finger_point: Float[np.ndarray, "T 3"]
+    """The finger's point nearest to the thumb, in the frame of the finger's last bone [m]."""
+    facing: Float[np.ndarray, "T 2"]
+    """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
+
+
+def thumb_contact(
+    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
+) -> ThumbContact:
+    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not.
+
+    A shape or the name of a size is a right hand.
+
+    Raises:
+        ArgumentError: There is no such finger, or `angles` is not (T, 20).
+    """
+    model = load_model(model)
+    check_choice(finger, FINGERS, noun="finger")
+    return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
+
+
+def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> ThumbContact:
+    bones = bones_of("thumb")[2], bones_of(finger)[2]
+    indices = [int(np.flatnonzero(capsules.bones == bone)[0]) for bone in bones]
+    segments, radii = capsules.posed(frames)[:, indices], capsules.radii[indices]
+    ends = _nearest_points(segments)
+    direction = ends[:, 1] - ends[:, 0]
+    distance = np.linalg.norm(direction, axis=1)
+    direction /= distance[:, None]
+    points, facing = [], []
+    for number, sign in enumerate((1.0, -1.0)):
+        frame = frames[:, bones[number]]
+        surface = ends[:, number] + sign * radii[number] * direction - frame[:, :3, 3]
+        points.append(np.einsum("tji,tj->ti", frame[:, :3, :3], surface))
+        facing.append(-sign * (frame[:, :3, 2] * direction).sum(axis=1))
+    return ThumbContact(finger, radii.sum() - distance, points[0], points[1], np.stack(facing, axis=1))
+
+
+def touching_angles(
+    model: HandModel | HandShape | str, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
+) -> Float[np.ndarray, "20"]:
+    """Joint angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
+
+    Only the thumb and this finger move. The last bones overlap by 0 to `MAX_OVERLAP`, their pads face each
+    other, and nothing else penetrates deeper than `MAX_PENETRATION`.
+
+    Args:
+        model: The hand; a shape or the name of a size is a right one.
+        finger: "index", "middle", "ring" or "little".
+        start: Where to begin [rad], one pose or several that are tried in turn; the library's pinches of this
+            finger, made valid, when not given.
+
+    Raises:
+        ArgumentError: There is no such finger.
+        PoseError: This hand's thumb was not brought to it.
+    """
+    model = load_model(model)
+    check_choice(finger, FINGERS, noun="finger")
+    if start is None:
+        pinches = [gesture(f"{kind}_{finger}") for kind in ("pinch_pad", "pinch_tip")]
+        starts = make_valid(model, np.stack(pinches))
+    else:
+        starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
+    for begin in np.clip(starts, LOW, HIGH):
+        angles = begin
+        for _ in range(_MOST_ROUNDS):  # each solution stays near its start, so a far touch takes some rounds
+            angles = _solve(model, finger, angles)
+            if is_touching(model, angles[None], finger)[0]:
+                return angles
+    raise PoseError(
+        f"this hand's thumb and {finger} finger could not be brought to touch pad to pad: "
+        "another start or finger may do"
+    )
+
+
+def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> NDArray[np.bool_]:
+    """Which poses (T,) are valid and touch as `touching_angles` defines it."""
+    contact = thumb_contact(model, angles, finger)
+    touching = (contact.overlap >= 0.0) & (contact.overlap <= MAX_OVERLAP)
+    facing = (contact.facing >= MIN_FACING).all(axis=1)
+    valid: NDArray[np.bool_] = touching & facing & is_valid(model, angles)
+    return valid
+
+
+def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.optimize import least_squares
+
+    number = DIGITS.index(finger)
+    moving = np.r_[0:4, 4 * number : 4 * number + 4]
+    low, high = LOW[moving], HIGH[moving]
+    residuals = _residuals(model, finger, start, moving)
+
+    def value(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        values: NDArray[np.float64] = residuals(x[None])[0]
+        return values
+
+    def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        steps = np.where(x + _STEP > high, -_STEP, _STEP)
+        moved = residuals(np.vstack([x, x + np.diag(steps)]))
+        quotients: NDArray[np.float64] = (moved[1:] - moved[0]).T / steps
+        return quotients
+
+    inside = np.clip(start[moving], low + 1e-4, high - 1e-4)
+    solution = least_squares(
+        value, inside, jac=jacobian, bounds=(low, high), max_nfev=60, xtol=1e-6, ftol=1e-6
+    )
+    angles: NDArray[np.float64] = start.copy()
+    angles[moving] = solution.x
+    return angles
+
+
+def _residuals(
+    model: HandModel, finger: str, start: NDArray[np.float64], moving: NDArray[np.int64]
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """The residuals (T, R) as a function of the moving angles (T, 8) [rad]."""
+    capsules = model.capsules
+    bones = bones_of("thumb")[2], bones_of(finger)[2]
+    pads = [_pad(capsules, bone) for bone in bones]
+    pairs = capsules.touching_pairs()
+    pairs = pairs[~np.isin(capsules.bones[pairs], bones).all(axis=1)]
+
+    def residuals(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        angles = np.tile(start, (len(x), 1))
+        angles[:, moving] = x
+        frames = model.forward_kinematics(join_qpos(angles))
+        overlaps = _overlaps(capsules.posed(frames), capsules.radii, pairs)
+        contact = _contact(capsules, frames, finger)
+        positions = [
+            np.einsum("tij,j->ti", frames[:, bone, :3, :3], pad) + frames[:, bone, :3, 3]
+            for bone, pad in zip(bones, pads, strict=True)
+        ]
+        return np.concatenate(
+            [
+                (contact.overlap - 0.5 * MAX_OVERLAP)[:, None] / _OVERLAP_SCALE,
+                np.maximum(0.0, overlaps - 0.7 * MAX_PENETRATION) / _DIG_SCALE,
+                _FACING_WEIGHT * np.maximum(0.0, _TARGET_FACING - contact.facing),
+                (positions[0] - positions[1]) / _PAD_SCALE,
+                _ANGLE_WEIGHTS * (x - start[moving]),
+            ],
+            axis=1,
+        )
+
+    return residuals
+
+
+def _pad(capsules: Capsules, bone: int) -> NDArray[np.float64]:
+    """The middle of a last bone's pad, in its frame [m]."""
+    index = int(np.flatnonzero(capsules.bones == bone)[0])
+    pad: NDArray[np.float64] = capsules.starts[index] + _PAD * (capsules.ends[index] - capsules.starts[index])
+    pad[2] -= capsules.radii[index]
+    return pad
+
+
+def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest points (T, 2, 3) of two segments (T, 2, 2, 3)."""
+    start, along = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
+    apart = start[:, 0] - start[:, 1]
+    uu, vv = (along**2).sum(axis=2).T
+    uv = (along[:, 0] * along[:, 1]).sum(axis=1)
+    uw, vw = (along * apart[:, None]).sum(axis=2).T
+    determinant = np.maximum(uu * vv - uv * uv, 1e-12 * uu * vv)
+    first = np.clip((uv * vw - vv * uw) / determinant, 0.0, 1.0)
+    second = np.clip((uv * first + vw) / vv, 0.0, 1.0)
+    first = np.clip((uv * second - uw) / uu, 0.0, 1.0)
+    return start + np.stack([first, second], axis=1)[..., None] * along
+
+
+@kernel
+def _overlaps(
+    segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
+) -> Any:
+    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart."""
+    overlaps = np.empty((len(segments), len(pairs)))
+    for frame in range(len(segments)):
+        for pair in range(len(pairs)):
+            i, j = pairs[pair, 0], pairs[pair, 1]
+            squared = segment_distance_squared(
+                segments[frame, i, 0], segments[frame, i, 1], segments[frame, j, 0], segments[frame, j, 1]
+            )
+            overlaps[frame, pair] = radii[i] + radii[j] - np.sqrt(squared)
+    return overlaps

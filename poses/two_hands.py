@@ -1,0 +1,609 @@
+"""Two hands that meet, clasp, clap, rub, point and part: smooth motions, and single poses drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from handsim._checks import check_choice
+from handsim.errors import ArgumentError, PoseError
+from handsim.files.json_files import package_data
+from handsim.hand.capsules import overlap_between
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.motion import HandMotion
+from handsim.hand.shape import DIGITS, bones_of
+from handsim.space.rig import ROOM_CENTER
+from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions
+from poses.contact import (
+    APPROACH,
+    MAX_ACCELERATION,
+    MAX_SPEED,
+    NEAREST,
+    RATE,
+    VOLUME,
+    WRIST_SPEED,
+    Passage,
+    close_fingers,
+    first_contact,
+    join_passages,
+    path_between,
+    placed_qpos,
+    smooth_above,
+    valid_frames,
+)
+from poses.motion import PEAK_SPEED, along, minimum_jerk
+from poses.shapes import HIGH, LOW, gesture, gesture_names, is_valid, make_valid, resting_angles
+
+_FLEXION_NOISE: Final = np.deg2rad(4.0)
+_ABDUCTION_NOISE: Final = np.deg2rad(1.5)
+_NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
+_SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
+_WANDER: Final = 0.4  # noise from beat to beat, as a share of the noise that a whole interaction keeps
+
+
+INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
+"""Names of all interactions."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fingers:
+    """Joint angles of one hand, one row per beat."""
+
+    opened: Float[np.ndarray, "K 20"]
+    """Open fingers [rad]."""
+    closed: Float[np.ndarray, "K 20"]
+    """Closed fingers if nothing blocks them [rad]."""
+    strength: Float[np.ndarray, "K 5"]
+    """Share of that path that each digit closes."""
+
+    def at(self, beats: Float[np.ndarray, "T"]) -> Fingers:
+        """Interpolated between beats, which count from 0."""
+        return Fingers(*(at_beats(keys, beats) for keys in (self.opened, self.closed, self.strength)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """Interactions as they were drawn: poses of the moving hand in the wrist frame of the still one."""
+
+    still: Fingers
+    moving: Fingers
+    rotations: Float[np.ndarray, "K 3"]
+    """Rotation vectors [rad], to be applied after `rotation`."""
+    rotation: Float[np.ndarray, "K 3 3"]
+    """The same for all beats of one interaction."""
+    targets: Float[np.ndarray, "K 3"]
+    """Points of the still hand [m]."""
+    anchors: Float[np.ndarray, "K 3"]
+    """Points of the moving hand [m] that are put on them."""
+    axis: Float[np.ndarray, "K 3"]
+    """Unit direction in which the moving hand backs off; the same for all beats of one interaction."""
+
+    def directions(self, beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
+        """Unit directions (T, 3) in which the moving hand backs off."""
+        directions: NDArray[np.float64] = self.axis[beats.astype(int)]
+        return directions
+
+    def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
+        tilts = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
+        rotations = tilts @ self.rotation[beats.astype(int)]
+        anchors = np.einsum("tij,tj->ti", rotations, at_beats(self.anchors, beats))
+        return rotations, at_beats(self.targets, beats) - anchors
+
+
+def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
+    """Values between keys, `beats` counting keys from 0."""
+    low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
+    share = (beats - low)[:, None]
+    values: NDArray[np.float64] = keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low])
+    return values
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise an `ArgumentError` that lists the valid names when one is unknown, or when there is none."""
+    if not names:
+        raise ArgumentError(f"no interactions were named; valid names: {', '.join(INTERACTIONS)}")
+    for name in names:
+        check_choice(name, INTERACTIONS, noun="interaction")
+
+
+def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
+    """One of the variants of an interaction, chosen at random."""
+    variants = package_data("poses", "interactions")["interactions"][name]
+    variant: dict[str, Any] = variants[rng.integers(len(variants))]
+    return variant
+
+
+class Sketch(NamedTuple):
+    """The random part of an interaction's beats, before hands give it their size."""
+
+    variant: dict[str, Any]
+    """Its description, from `draw_variant`."""
+    still: _FingerSketch
+    moving: _FingerSketch
+    targets: Float[np.ndarray, "K 3"]
+    """Points of the still hand [hand lengths]."""
+    tilts: Float[np.ndarray, "K 3"]
+    """Rotation of the moving hand [rad]."""
+
+
+class _FingerSketch(NamedTuple):
+    """Fingers of one hand (K, ...), not valid yet."""
+
+    opened: NDArray[np.float64]
+    closed: NDArray[np.float64]
+    wander: NDArray[np.float64]
+    """Change of the open fingers from beat to beat [rad]."""
+    strength: NDArray[np.float64]
+
+
+def sketch_meeting(
+    variant: dict[str, Any], count: int, *, together: bool, rng: np.random.Generator
+) -> Sketch:
+    """Random positions, orientations and fingers for `count` beats.
+
+    Args:
+        variant: Its description, from `draw_variant`.
+        count: Number of beats, K.
+        together: Whether beats belong to one meeting, and so resemble each other, or are independent.
+    """
+    noise = _Noise(count, together, rng)
+    still, moving = (
+        _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
+    )
+    targets = np.tile(variant["target"], (count, 1))
+    targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _offsets(variant, count, rng)
+    return Sketch(variant, still, moving, targets, noise.around(np.deg2rad(variant["tilt"]), 0.3))
+
+
+def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Meeting:
+    """The beats of all sketches, one sketch after another, with valid fingers of these hands.
+
+    Args:
+        sketches: What was drawn, from `sketch_meeting`.
+        still: The hand that holds still.
+        moving: The other hand, of the other side.
+    """
+    mirror = np.eye(3) if still.shape.side == "right" else MIRROR
+    counts = [len(sketch.targets) for sketch in sketches]
+    fingers = _valid_fingers(moving, [sketch.moving for sketch in sketches])
+    opened = np.split(fingers.opened, np.cumsum(counts)[:-1])
+    tilts = np.concatenate([sketch.tilts for sketch in sketches])[:, ::-1]
+    rotation = [euler_matrix(np.deg2rad(sketch.variant["rotation"])) for sketch in sketches]
+    axis = np.array([sketch.variant["axis"] for sketch in sketches], dtype=np.float64) @ mirror
+    return Meeting(
+        still=_valid_fingers(still, [sketch.still for sketch in sketches]),
+        moving=fingers,
+        rotations=-tilts @ mirror if still.shape.side == "left" else tilts,
+        rotation=np.repeat(mirror @ np.array(rotation) @ mirror, counts, axis=0),
+        targets=still.shape.length * np.concatenate([sketch.targets for sketch in sketches]) @ mirror,
+        anchors=np.concatenate(
+            [
+                _anchors(sketch.variant["anchor"], moving, part)
+                for sketch, part in zip(sketches, opened, strict=True)
+            ]
+        ),
+        axis=np.repeat(axis / np.linalg.norm(axis, axis=1, keepdims=True), counts, axis=0),
+    )
+
+
+class _Noise:
+    """Gaussian noise with a part that all beats share, clipped at two standard deviations."""
+
+    def __init__(self, count: int, together: bool, rng: np.random.Generator) -> None:
+        self.count, self.together, self.rng = count, together, rng
+
+    def around(
+        self, scale: NDArray[np.float64], wander: float, *, common: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Noise (K, n): `common` standard deviations `scale` (n,) that last, `wander` new at each beat."""
+        size = (self.count, len(scale))
+        lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
+        new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
+        return scale * (common * lasting + wander * new)
+
+
+def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Offsets (K, 2) of the beats from the middle one, in hand lengths."""
+    reach = np.array(variant["place"])
+    if variant["pattern"] == "random":
+        return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
+    side = (-1.0) ** np.arange(count)[:, None]
+    direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
+    offsets: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
+    return offsets
+
+
+def _sketch_fingers(
+    role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
+) -> _FingerSketch:
+    weaker = rng.random((noise.count, len(DIGITS))) < relaxing
+    strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
+    opened = _angles(role["open"]) + noise.around(_NOISE, 0.0)
+    closed = _angles(role["closed"]) + noise.around(_NOISE, 0.0)
+    return _FingerSketch(opened, closed, _WANDER * noise.around(_NOISE, 1.0, common=0.0), strength)
+
+
+def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
+    """The fingers of all sketches, one after another, none in another's way."""
+    opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
+    # Poses with deep contact come a little nearer to rest, because fingers need room.
+    angles = make_valid(model, np.clip(opened, LOW, HIGH))
+    hard = ~is_valid(model, angles, max_penetration=_SNUG)
+    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
+    lasting = angles
+    wandering = np.clip(lasting + wander, LOW, HIGH)
+    valid = is_valid(model, wandering, max_penetration=_SNUG)
+    return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
+
+
+def _angles(name: str) -> NDArray[np.float64]:
+    """Joint angles [rad] of a gesture, or of a hand pose of this data file alone."""
+    if name in gesture_names():
+        return gesture(name)
+    return np.deg2rad(np.ravel(package_data("poses", "interactions")["hands"][name]))
+
+
+def _anchors(
+    anchor: str | list[float], moving: HandModel, opened: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (K, 3) of the moving hand in its wrist frame [m]."""
+    if isinstance(anchor, str):
+        bone = bones_of(anchor)[-1]
+        frames = moving.forward_kinematics(join_qpos(opened))[:, bone]
+        tips: NDArray[np.float64] = frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0]
+        return tips
+    mirror = MIRROR if moving.shape.side == "left" else np.eye(3)
+    return np.tile(moving.shape.length * np.array(anchor) @ mirror, (len(opened), 1))
+
+
+_CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
+_FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
+_PARTED: Final = (0.08, 0.16)  # how far the hands are moved apart along the axis before and after [m]
+# Single poses: how many touch, how far the others are apart at most [m], how many fingers are half closed.
+_TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
+
+
+class _Course(NamedTuple):
+    """The course of a meeting, each array (T,)."""
+
+    beats: NDArray[np.float64]
+    """Position among the beats, which count from 0."""
+    lift: NDArray[np.float64]
+    """Distance of the hands from touching [m]."""
+    grip: NDArray[np.float64]
+    """Share of their strength with which fingers close."""
+
+
+def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random.Generator) -> Passage | None:
+    """One interaction from coming together to letting go; None when this draw is not valid.
+
+    Args:
+        name: One of `INTERACTIONS`.
+    """
+    still, moving = (right, left) if rng.random() < 0.5 else (left, right)
+    variant = draw_variant(name, rng=rng)
+    count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
+    sketches = [
+        sketch_meeting(variant, count, together=True, rng=rng) for _ in range(variant.get("tries", 1))
+    ]
+    draws = [meet([sketch], still, moving) for sketch in sketches]
+    meeting = min(draws, key=lambda draw: float(_contact_distance(still, moving, draw, np.zeros(1))[0]))
+    course = _course(variant, count, rng)
+    distance = _contact_distance(still, moving, meeting, course.beats)
+    if (distance <= NEAREST).any():
+        return None
+    passage = _close_contact(still, moving, meeting, course, distance=distance, rate=RATE)
+    if _too_fast(passage) or not valid_frames(right, left, passage).all():
+        return None
+    return passage
+
+
+def draw_poses(
+    right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
+) -> Passage:
+    """Valid single poses of several interactions, the roles drawn once for each.
+
+    Args:
+        counts: Names out of `INTERACTIONS`, each with a number of poses to draw; those that are not valid are
+            left out.
+    """
+    draws = [_draw(name, count, rng) for name, count in counts]
+    order = np.argsort([draw.left_still for draw in draws], kind="stable")
+    passages, valid = [], []
+    for left_still, still, moving in ((False, right, left), (True, left, right)):
+        drawn = [draws[number] for number in order if draws[number].left_still == left_still]
+        if not drawn:
+            continue
+        meeting = meet([draw.sketch for draw in drawn], still, moving)
+        distance = _contact_distance(still, moving, meeting, np.arange(float(len(meeting.axis))))
+        best = _nearest_tries(drawn, distance)
+        course = _Course(
+            best.astype(float), *(np.concatenate([draw[part] for draw in drawn]) for part in (2, 3))
+        )
+        passages.append(_close_contact(still, moving, meeting, course, distance=distance[best], rate=None))
+        valid.append((distance[best] > NEAREST) & valid_frames(right, left, passages[-1]))
+    sizes = [len(draws[number].lift) for number in order]
+    as_drawn = np.argsort(np.repeat(order, sizes), kind="stable")
+    return join_passages(passages).at(as_drawn[np.concatenate(valid)[as_drawn]])
+
+
+class _Draw(NamedTuple):
+    """Single poses of one interaction, before hands give them their size."""
+
+    left_still: bool
+    """Whether the left hand holds still."""
+    sketch: Sketch
+    """The poses, each tried a few times."""
+    lift: NDArray[np.float64]
+    """Distance of the hands from touching (N,) [m]."""
+    grip: NDArray[np.float64]
+    """Share of their strength with which fingers close (N,)."""
+
+
+def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
+    left_still = not rng.random() < 0.5
+    variant = draw_variant(name, rng=rng)
+    sketch = sketch_meeting(variant, count * variant.get("tries", 1), together=False, rng=rng)
+    lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
+    grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
+    return _Draw(left_still, sketch, lift, grip)
+
+
+def _nearest_tries(draws: Sequence[_Draw], distance: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The beat of each pose's try whose hands come nearest to each other."""
+    best, begin = [], 0
+    for draw in draws:
+        count, beats = len(draw.lift), len(draw.sketch.targets)
+        tries = distance[begin : begin + beats].reshape(count, -1)
+        best.append(begin + tries.shape[1] * np.arange(count) + tries.argmin(axis=1))
+        begin += beats
+    return np.concatenate(best)
+
+
+def _contact_distance(
+    still: HandModel, moving: HandModel, meeting: Meeting, beats: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance (T,) [m] that the moving hand must back off with open fingers."""
+    return first_contact(
+        still,
+        join_qpos(meeting.still.at(beats).opened),
+        moving,
+        placed_qpos(meeting.moving.at(beats).opened, *meeting.placement(beats)),
+        meeting.directions(beats),
+    )
+
+
+def _close_contact(
+    still: HandModel,
+    moving: HandModel,
+    meeting: Meeting,
+    course: _Course,
+    *,
+    distance: NDArray[np.float64],
+    rate: float | None,
+) -> Passage:
+    """Hands brought into contact with their fingers closed; smoothed in time if there is a rate."""
+    contact_window, finger_window = (
+        1 if rate is None else 2 * int(window * rate / 2) + 1 for window in (_CONTACT_WINDOW, _FINGER_WINDOW)
+    )
+    rotation, position = meeting.placement(course.beats)
+    back = smooth_above(distance, contact_window) + course.lift
+    position = position + back[:, None] * meeting.directions(course.beats)
+    fingers = meeting.still.at(course.beats), meeting.moving.at(course.beats)
+    still_qpos, moving_qpos = join_qpos(fingers[0].opened), placed_qpos(fingers[1].opened, rotation, position)
+    strength = [each.strength * course.grip[:, None] for each in fingers]
+    still_qpos[:, 7:] = close_fingers(
+        still,
+        still_qpos,
+        fingers[0].closed,
+        strength[0],
+        other=moving,
+        other_qpos=moving_qpos,
+        window=finger_window,
+    )
+    moving_qpos[:, 7:] = close_fingers(
+        moving,
+        moving_qpos,
+        fingers[1].closed,
+        strength[1],
+        other=still,
+        other_qpos=still_qpos,
+        window=finger_window,
+    )
+    if still.shape.side == "right":
+        return Passage(rotation, position, still_qpos[:, 7:], moving_qpos[:, 7:])
+    back = np.swapaxes(rotation, 1, 2)
+    return Passage(back, -np.einsum("tij,tj->ti", back, position), moving_qpos[:, 7:], still_qpos[:, 7:])
+
+
+def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
+    """The course of a meeting: come together, stay and move `count` times, let go."""
+    ends = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
+    # Fingers close after the hands met, and open before they part.
+    grips = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
+    tempo = rng.random(2)
+    beats, lift = [np.zeros(ends[0] + grips[0])], [1.0 - minimum_jerk(ends[0]), np.zeros(grips[0])]
+    lift[0] = rng.uniform(*_PARTED) * lift[0]
+    for beat in range(count):
+        stay, move = (
+            int((low + share * (high - low)) * rng.uniform(0.9, 1.1) * RATE) + 1
+            for (low, high), share in zip((variant["stay"], variant["move"]), tempo, strict=True)
+        )
+        beats.append(np.full(stay, float(beat)))
+        lift.append(np.zeros(stay))
+        if beat < count - 1:
+            time = np.arange(1, move + 1) / move
+            height = min(rng.uniform(*variant["lift"]), move / RATE * WRIST_SPEED)
+            beats.append(beat + minimum_jerk(move))
+            lift.append(height * 64.0 * (time * (1.0 - time)) ** 3)
+    beats.append(np.full(ends[1] + grips[1], count - 1.0))
+    lift += [np.zeros(grips[1]), rng.uniform(*_PARTED) * minimum_jerk(ends[1])]
+    grip = np.ones(sum(map(len, beats)))
+    grip[: sum(map(len, lift[:2]))] = np.concatenate([np.zeros(ends[0]), minimum_jerk(grips[0])])
+    grip[len(grip) - ends[1] - grips[1] :] = np.concatenate([1.0 - minimum_jerk(grips[1]), np.zeros(ends[1])])
+    return _Course(np.concatenate(beats), np.concatenate(lift), grip)
+
+
+def _too_fast(passage: Passage) -> bool:
+    """Whether a joint exceeds the limits of speed or acceleration."""
+    angles = np.concatenate([passage.right, passage.left], axis=1)
+    speeds = np.diff(angles, axis=0) * RATE
+    accelerations = np.diff(speeds, axis=0) * RATE
+    return bool(np.abs(speeds).max() > MAX_SPEED or np.abs(accelerations).max() > MAX_ACCELERATION)
+
+
+PAUSE: Final = (0.0, 0.6)
+"""Shortest and longest rest between two meetings [s]."""
+_TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
+_ROTATION: Final = 0.5  # spread of the rotation between two positions [rad]
+_MOST_DRAWS: Final = 60
+_MOST_PATHS: Final = 10
+
+
+def two_hands_penetration(
+    right: HandModel,
+    left: HandModel,
+    right_qpos: Float[np.ndarray, "T 27"],
+    left_qpos: Float[np.ndarray, "T 27"],
+) -> Float[np.ndarray, "T"]:
+    """Deepest overlap of any capsule of one hand with any of the other [m]; 0 where they do not touch."""
+    overlap = overlap_between(
+        right.capsules,
+        right.forward_kinematics(right_qpos),
+        left.capsules,
+        left.forward_kinematics(left_qpos),
+    )
+    depth: NDArray[np.float64] = np.maximum(overlap, 0.0)
+    return depth
+
+
+def sample_two_hand_motion(
+    right: HandModel,
+    left: HandModel,
+    duration: float,
+    *,
+    pause: tuple[float, float] = PAUSE,
+    interactions: Sequence[str] | None = None,
+    rng: np.random.Generator,
+) -> tuple[HandMotion, HandMotion]:
+    """Random smooth motion of two hands through a series of interactions, valid at every frame.
+
+    It has `round(duration * RATE) + 1` frames, and the interactions are all of `INTERACTIONS` when not given.
+    Between two meetings hands rest apart for a time from shortest to longest pause [s]. The left hand may be
+    another person's.
+
+    Raises:
+        ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
+            and a left one.
+        PoseError: No valid path that brings them together was found.
+    """
+    names = INTERACTIONS if interactions is None else tuple(interactions)
+    check_names(names)
+    _check_sides(right, left)
+    if not 0.0 < duration < np.inf:
+        raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
+    frames = round(duration * RATE) + 1
+    passages = _next_passages(right, left, None, names, pause, rng=rng)
+    while sum(map(len, passages)) < frames:
+        passages += _next_passages(right, left, passages[-1].at([-1]), names, pause, rng=rng)
+    whole = join_passages(passages).at(slice(frames))
+    right_qpos, left_qpos = _in_world(whole, *_travel(frames, rng))
+    return HandMotion(right_qpos, RATE), HandMotion(left_qpos, RATE)
+
+
+def sample_two_hand_poses(
+    right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
+    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid.
+
+    Raises:
+        ArgumentError: The count is not positive, or the hands are not a right and a left one.
+        PoseError: No valid poses were found.
+    """
+    _check_sides(right, left)
+    if count < 1:
+        raise ArgumentError(f"the count of poses is {count}, expected a positive number")
+    passages: list[Passage] = []
+    missing = count
+    for _ in range(_MOST_DRAWS):
+        # Each name twice, since roles are drawn once per batch; more than needed, since some will fail.
+        batches = rng.multinomial(
+            missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
+        )
+        counts = [(name, int(n)) for name, n in zip(2 * INTERACTIONS, batches, strict=True) if n]
+        passages.append(draw_poses(right, left, counts, rng=rng))
+        missing = count - sum(map(len, passages))
+        if missing <= 0:
+            whole = join_passages(passages)
+            whole = whole.at(rng.permutation(len(whole))[:count])
+            positions = ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=(count, 3))
+            return _in_world(whole, positions, Rotation.from_quat(random_quaternions(count, rng=rng)))
+    raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
+
+
+def _next_passages(
+    right: HandModel,
+    left: HandModel,
+    last: Passage | None,
+    names: tuple[str, ...],
+    pause: tuple[float, float],
+    *,
+    rng: np.random.Generator,
+) -> list[Passage]:
+    """The path from the last frame to a meeting, and the meeting."""
+    name = names[rng.integers(len(names))]
+    for _ in range(_MOST_DRAWS):
+        meeting = play_meeting(right, left, name, rng=rng)
+        if meeting is None:
+            continue
+        if last is None:
+            return [meeting]
+        for _ in range(_MOST_PATHS):
+            path = path_between(right, left, last, meeting.at([0]), pause, rng=rng)
+            if path is not None:
+                return [path, meeting]
+    raise PoseError(f"no valid path was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+
+
+def _travel(frames: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], Rotation]:
+    """Positions (T, 3) and orientations of a pair of hands that moves from position to position."""
+    positions = [ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3)]
+    orientations, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
+    while sum(map(len, shares)) < frames:
+        positions.append(ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3))
+        orientations.append(orientations[-1] * Rotation.from_rotvec(rng.normal(scale=_ROTATION, size=3)))
+        distance = float(np.linalg.norm(positions[-1] - positions[-2]))
+        seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / WRIST_SPEED)
+        shares.append(len(positions) - 2 + minimum_jerk(int(np.ceil(seconds * RATE))))
+    return along(np.array(positions), Rotation.concatenate(orientations), np.concatenate(shares)[:frames])
+
+
+def _in_world(
+    whole: Passage, middle: NDArray[np.float64], orientations: Rotation
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both hands' qpos from the middle of their wrists and the right one's orientation."""
+    across = orientations.apply(whole.position) / 2
+    rotations = orientations.as_matrix()
+    return (
+        join_qpos(whole.right, position=middle - across, quaternion=rotation_quaternions(rotations)),
+        join_qpos(
+            whole.left,
+            position=middle + across,
+            quaternion=rotation_quaternions(rotations @ whole.rotation),
+        ),
+    )
+
+
+def _check_sides(right: HandModel, left: HandModel) -> None:
+    sides = right.shape.side, left.shape.side
+    if sides != ("right", "left"):
+        raise ArgumentError(
+            f"the hands are a {sides[0]} and a {sides[1]} one, expected a right and a left one"
+        )

@@ -1,0 +1,253 @@
+"""What is sent of a tracked frame: names that never change, numbers that do, and both as documents.
+
+Every outgoing message is made here, by `MessageEncoder`; docs/live_output.md describes the documents.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gloves.fit import GloveFit
+from gloves.takes.points import Status
+from gloves.takes.take import label_names
+from handsim import __version__
+from handsim._plugins import import_extra
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import JOINT_NAMES, Side
+from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedFrame, TrackedHand
+from track.streams.frame_source import StreamedFrame
+
+SCHEMA: Final = 1
+"""Version of what is sent; a receiver that knows it knows every later message of the same version."""
+FORMATS: Final = ("json", "msgpack")
+_DECIMALS: Final = 6  # micrometers and microradians
+
+
+@dataclass(frozen=True, slots=True)
+class LiveHeader:
+    """The names of the numbers in every message of a stream."""
+
+    sides: tuple[Side, ...]
+    """The hands in their order."""
+    angles: tuple[str, ...]
+    """The joint angles."""
+    positions: tuple[str, ...]
+    """The joint positions: the wrist, and the joints and the tip of each digit."""
+    bodies: tuple[str, ...]
+    """The rigid bodies in their order."""
+    markers: tuple[str, ...]
+    """What a point's label counts through: `right:ThumbTip`, ..., the hands' markers before the bodies'."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveHand:
+    """One hand; all numbers are NaN where it has no pose."""
+
+    side: Side
+    status: Status
+    position: Float[np.ndarray, "3"]
+    """Wrist position in the world [m]."""
+    quaternion: Float[np.ndarray, "4"]
+    """Wrist orientation in the world, wxyz."""
+    angles: Float[np.ndarray, "20"]
+    """Joint angles [rad]."""
+    positions: Float[np.ndarray, "21 3"]
+    """Joint positions in the world [m]."""
+    angle_spread: Float[np.ndarray, "20"]
+    """Standard deviation of each joint angle [rad]."""
+    position_spread: Float[np.ndarray, "21"]
+    """Standard deviation of each joint position in each direction [m]."""
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether there is a pose."""
+        return self.status is not Status.LOST
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveBody:
+    """One rigid body; all numbers are NaN where it is lost."""
+
+    name: str
+    status: Status
+    position: Float[np.ndarray, "3"]
+    """Position in the world [m]."""
+    quaternion: Float[np.ndarray, "4"]
+    """Orientation in the world, wxyz."""
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether there is a pose."""
+        return self.status is not Status.LOST
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveMessage:
+    """A tracked frame as it is sent."""
+
+    header: LiveHeader
+    """The same object in every message of a stream."""
+    number: int
+    """The frame's number; those of a stream may have gaps and may start again."""
+    time: float
+    """Time of the frame [s]; never runs back."""
+    silent: bool
+    """No frame arrives; this message says what has become of the hands until now."""
+    hands: tuple[LiveHand, ...]
+    bodies: tuple[LiveBody, ...]
+    points: Float[np.ndarray, "N 3"]
+    """All points of the frame [m]."""
+    labels: Int[np.ndarray, "N"]
+    """Marker of each point, an index into `header.markers`; -1 for none."""
+    lag: float
+    """Time from the frame's arrival on this machine to this message [s]; NaN where it did not come live."""
+
+
+class LiveSink(Protocol):
+    """Takes messages somewhere; a class of the user's own for `handsim track --send module:name`.
+
+    The tracker calls both methods and waits for them, so `send` must not wait itself. A sink that raises is
+    closed with a warning, and tracking goes on without it.
+    """
+
+    def send(self, message: LiveMessage) -> None:
+        """Take a message: positions in [m], angles in [rad]."""
+        ...
+
+    def close(self) -> None:
+        """No further message comes."""
+        ...
+
+
+class MessageEncoder:
+    """Makes messages of the frames of one tracker."""
+
+    def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
+        self._models = [hand.model for hand in hands]
+        self.header = LiveHeader(
+            tuple(hand.side for hand in hands),
+            JOINT_NAMES,
+            KEYPOINT_NAMES,
+            tuple(body.name for body in bodies),
+            label_names(hands, bodies),
+        )
+        """The names in its messages."""
+
+    def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
+        """The message of a frame, which has the tracker's time."""
+        return LiveMessage(
+            header=self.header,
+            number=frame.number,
+            time=frame.time,
+            silent=frame.silent,
+            hands=tuple(self._hand(number, hand) for number, hand in enumerate(tracked.hands)),
+            bodies=tuple(
+                LiveBody(one.name, one.status, one.translation, one.rotation) for one in tracked.bodies
+            ),
+            points=frame.points,
+            labels=tracked.labels,
+            lag=monotonic() - frame.arrived,
+        )
+
+    def _hand(self, number: int, hand: TrackedHand) -> LiveHand:
+        positions = np.full((len(KEYPOINT_NAMES), 3), np.nan)
+        if hand.has_pose:
+            positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
+        wrist, angles = (hand.qpos[:3], hand.qpos[3:7]), hand.qpos[7:]
+        spreads = hand.angle_spread, hand.keypoint_spread
+        return LiveHand(hand.side, hand.status, *wrist, angles, positions, *spreads)
+
+
+class MessageFormat(NamedTuple):
+    """How messages become bytes."""
+
+    header: Callable[[LiveHeader], bytes]
+    frame: Callable[[LiveMessage], bytes]
+    is_text: bool = False
+
+
+def document_format(name: str, *, points: bool = False) -> MessageFormat:
+    """Messages as documents, with all points and their labels if `points`.
+
+    Raises:
+        ArgumentError: The format, one of `FORMATS`, needs a package that is not installed.
+    """
+    encode: Callable[[dict[str, Any]], bytes] = _encode_json
+    if name == "msgpack":
+        packer: Callable[[], Any] = import_extra("msgpack", f"format={name}", "send").Packer
+        encode = packer().pack
+    return MessageFormat(
+        lambda header: encode(header_document(header)),
+        lambda message: encode(frame_document(message, points=points)),
+        is_text=name == "json",
+    )
+
+
+def header_document(header: LiveHeader) -> dict[str, Any]:
+    """The header: names and units of everything that the frames hold."""
+    return {
+        "type": "header",
+        "schema": SCHEMA,
+        "source": f"handsim {__version__}",
+        "units": {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"},
+        "sides": list(header.sides),
+        "angles": list(header.angles),
+        "positions": list(header.positions),
+        "bodies": list(header.bodies),
+        "markers": list(header.markers),
+    }
+
+
+def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, Any]:
+    """A frame: what is NaN in the message is null here."""
+    document = {
+        "type": "frame",
+        "schema": SCHEMA,
+        "number": int(message.number),
+        "time": float(message.time),
+        "silent": message.silent,
+        "lag": None if math.isnan(message.lag) else round(message.lag, _DECIMALS),
+        "hands": [_hand_document(hand) for hand in message.hands],
+        "bodies": [
+            {"name": body.name, "status": str(body.status), "pose": _pose(body)} for body in message.bodies
+        ],
+    }
+    if points:
+        document |= {"points": _rounded(message.points), "labels": message.labels.tolist()}
+    return document
+
+
+def _encode_json(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _hand_document(hand: LiveHand) -> dict[str, Any]:
+    return {
+        "side": hand.side,
+        "status": str(hand.status),
+        "wrist": _pose(hand),
+        "angles": _rounded(hand.angles) if hand.has_pose else None,
+        "positions": _rounded(hand.positions) if hand.has_pose else None,
+        "angle_spread": None if np.isnan(hand.angle_spread).any() else _rounded(hand.angle_spread),
+        "position_spread": None if np.isnan(hand.position_spread).any() else _rounded(hand.position_spread),
+    }
+
+
+def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
+    if not thing.has_pose:
+        return None
+    return {"position": _rounded(thing.position), "quaternion": _rounded(thing.quaternion)}
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> Any:
+    """Numbers of a document, as lists."""
+    return np.round(values, _DECIMALS).tolist()

@@ -1,0 +1,526 @@
+"""Live output: sinks take tracked frames to other programs as they are made.
+
+An address names a sink: `osc://host:port`, `udp://host:port`, `ws://:8765`, `lsl:NAME` or `module:name`. Each
+frame goes to all of them, and none that fails stops the tracker.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import math
+import re
+import socket
+import threading
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from gloves.takes.points import Status
+from handsim._checks import check_type
+from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
+from handsim.errors import ArgumentError, HandSimWarning
+from track.bodies.rigid_body import RigidTemplate
+from track.frames import TrackedFrame
+from track.live_message import (
+    FORMATS,
+    SCHEMA,
+    LiveHeader,
+    LiveMessage,
+    LiveSink,
+    MessageEncoder,
+    MessageFormat,
+    document_format,
+)
+from track.streams import split_address
+from track.streams.frame_source import StreamedFrame
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+VALID: Final = ("osc://host:port", "udp://host:port", "ws://host:port", "lsl:NAME", "module:name")
+"""What an address may be."""
+GROUP: Final = "handsim.sinks"
+"""Entry points of packages that bring sinks."""
+STATUSES: Final = tuple(reversed(Status))
+"""The value of a status channel of LSL is an index into these."""
+_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # options of an address
+_RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an address of OSC
+_MOST_NUMBER: Final = 0x7FFFFFFF  # of OSC
+_HEADERS: Final = 1.0  # [s] between two headers, for those who begin to listen later
+_WAITING: Final = 256  # frames that may wait for a client
+_SEND_BUFFER: Final = 1 << 17  # bytes that the system holds for a client, older than those that wait
+_LARGEST: Final = 1 << 10  # bytes of a message of a client, which is not read
+_FLUSH: Final = 1.0  # [s] for clients to take what waits at the end
+_OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
+"""Pages of this machine; without this rule any page in its browser could read along."""
+_AXES: Final = ("x", "y", "z")
+_POSE: Final = (*[(f"position_{axis}", "meters") for axis in _AXES], *[(f"rotation_{c}", "") for c in "wxyz"])
+
+_Content = tuple[str, str, Sequence[Any]]
+"""Address, types and values of an OSC message."""
+
+
+class SinkGroup(Closing):
+    """Sends frames to sinks; the end of a `with` block closes them.
+
+    Args:
+        sinks: The sinks by the addresses that opened them.
+    """
+
+    def __init__(self, sinks: Mapping[str, LiveSink]) -> None:
+        self._sinks, self._all = dict(sinks), dict(sinks)
+        self._encoder: MessageEncoder | None = None
+        self._sent = 0
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._sinks)
+
+    def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
+        """Take on a tracker's hands and bodies; nothing is sent before."""
+        self._encoder = MessageEncoder(hands, bodies)
+
+    def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Send a frame to every sink."""
+        if self._encoder is None or not self._sinks:
+            return
+        message = self._encoder.encode(frame, tracked)
+        self._sent += 1
+        for address, sink in list(self._sinks.items()):
+            try:
+                sink.send(message)
+            except Exception as error:  # of the user's code: any; the recording goes on
+                _warn(f"{address} failed and gets no further frame", error)
+                self._close(address)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames that each sink has dropped, by its address."""
+        return {address: getattr(sink, "dropped", 0) for address, sink in self._all.items()}
+
+    def notes(self) -> tuple[str, ...]:
+        """What to print at the end, one line each."""
+        told = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
+        told += [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
+        return tuple(told)
+
+    def close(self) -> None:
+        """Close all sinks."""
+        for address in list(self._sinks):
+            self._close(address)
+
+    def _close(self, address: str) -> None:
+        try:
+            self._sinks.pop(address).close()
+        except Exception as error:  # of the user's code: any
+            _warn(f"{address} could not be closed", error)
+
+
+def _warn(what: str, error: Exception) -> None:
+    warnings.warn(f"{what} ({type(error).__name__}: {error})", HandSimWarning, stacklevel=4)
+
+
+def open_sinks(addresses: str | Sequence[str]) -> SinkGroup:
+    """Open a sink for each address, which gets positions in [m] and angles in [rad].
+
+    Args:
+        addresses: One, or several, each as in `VALID`; `udp://` and `ws://` take `?format=json`,
+            `?format=msgpack` and `?points=yes`.
+
+    Raises:
+        ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
+    """
+    addresses = (addresses,) if isinstance(addresses, str) else addresses
+    check_type("addresses", addresses, Sequence, f"a list of {', '.join(VALID)}")
+    sinks: dict[str, LiveSink] = {}
+    with ExitStack() as stack:
+        for address in addresses:
+            if address in sinks:
+                raise ArgumentError(f"--send {address} is given twice, expected once")
+            sinks[address] = open_sink(address)
+            stack.callback(sinks[address].close)
+        stack.pop_all()
+    return SinkGroup(sinks)
+
+
+def open_sink(address: str) -> LiveSink:
+    """Open the sink that an address names, see `open_sinks`."""
+    scheme, _, rest = address.partition(":")
+    if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
+        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS)
+        if scheme != "ws" and parts.port == 0:
+            raise ArgumentError(f"'{address}' is not an address, expected a port from 1 to 65535")
+        if scheme == "osc":
+            return DatagramSink(parts.host, parts.port, osc_format())
+        format = document_format(parts.options["format"], points=parts.options["points"] == "yes")
+        kind: Callable[..., LiveSink] = WebSocketSink if scheme == "ws" else DatagramSink
+        return kind(parts.host, parts.port, format)
+    if scheme == "lsl" and rest and not rest.startswith("//"):
+        return LabStreamingSink(rest)
+    name = address.partition("?")[0]
+    if not (is_plugin(name) or name in list_plugins(GROUP)):
+        raise ArgumentError(f"'{address}' is not an address to send to, expected {', '.join(VALID)}")
+    sink: Any = make_plugin(address, group=GROUP, noun="sink")
+    for method in ("send", "close"):
+        if not callable(getattr(sink, method, None)):
+            raise ArgumentError(
+                f"{address} has no method {method}, expected the methods send and close of a sink"
+            )
+    made: LiveSink = sink
+    return made
+
+
+class DatagramSink:
+    """Sends each frame as one UDP datagram, and the header every second.
+
+    It never waits: what the network does not take is dropped and counted.
+
+    Raises:
+        ArgumentError: The host is unknown.
+    """
+
+    def __init__(self, host: str, port: int, format: MessageFormat) -> None:
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(family, kind)
+        except OSError as error:
+            raise ArgumentError(f"host '{host}' cannot be sent to ({error.strerror or error})") from error
+        self._socket.setblocking(False)
+        self._address, self._format, self._due = address, format, 0.0
+        self.dropped = 0
+        """Number of datagrams that were not sent."""
+
+    def send(self, message: LiveMessage) -> None:
+        """Send a frame, and before it the header when that is due."""
+        now = time.monotonic()
+        if now >= self._due:
+            self._due = now + _HEADERS
+            self._put(self._format.header(message.header))
+        self._put(self._format.frame(message))
+
+    def close(self) -> None:
+        """Send nothing more."""
+        self._socket.close()
+
+    def _put(self, datagram: bytes) -> None:
+        try:
+            self._socket.sendto(datagram, self._address)
+        except OSError:  # the buffer is full, the network is down, or it is too large for a datagram
+            self.dropped += 1
+
+
+def osc_format() -> MessageFormat:
+    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md has the addresses.
+
+    Raises:
+        ArgumentError: The package python-osc is missing.
+    """
+    messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
+    bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
+
+    def bundle(contents: Iterable[_Content]) -> bytes:
+        made = bundles.OscBundleBuilder(bundles.IMMEDIATELY)
+        for address, types, values in contents:
+            message = messages.OscMessageBuilder(address)
+            for kind, value in zip(types, values, strict=True):
+                message.add_arg(value, kind)
+            made.add_content(message.build())
+        datagram: bytes = made.build().dgram
+        return datagram
+
+    return MessageFormat(
+        lambda header: bundle(_osc_header(header)), lambda message: bundle(_osc_frame(message))
+    )
+
+
+def _osc_header(header: LiveHeader) -> Iterator[_Content]:
+    """The names in the order of the numbers."""
+    yield "/handsim/schema", "i", [SCHEMA]
+    yield _strings("/handsim/sides", header.sides)
+    yield _strings("/handsim/angles", header.angles)
+    yield _strings("/handsim/positions", header.positions)
+    yield _strings("/handsim/bodies", [_part(name) for name in header.bodies])
+
+
+def _osc_frame(message: LiveMessage) -> Iterator[_Content]:
+    """A frame; of a hand or a body without a pose only the status."""
+    yield "/handsim/frame", "idi", [message.number & _MOST_NUMBER, message.time, int(message.silent)]
+    if not math.isnan(message.lag):
+        yield "/handsim/lag", "f", [message.lag]
+    for hand in message.hands:
+        address = f"/handsim/{hand.side}"
+        yield _strings(f"{address}/status", [str(hand.status)])
+        if hand.has_pose:
+            yield _floats(f"{address}/wrist", hand.position, hand.quaternion)
+            yield _floats(f"{address}/angles", hand.angles)
+            yield _floats(f"{address}/positions", hand.positions.ravel())
+    for body in message.bodies:
+        address = f"/handsim/body/{_part(body.name)}"
+        yield _strings(f"{address}/status", [str(body.status)])
+        if body.has_pose:
+            yield _floats(f"{address}/pose", body.position, body.quaternion)
+
+
+def _part(name: str) -> str:
+    """A name as a part of an address."""
+    return _RESERVED.sub("_", name)
+
+
+def _floats(address: str, *values: np.ndarray) -> _Content:
+    numbers = np.concatenate(values).tolist()
+    return address, "f" * len(numbers), numbers
+
+
+def _strings(address: str, values: Sequence[str]) -> _Content:
+    return address, "s" * len(values), values
+
+
+class Channel(NamedTuple):
+    """One number of a sample of LSL."""
+
+    label: str
+    unit: str
+    kind: str
+
+
+class LabStreamingSink:
+    """Pushes a sample per frame into a stream of the Lab Streaming Layer; a number that is missing is NaN.
+
+    Raises:
+        ArgumentError: The package pylsl or its library is missing.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._lsl: Any = import_extra("pylsl", "lsl:", "send")
+        self._name = name
+        self._outlet: Any = None
+
+    def send(self, message: LiveMessage) -> None:
+        """Push a sample; the first one opens the stream, whose channels depend on the hands."""
+        if self._outlet is None:
+            self._outlet = self._open(message.header)
+        self._outlet.push_sample(sample_of(message).tolist())
+
+    def close(self) -> None:
+        """End the stream."""
+        self._outlet = None
+
+    def _open(self, header: LiveHeader) -> Any:
+        channels = list(channels_of(header))
+        info = self._lsl.StreamInfo(
+            self._name,
+            "MoCap",
+            len(channels),
+            self._lsl.IRREGULAR_RATE,
+            self._lsl.cf_double64,
+            f"handsim:{self._name}",  # by which a client finds the stream again after a restart
+        )
+        description = info.desc()
+        description.append_child_value("manufacturer", "handsim")
+        description.append_child_value("schema", str(SCHEMA))
+        description.append_child_value("statuses", " ".join(str(status) for status in STATUSES))
+        listed = description.append_child("channels")
+        for channel in channels:
+            one = listed.append_child("channel")
+            for name, value in zip(("label", "unit", "type"), channel, strict=True):
+                one.append_child_value(name, value)
+        return self._lsl.StreamOutlet(info)
+
+
+def channels_of(header: LiveHeader) -> Iterator[Channel]:
+    """The channels of a stream, in the order of `sample_of`."""
+    yield Channel("frame", "", "FrameNumber")
+    yield Channel("time", "seconds", "Time")
+    for side in header.sides:
+        yield from _pose_channels(f"{side}_status", f"{side}_wrist")
+        for joint in header.angles:
+            yield Channel(f"{side}_{joint}", "radians", "JointAngle")
+        for place in header.positions:
+            for axis in _AXES:
+                yield Channel(f"{side}_{place}_{axis}", "meters", f"Position{axis.upper()}")
+    for body in header.bodies:
+        yield from _pose_channels(f"{body}_status", body)
+    yield Channel("lag", "seconds", "Lag")
+
+
+def _pose_channels(status: str, name: str) -> Iterator[Channel]:
+    """Status, position and orientation; kinds are those of XDF's motion capture: PositionX, OrientationW."""
+    yield Channel(status, "", "Status")
+    for label, unit in _POSE:
+        what, _, axis = label.partition("_")
+        kind = ("Position" if what == "position" else "Orientation") + axis.upper()
+        yield Channel(f"{name}_{label}", unit, kind)
+
+
+def sample_of(message: LiveMessage) -> np.ndarray:
+    """The numbers of a message, one per channel."""
+    parts: list[Any] = [[message.number, message.time]]
+    for hand in message.hands:
+        parts.append([STATUSES.index(hand.status)])
+        parts += [hand.position, hand.quaternion, hand.angles, hand.positions.ravel()]
+    for body in message.bodies:
+        parts += [[STATUSES.index(body.status)], body.position, body.quaternion]
+    parts.append([message.lag])
+    return np.concatenate(parts)
+
+
+class WebSocketSink:
+    """Serves messages to any number of clients from a thread of its own.
+
+    A client gets the header, then every frame from then on; one that reads too slowly loses frames and delays
+    nobody. A loopback address serves pages of this machine and programs that are no browsers; another address
+    serves everybody.
+
+    Args:
+        port: TCP port to listen at; 0 for a free one.
+
+    Raises:
+        ArgumentError: The package websockets is missing, or the port cannot be listened at.
+    """
+
+    def __init__(self, host: str, port: int, format: MessageFormat) -> None:
+        self._serve: Any = import_extra("websockets.asyncio.server", "ws://", "send").serve
+        self._closed_error: Any = import_extra("websockets.exceptions", "ws://", "send").ConnectionClosed
+        self._format, self._socket = format, _listen(host, port)
+        address = self._socket.getsockname()
+        self._origins = [None, _OWN_PAGES] if ipaddress.ip_address(address[0]).is_loopback else None
+        self.port: int = address[1]
+        """The port that it listens at."""
+        self.dropped = 0
+        """Number of frames that were dropped for slow clients."""
+        self._header = b""
+        self._clients: set[_Client] = set()
+        self._loop = asyncio.new_event_loop()
+        self._ending, self._ready = asyncio.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="websocket server", daemon=True)
+        self._thread.start()
+        self._ready.wait()
+
+    @property
+    def num_clients(self) -> int:
+        """Number of clients at this moment."""
+        return len(self._clients)
+
+    def send(self, message: LiveMessage) -> None:
+        """Hand a message over to the clients."""
+        self._header = self._header or self._format.header(message.header)
+        if self._clients:
+            self._loop.call_soon_threadsafe(self._spread, self._format.frame(message))
+
+    def close(self) -> None:
+        """Give clients a second for what they have not read, and disconnect them."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._ending.set)
+            self._thread.join()
+
+    def _spread(self, frame: bytes) -> None:
+        for client in self._clients:
+            self.dropped += client.put(frame)
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._listen_until_the_end())
+        finally:
+            self._loop.close()
+            self._ready.set()
+
+    async def _listen_until_the_end(self) -> None:
+        quiet = logging.getLogger("handsim.websocket")  # what strangers send is not for the user's terminal
+        quiet.setLevel(logging.CRITICAL + 1)
+        server = await self._serve(
+            self._talk,
+            sock=self._socket,
+            origins=self._origins,
+            compression=None,  # costs more time than a local network does
+            max_size=_LARGEST,
+            close_timeout=_FLUSH,
+            logger=quiet,
+        )
+        self._ready.set()
+        await self._ending.wait()
+        await self._flush()
+        server.close()
+        await server.wait_closed()
+
+    async def _flush(self) -> None:
+        """Let clients take what waits, and cut those off that do not: a closing handshake would wait too."""
+        waiting = {asyncio.ensure_future(client.empty.wait()): client for client in self._clients}
+        if waiting:
+            _, late = await asyncio.wait(waiting, timeout=_FLUSH)
+            for one in late:
+                one.cancel()
+                waiting[one].connection.transport.abort()
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        """Send a client everything until it leaves."""
+        client = _Client(connection)
+        self._clients.add(client)
+        sending = asyncio.ensure_future(self._deliver(client))
+        try:
+            with suppress(self._closed_error):
+                while True:
+                    await connection.recv()  # and ignore it: so pongs and the leave are noticed
+        finally:
+            self._clients.discard(client)
+            client.empty.set()
+            sending.cancel()
+
+    async def _deliver(self, client: _Client) -> None:
+        """Send a client the header, and each frame when the one before is on its way."""
+        with suppress(self._closed_error):
+            frame = await client.next()
+            await client.connection.send(self._header, text=self._format.is_text)
+            while True:
+                await client.connection.send(frame, text=self._format.is_text)
+                if not client.frames:
+                    client.empty.set()
+                frame = await client.next()
+
+
+class _Client:
+    """The frames that wait for a client; the oldest is dropped for a new one."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self.connection = connection
+        self.frames: deque[bytes] = deque(maxlen=_WAITING)
+        self._came, self.empty = asyncio.Event(), asyncio.Event()
+        self.empty.set()
+
+    def put(self, frame: bytes) -> bool:
+        """Add a frame; returns whether another was dropped for it."""
+        full = len(self.frames) == _WAITING
+        self.frames.append(frame)
+        self._came.set()
+        self.empty.clear()
+        return full
+
+    async def next(self) -> bytes:
+        """Wait for the next frame."""
+        await self._came.wait()
+        frame = self.frames.popleft()
+        if not self.frames:
+            self._came.clear()
+        return frame
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        one = socket.create_server(address[:2], family=family)
+    except OSError as error:
+        raise ArgumentError(
+            f"port {port} of {host} cannot be listened at ({error.strerror or error}), expected a free port "
+            "of this machine"
+        ) from error
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # of its connections too
+    return one

@@ -1,1 +1,0 @@
-"""Live output: tracked frames go to other programs as they are made."""

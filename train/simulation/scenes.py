@@ -1,0 +1,428 @@
+"""What moves in a take: people in their gloves, and what they do in each kind of capture."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from gloves.fit import GlovedHand, GloveFit, wear
+from gloves.layout import MarkerLayout
+from handsim._checks import check_count
+from handsim.errors import ArgumentError, PoseError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.hand.shape import ADULTS, BONES, EVERYBODY, NUM_JOINTS, SIDES, Population, sample_shape
+from handsim.space.objects import RigidObject, named_object
+from handsim.space.rig import CameraRig
+from handsim.space.transforms import quaternion_matrix
+from poses.motion import (
+    MotionConfig,
+    WristConfig,
+    angles_through,
+    can_be_left,
+    count_frames,
+    sample_motion,
+    scripted_motion,
+    wrist_path,
+)
+from poses.object_motion import keep_apart, point_pen, pointing_path, sample_object_motion
+from poses.shapes import gesture, make_valid, resting_angles
+from poses.touch import FINGERS, touching_angles
+from poses.two_hands import sample_two_hand_motion
+
+Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
+"""A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+SimulatedKind = Literal[
+    "single-hand", "hand-hand", "hand-pen", "hand-controller", "real-like", "calibration", "free"
+]
+"""These, hands like real ones, the exercises that a user is calibrated by, and hands that move freely."""
+SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
+NO_REST: Final = "person: fingers overlap at rest"
+"""Reason for which a person is drawn again."""
+_MAX_PEOPLE: Final = 1000
+
+
+def sample_hands(
+    population: Population, *, redrawn: Counter[str] | None = None, rng: np.random.Generator
+) -> tuple[HandModel, ...]:
+    """A random person's left and right hand, whose fingers do not overlap at rest.
+
+    Those who were drawn again are counted in `redrawn`, by reason.
+    """
+    for _ in range(_MAX_PEOPLE):
+        shape = sample_shape(population, side=SIDES[0], rng=rng)
+        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
+        try:
+            resting_angles(models[0])
+        except PoseError:
+            if redrawn is not None:
+                redrawn[NO_REST] += 1
+            continue
+        return models
+    raise ArgumentError(
+        f"the fingers of all {_MAX_PEOPLE} people drawn from the population overlap at rest, expected a "
+        f"population with smaller spreads than {population}"
+    )
+
+
+def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
+    """Right and left hand of a random adult, for takes."""
+    shape = sample_shape(ADULTS, side="right", rng=rng)
+    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
+
+
+def wear_gloves(
+    layout: MarkerLayout,
+    models: Sequence[HandModel],
+    *,
+    along: float,
+    around: float,
+    rng: np.random.Generator,
+) -> tuple[GloveFit, ...]:
+    """The same glove on each hand, its markers slipped a little.
+
+    Args:
+        along: Standard deviation of the slip along the bones [bone lengths].
+        around: Standard deviation of the slip around the bones [rad].
+
+    Raises:
+        LayoutError: A marker misses the skin however it slips.
+    """
+    return tuple(
+        GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
+    )
+
+
+RATE: Final = 120.0
+"""Frames per second of simulated takes [Hz]."""
+_HAND_OFFSET: Final = 0.22  # from the middle to a hand that touches nothing [m]
+_RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # where a right hand makes room
+_PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
+_WRIST_ROTATION: Final = 0.5  # standard deviation about each axis [rad]
+_FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingObject:
+    """An object and its path through the room."""
+
+    rigid_object: RigidObject
+    motion: BodyMotion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneMotion:
+    """Everything that moves in a take; all motions have one length."""
+
+    hands: tuple[GlovedHand, ...]
+    moving_object: MovingObject | None = None
+    rate: float = RATE
+    """Frames per second [Hz]."""
+    skin: tuple[Float[np.ndarray, "T M 3"], ...] = ()
+    """Displacement of each hand's markers by its skin, in the world [m]; none when empty."""
+    others: Float[np.ndarray, "T Q 3"] | None = None
+    """Markers that belong to no hand and to no tracked object [m]."""
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.hands[0].qpos)
+
+    def faster(self, times: int) -> SceneMotion:
+        """The same motion this many times as fast: of so many frames only the first is kept.
+
+        Displacements by the skin and markers of others are not kept.
+
+        Args:
+            times: Whole number from 1.
+        """
+        hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
+        held = self.moving_object
+        if held is not None:
+            motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
+            held = dataclasses.replace(held, motion=motion)
+        return SceneMotion(hands, held, self.rate)
+
+
+def sample_scene_motion(
+    kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator
+) -> SceneMotion:
+    """Random motion of a right and a left hand, and of the object that the right hand holds.
+
+    Args:
+        fits: A right and a left hand in their gloves.
+        num_frames: Frames at `RATE`.
+
+    Raises:
+        PoseError: These hands cannot do this: they do not grasp the object, say.
+    """
+    right, left = fits
+    if kind == "hand-hand":
+        return _two_hands(right, left, num_frames, rng)
+    if kind == "single-hand":
+        motions = (
+            _free_hand(right.model, _FREE_SCRIPT, _HAND_OFFSET, num_frames, rng),
+            _free_hand(left.model, _FREE_SCRIPT, -_HAND_OFFSET, num_frames, rng),
+        )
+        return SceneMotion(_gloved(fits, motions, num_frames))
+    return _hand_with_object(kind, right, left, num_frames, rng)
+
+
+def _two_hands(right: GloveFit, left: GloveFit, num_frames: int, rng: np.random.Generator) -> SceneMotion:
+    """Hands that meet and part."""
+    motions = sample_two_hand_motion(
+        right.model, left.model, num_frames / RATE, pause=_PAUSE_BETWEEN_CONTACTS, rng=rng
+    )
+    return SceneMotion(_gloved((right, left), motions, num_frames))
+
+
+def _hand_with_object(
+    kind: Kind, right: GloveFit, left: GloveFit, num_frames: int, rng: np.random.Generator
+) -> SceneMotion:
+    """The right hand holds a pen that points at the left hand's markers, or a controller."""
+    rigid_object = named_object("pen" if kind == "hand-pen" else "controller")
+    holding, body = sample_object_motion(right.model, rigid_object, num_frames / RATE, rng=rng)
+    held = HandMotion(holding.qpos[:num_frames], RATE), BodyMotion(body.T_world_body[:num_frames], RATE)
+    other = _free_hand(left.model, _RESTING_SCRIPT, -_HAND_OFFSET, num_frames, rng)
+    if kind == "hand-pen":
+        path = pointing_path(*left.markers(other.qpos), RATE, rng=rng)
+        holding, body = point_pen(right.model, left.model, rigid_object, held, other, path)
+    else:
+        direction = np.tile(_RETREAT_DIRECTION, (num_frames, 1))
+        holding, body = keep_apart(right.model, left.model, rigid_object, held, other, direction)
+    return SceneMotion(_gloved((right, left), (holding, other), num_frames), MovingObject(rigid_object, body))
+
+
+def _free_hand(
+    model: HandModel, script: str, offset: float, num_frames: int, rng: np.random.Generator
+) -> HandMotion:
+    """One hand in the air, palm mostly down, that touches nothing; `offset` is its side of the room [m]."""
+    qpos = scripted_motion(model, script, num_frames / RATE, rng=rng).qpos[:num_frames].copy()
+    config = WristConfig(center=(offset, 0.0, 1.1), volume=0.1, turning=_WRIST_ROTATION)
+    qpos[:, :3], qpos[:, 3:7] = wrist_path(num_frames, RATE, config, rng=rng)
+    return HandMotion(qpos, RATE)
+
+
+def _gloved(
+    fits: Sequence[GloveFit], motions: Sequence[HandMotion], num_frames: int
+) -> tuple[GlovedHand, ...]:
+    return tuple(GlovedHand(fit, motion.qpos[:num_frames]) for fit, motion in zip(fits, motions, strict=True))
+
+
+_OFFSETS: Final = (0.22, -0.22)  # of the hands from the room's middle [m], so that they do not meet
+_VOLUME: Final = 0.1  # half side of the cube that a wrist stays in [m]
+_MAX_DRAWS: Final = 20
+_STARTS: Final = ("pinch_pad", "pinch_tip")
+_JITTER: Final = np.deg2rad(8.0)
+_TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
+_FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationTakeConfig:
+    """What the user does, and the cameras that see it."""
+
+    free: float = 40.0
+    """Free motion [s]."""
+    rounds: int = 3
+    """How often the thumb goes to each of the other fingertips in turn."""
+    rig: CameraRig | str = "figure5"
+    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
+    turning: float = 0.7
+    """Standard deviation of the wrist's rotation about each axis [rad]."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.free < np.inf:
+            raise ArgumentError(f"free is {self.free:g} s, expected a positive time")
+        check_count("rounds", self.rounds, 0)
+
+
+def sample_calibration_scene(
+    hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
+) -> SceneMotion:
+    """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
+
+    Raises:
+        ArgumentError: There are no hands or more than two.
+        PoseError: A hand finds no way from its touches to free motion.
+    """
+    if not 1 <= len(hands) <= len(_OFFSETS):
+        raise ArgumentError(f"{len(hands)} hands, expected one or two")
+    angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
+    frames = min(len(part) for part in angles)
+    moving = []
+    for fit, part, offset in zip(hands, angles, _OFFSETS, strict=False):
+        wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
+        position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
+        qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
+        moving.append(GlovedHand(fit, qpos))
+    return SceneMotion(tuple(moving), rate=_FREE.rate)
+
+
+def calibration_angles(
+    model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
+
+    Raises:
+        PoseError: This hand finds no way from its touches to free motion.
+    """
+    touches = [pose for _ in range(config.rounds) for pose in _touch_fingers(model, rng)]
+    free = _free_motion(model, config.free, rng)
+    if not touches:
+        return free
+    poses = np.stack([*touches, free[0]])
+    return np.concatenate([poses[:1], angles_through(model, poses, _TOUCHING, rng=rng), free])
+
+
+def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Free motion from a pose that can be reached from everywhere."""
+    for _ in range(_MAX_DRAWS):
+        free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
+        if can_be_left(model, free[:1]).all():
+            return free
+    raise PoseError(f"this hand finds no way from its touches to a free motion in {_MAX_DRAWS} tries")
+
+
+def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """Poses (20,) [rad] of the thumb at each fingertip that it reaches, each from a start of its own."""
+    poses = []
+    for finger in FINGERS:
+        pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
+        start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
+        try:
+            touch = touching_angles(model, finger, start)
+        except PoseError:
+            continue  # another finger, or the next round, will do
+        if can_be_left(model, touch[None]).all():
+            poses.append(touch)
+    return poses
+
+
+NUM_FRAMES: Final = 3000
+"""Frames of such a take when no number is given."""
+NOISE: Final = 0.00125
+"""Standard deviation of the markers' independent noise per axis [m]."""
+FLESH: Final = 0.0008
+"""RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
+SPEED: Final = 2
+"""Times that hands move as fast as in the other takes."""
+_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # of a glove, as in training sets
+
+
+def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
+    """Two hands of anybody, children included, that meet and part.
+
+    Args:
+        layout: The glove on both hands.
+        num_frames: Frames at `train.simulation.scenes.RATE`.
+
+    Raises:
+        LayoutError: The glove does not fit.
+        PoseError: The person drawn cannot bring the hands together.
+    """
+    models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
+    fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
+    fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
+    return dataclasses.replace(fast, skin=tuple(move_skin(hand, rng=rng) for hand in fast.hands))
+
+
+def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
+    """Displacement of a hand's markers in the world [m]: what repeats with the pose, and noise."""
+    turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
+    moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
+    for marker, bone in enumerate(hand.fit.attachment.main_bones):
+        digit = BONES[bone].digit
+        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
+        way *= FLESH / max(np.sqrt((way**2).mean()), 1e-9)
+        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
+    return moved
+
+
+MOST_OTHERS: Final = 60
+"""Markers of others at most."""
+_STRAIGHT: Final = 0.6  # share of the hand's own direction in the forearm's
+_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, to the side and above them
+_WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
+_ALONG_FOREARM: Final = ((0.12, 0.0, 0.03), (0.26, 0.03, 0.02), (0.2, -0.03, 0.02))
+_THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
+_HEAD: Final = (
+    (0.09, 0.0, 0.25),
+    (-0.09, 0.0, 0.25),
+    (0.0, 0.08, 0.27),
+    (0.0, -0.08, 0.2),
+)  # [m] on its middle
+_BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
+_PERSON: Final = 1.2  # [m] to the one beside
+_SWAY: Final = 0.03  # [m]
+_BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
+
+
+def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T Q 3"]:
+    """So many markers of others [m], those nearest to the hands first.
+
+    Wrists, elbows and shoulders come first, then a thing in a hand, then head and back, then another person.
+
+    Args:
+        count: Markers.
+    """
+    wrists = np.stack([hand.qpos[:, :3] for hand in scene.hands], axis=1)
+    ahead = np.stack(
+        [hand.fit.model.forward_kinematics(hand.qpos)[:, 0, :3, :3] for hand in scene.hands], axis=1
+    )
+    middle = wrists.mean(axis=(0, 1))
+    front = ahead[..., 0].mean(axis=(0, 1)) * [1.0, 1.0, 0.0] + [1e-6, 0.0, 0.0]
+    front /= np.linalg.norm(front)
+    trunk = np.stack([front, [-front[1], front[0], 0.0], [0.0, 0.0, 1.0]], axis=1)
+    sway = _path(scene, middle, _SWAY, rng) - middle
+    back, side, above = _SHOULDER
+    arms, bodies = [], []
+    for number, hand in enumerate(scene.hands):
+        lateral = -side if hand.fit.side == "right" else side
+        shoulder = middle + trunk @ [-back, lateral, above] + sway
+        arms.append(_arm(wrists[:, number], ahead[:, number], shoulder))
+        bodies.append(shoulder[:, None])
+    thing = wrists[:, :1] + np.einsum(
+        "tij,kj->tki", ahead[:, 0], np.array(_THING) + rng.normal(0.0, 0.01, (4, 3))
+    )
+    torso = middle + np.array([*_HEAD, *_BACK]) @ trunk.T + trunk @ [-back, 0.0, above] + sway[:, None]
+    own = [*[part[:, :3] for part in arms], *bodies, *[part[:, 3:] for part in arms], thing, torso]
+    markers = np.concatenate(own, axis=1)
+    left = max(0, count - markers.shape[1])
+    place = middle + _PERSON * (trunk @ [np.cos(angle := rng.uniform(0.0, 2.0 * np.pi)), np.sin(angle), 0.0])
+    person = _path(scene, place, 0.1, rng)[:, None] + rng.uniform(-1.0, 1.0, (left, 3)) * _BODY_SIZE
+    return np.concatenate([markers, person], axis=1)[:, :count]
+
+
+def _arm(
+    wrist: Float[np.ndarray, "T 3"], ahead: Float[np.ndarray, "T 3 3"], shoulder: Float[np.ndarray, "T 3"]
+) -> Float[np.ndarray, "T 5 3"]:
+    """Markers beside the wrist's joint and on the forearm [m]: two at the wrist, an elbow, two between."""
+    reach = wrist - shoulder
+    reach /= np.linalg.norm(reach, axis=1, keepdims=True)
+    along = _STRAIGHT * ahead[..., 0] + (1.0 - _STRAIGHT) * reach
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(ahead[..., 2], along)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    frame = np.stack([-along, across, np.cross(along, across)], axis=2)
+    elbow, *between = _ALONG_FOREARM[1], _ALONG_FOREARM[0], _ALONG_FOREARM[2]
+    places = np.array([*_WRIST, elbow, *between])
+    markers: Float[np.ndarray, "T 5 3"] = wrist[:, None] + np.einsum("tij,kj->tki", frame, places)
+    return markers
+
+
+def _path(
+    scene: SceneMotion, center: Float[np.ndarray, "3"], volume: float, rng: np.random.Generator
+) -> Float[np.ndarray, "T 3"]:
+    """Slow motion about a place [m]."""
+    config = WristConfig(center=tuple(center), volume=volume, turning=0.0)
+    return wrist_path(scene.num_frames, scene.rate, config, rng=rng)[0]
