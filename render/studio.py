@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.formats.annotations.common import as_sensed
 from render.frames import Pictures, RenderedFrame
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn

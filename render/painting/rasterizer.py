@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int, Int32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from render.frames import Pictures
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tints
 from render.sensors.random_images import normal_numbers

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight

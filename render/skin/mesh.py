@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import skin_frames, vertex_normals
 from handsim.hand.topology import BONES, DIGITS, NUM_BONES, PALM
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import quaternion_matrix
 from render.skin.atlas import RINGS, skin_atlas
 from render.skin.flexion import Flexion

@@ -16,7 +16,7 @@ from scipy import ndimage
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import DIGITS, NUM_BONES
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import bump, smooth
 from render.skin.forearm import Forearm, arm_places

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from train.config import SetLabelerConfig
 from train.labelers.protocol import Labeling, check_clouds, check_output
 from train.matching.pose_prior import PosePrior

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 
 _TAPS = 9  # of a 3x3 filter
 
