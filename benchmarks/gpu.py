@@ -31,7 +31,7 @@ from benchmarks.held_out import held_out_markers
 from benchmarks.record import describe
 from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
 from benchmarks.training_scaling import train
-from render.painting.gl import _renderer_name, opengl_has_hardware
+from render.painting.opengl import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
 from train.data.batches import Corruption, corrupt
 from train.glove_labeler import load_labeler

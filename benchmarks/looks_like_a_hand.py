@@ -36,12 +36,12 @@ from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES, Side
 from handsim.space.camera import Camera, preset
 from poses.shapes import gesture, make_valid
+from render.color_sensor import ExposureConfig, sample_exposure
 from render.formats.writer import open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import Background, Backgrounds
 from render.scenery.lights import Lighting, expose_for, sample_surroundings
-from render.sensors.exposure import ExposureConfig, sample_exposure
 from render.skin.look import TONES
 from render.studio import FrameChoices, Moment, Studio
 

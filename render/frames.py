@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from handsim.hand.shape import HandShape
+from handsim.hand.topology import NUM_BONES
 from handsim.space.camera import Camera
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""
+FOREARM: Final = NUM_BONES
+"""Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
 PARTS_A_HAND: Final = 32
 """Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is not a hand."""
 

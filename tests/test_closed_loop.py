@@ -12,7 +12,7 @@ from handsim.cli.simulate import simulate
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from render import RenderConfig, draw
-from render.cameras.viewpoints import ViewConfig
+from render.viewpoints import ViewConfig
 from track.captures import track_capture
 from train.simulation.takes import TakeConfig
 

@@ -21,12 +21,10 @@ from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import load_rig
 from poses.shapes import gesture
+from render.captions import contact_sheet, write_png
 from render.config import RenderConfig
-from render.drawing import draw
-from render.illustrations.captions import write_png
-from render.illustrations.contact_sheet import contact_sheet
-from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
-from render.illustrations.scene import PosedHand
+from render.illustrations import PosedHand, draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
+from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset

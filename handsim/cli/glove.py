@@ -54,8 +54,8 @@ def list_gloves(out: Path | None = None) -> None:
         "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
     )
     if out is not None:
-        from render.illustrations.captions import write_png
-        from render.illustrations.hands import draw_gloves
+        from render.captions import write_png
+        from render.illustrations import draw_gloves
 
         write_png(out, draw_gloves([_fitted(load_layout(name), "M") for name in list_layouts()]))
         print_line(f"{out}: the gloves on hands of size M")
@@ -135,8 +135,8 @@ def check_glove(
             f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps)}; "
             "move them apart"
         )
-    from render.illustrations.captions import write_png
-    from render.illustrations.hands import draw_glove
+    from render.captions import write_png
+    from render.illustrations import draw_glove
 
     write_png(picture, draw_glove(nominal_fit(layout, size, layout.sides[-1])))
     print_line(f"{picture}: the glove on a hand of size {size}")

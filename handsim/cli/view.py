@@ -105,7 +105,7 @@ def _draw(name: str, content: Content, video: Path) -> None:
     from track.viewer.video import write_video
 
     check_outputs((name,), (video,))
-    from render.illustrations.clip import write_clip  # OpenCV and the painters
+    from render.illustrations import write_clip  # OpenCV and the painters
 
     recording = content.recording
     if recording is None:

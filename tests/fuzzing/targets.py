@@ -23,7 +23,7 @@ from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
 from handsim.space.rig_formats.any_file import import_cameras, load_cameras
-from render.scenery.photographs import draw_photo, photo_files
+from render.scenery.backgrounds import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target

@@ -13,7 +13,7 @@ from gloves.captures.formats import read_capture, write_capture
 from handsim.cli.main import main
 from handsim.hand.keypoints import hand_keypoints
 from render import RenderConfig, draw
-from render.cameras.viewpoints import ViewConfig
+from render.viewpoints import ViewConfig
 from track.captures import track_capture
 from train.data.shards import Dataset
 from train.simulation.takes import simulate_take
