@@ -27,7 +27,7 @@ from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
 from track.tracker import Tracker
 from track.user import MEASURED, User
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS, CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration, simulate_take
 

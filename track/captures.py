@@ -49,7 +49,7 @@ from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
 from track.user import MEASURED, User, checked_sides
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
 _CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most

@@ -28,8 +28,8 @@ from track.hand_size import fit_size
 from track.inputs import designed_glove
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.glove_labeler import labeler_at_once
 from train.labelers.protocol import Labeler, Labeling
+from train.labelers.storage import labeler_at_once
 
 _WINDOW: Final = 30  # frames of each of two parts in which hands are compared
 _LEAST_FRAMES: Final = 10  # that tell anything

@@ -24,8 +24,8 @@ from track.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from track.user import MEASURED, User, as_user, nominal_user
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
 AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 """A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""

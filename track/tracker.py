@@ -37,7 +37,7 @@ from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFram
 from track.inputs import AnyLabeler, designed_glove
 from track.rigid_body import BodyTracker, RigidTemplate
 from track.user import User, as_user
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost

@@ -25,8 +25,8 @@ from track.captures import measure_hands
 from track.frames import FrameTracker
 from track.streams.frame_source import capture_frames
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
 

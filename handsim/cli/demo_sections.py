@@ -28,9 +28,9 @@ from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset
-from train.evaluate import CLEAN, evaluate_labeler
-from train.glove_labeler import load_labeler
+from train.evaluation import CLEAN, evaluate_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 from train.simulation.generation import generate_dataset
 from train.simulation.takes import simulate_take
 

@@ -68,8 +68,7 @@ def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None
 def _export_labeler(source: str, out: Path) -> None:
     from gloves.captures.formats import READABLE
     from gloves.takes.formats import MOTION_FORMATS
-    from train.labelers.onnx_labeler import export_onnx
-    from train.labelers.storage import load_network
+    from train.labelers.storage import export_onnx, load_network
 
     if Path(source).suffix.lower() in READABLE:
         raise ArgumentError(f"{source} is a capture without poses; handsim track makes a take of it")

@@ -204,7 +204,7 @@ def score_glove(
 
 def _tell(score: LayoutScore) -> None:
     """Print the figures of a score."""
-    from train.metrics import percent
+    from train.evaluation import percent
 
     joints = np.rad2deg(score.joints)
     for title, report in (

@@ -273,9 +273,9 @@ def photos(folder: Path) -> list[Path]:
 def weights(folder: Path) -> list[Path]:
     import torch
 
-    from train.config import SetLabelerConfig
-    from train.labelers.kinds import new_network
+    from train.labelers.networks import new_network
     from train.labelers.storage import CARD, WEIGHTS, save_network
+    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
@@ -286,9 +286,9 @@ def weights(folder: Path) -> list[Path]:
 def onnx(folder: Path) -> list[Path]:
     import torch
 
-    from train.config import SetLabelerConfig
-    from train.labelers.kinds import new_network
-    from train.labelers.onnx_labeler import export_onnx
+    from train.labelers.networks import new_network
+    from train.labelers.storage import export_onnx
+    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))

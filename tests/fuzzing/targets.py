@@ -88,13 +88,13 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 

@@ -33,7 +33,7 @@ from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 60
@@ -197,7 +197,7 @@ from track.captures import track_capture
 from track.label_confidence import label_confidence
 from track.settings import warm_up
 from track.streams.frame_source import checked_frames
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 def ready():

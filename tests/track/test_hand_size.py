@@ -24,7 +24,7 @@ from track.hand_size import (
     usual_breadth,
 )
 from track.streams.frame_source import StreamedFrame, checked_frames
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

@@ -24,7 +24,7 @@ from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 PEN = RigidBody("pen", ("Pen1", "Pen2", "Pen3"), np.diag([0.03, 0.05, 0.08]))
 

@@ -25,7 +25,7 @@ from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 24

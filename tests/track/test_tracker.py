@@ -15,7 +15,7 @@ from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from track.frames import TrackedFrame
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
-from train.matching.assignment import assign
+from train.labelers.matching import assign
 
 
 class Numbering:

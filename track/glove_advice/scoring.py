@@ -19,8 +19,8 @@ from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_motion, observe_poses
 from track.glove_advice.trials import CAPTURES, try_layout
 from track.inputs import AnyGlove, AnyLabeler
-from train.any_layout.learned_gloves import learned_labeler
-from train.glove_labeler import load_labeler
+from train.labelers.layout_labeler import learned_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 _POSES: Final = "poses"

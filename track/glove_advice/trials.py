@@ -24,8 +24,8 @@ from track.config import BOTH
 from track.hand_size import sample_frames
 from track.settings import measured_user
 from track.streams.frame_source import checked_frames
+from train.evaluation import LabelCounts
 from train.labelers.protocol import Labeler
-from train.metrics import LabelCounts
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 

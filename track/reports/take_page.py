@@ -22,7 +22,7 @@ from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
-from train.metrics import percent
+from train.evaluation import percent
 from train.reports.plot_style import picture
 
 _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by line

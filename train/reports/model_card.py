@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.files.atomic import atomic_write
-from train.metrics import percent
+from train.evaluation import percent
 
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"

@@ -16,8 +16,8 @@ from gloves.takes.status import Status
 from gloves.takes.take import Take
 from handsim.hand.topology import JOINT_NAMES
 from track.frames import TrackedFrame
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

@@ -17,7 +17,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.frames import TrackedFrame, TrackedHand
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

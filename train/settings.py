@@ -14,7 +14,7 @@ from handsim.errors import ArgumentError, HandSimError
 from train.data.batches import BatchRecipe, Corruption, OwnCorruption, paper_corruption
 
 Kind = Literal["set", "cnn"]
-"""`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's
+"""`set` is the default labeler (`train.labelers.networks`), `cnn` the paper's
 (`train.labelers.cnn_network`)."""
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -56,8 +56,8 @@ _SIZES: Final = {  # least and greatest; a network beyond these would not fit in
 
 
 Views = Literal["aligned", "random"]
-"""`aligned` turns every hand like the mean hand (`train.labelers.views`); `random` is the paper's policy:
-any view in training, for labeling the one of ten on which the cloud spreads best."""
+"""`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
+for labeling the one of ten on which the cloud spreads best."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ NetworkConfig = SetLabelerConfig | CNNConfig
 
 
 @dataclass(frozen=True, slots=True)
-class TrainConfig:
+class TrainSettings:
     """How a labeler is trained; the defaults made the shipped weights."""
 
     labeler: Kind = "set"
@@ -167,7 +167,7 @@ class TrainConfig:
         check_number("knee", self.knee, 0.0, above=True)
 
 
-def batch_recipe(config: TrainConfig, num_markers: int) -> BatchRecipe:
+def batch_recipe(config: TrainSettings, num_markers: int) -> BatchRecipe:
     """How a labeler's batches are drawn for a layout of this many markers."""
     usual = paper_corruption(num_markers).occlude
     occlude = usual if config.occlude is None else config.occlude
@@ -185,7 +185,7 @@ PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
 EPOCHS: Final = 75
 
 
-def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
+def preset_config(preset: Preset, num_frames: int) -> TrainSettings:
     """The settings of a published recipe for a training set of `num_frames`.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
@@ -194,7 +194,7 @@ def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
     precision on hardware that has it is not the paper's either.
     """
     del preset  # one so far
-    return TrainConfig(
+    return TrainSettings(
         labeler="cnn",
         samples=EPOCHS * num_frames,
         optimizer="sgd",
@@ -211,11 +211,11 @@ def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
     )
 
 
-def default_config(labeler: Kind) -> TrainConfig:
+def default_config(labeler: Kind) -> TrainSettings:
     """The settings that a labeler of this kind is trained with when no others are given."""
     if labeler == "set":
-        return TrainConfig()
-    return TrainConfig(
+        return TrainSettings()
+    return TrainSettings(
         labeler="cnn",
         samples=300_000,
         batch=32,

@@ -1,12 +1,19 @@
-"""A labeler for any layout, without training: one network that takes the layout as an input.
+"""A labeler for any layout, without a training set: one network that takes the layout as an input.
 
 What it must know of a layout comes from a few seconds of simulation: the distribution of the distance between
-every two markers over people and poses, and the pose prior (`train.matching.pose_prior`).
+every two markers over people and poses, and the pose prior (`train.labelers.pose_prior`). A minute of
+training makes it better. Such a labeler is kept in the user's cache folder, under a digest of all that
+decides it: the layout, the cameras, the shipped weights and the version.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
+import hashlib
+import json
+import os
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -22,15 +29,20 @@ from gloves.layout import MarkerLayout
 from handsim._version import __version__
 from handsim.errors import WeightsError
 from handsim.files.atomic import atomic_write, written_together
+from handsim.files.inputs import checksum
 from handsim.files.json_files import save_json
 from handsim.hand.topology import SIDES
-from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
+from handsim.space.cameras import CameraRig, as_rig
+from train.data.batches import draw_batch
+from train.data.shards import row_dtype
+from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.labelers.pose_prior import PosePrior, learn_pose_prior
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
-from train.matching.pose_prior import PosePrior
-from train.matching.prior_learning import learn_pose_prior
+from train.labelers.storage import LEARNED, learned_folder, learned_gloves
+from train.settings import TrainSettings, batch_recipe
 from train.simulation.scenes import sample_hands, wear_gloves
-from train.simulation.training_frames import DatasetConfig, sample_single_hand
-from train.threads import labeling_threads
+from train.simulation.training_frames import DatasetConfig, sample_single_hand, simulate_frames
+from train.threads import labeling_threads, torch_threads
 
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""
@@ -174,3 +186,139 @@ def sample_worn_markers(
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)
+
+
+MOST: Final = 32
+"""Labelers that are kept; one takes about four megabytes."""
+NUM_CLOUDS: Final = 15_000
+_BATCH: Final = 64
+_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
+_FRAMES_EACH: Final = 100  # of a person
+_MOST_GRADIENT: Final = 1.0
+
+
+def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
+    """Whether a glove was learned before."""
+    return _file_of(layout, rig).exists()
+
+
+def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
+    """The labeler of a glove, learned within a minute the first time and read within a second from then on.
+
+    Args:
+        rig: Cameras that see it while it is learned.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    file = _file_of(layout, rig)
+    found = _read(file, layout)
+    if found is not None:
+        return found
+    learned = fine_tuned_labeler(layout, rig)
+    try:
+        _write(file, learned)
+    except OSError:
+        return learned  # a cache that cannot be written costs time, no labels
+    return _read(file, layout) or learned
+
+
+def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+    return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
+
+
+@functools.lru_cache(maxsize=MOST)
+def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
+    """Of all that decides a labeler."""
+    decides = {
+        "layout": dataclasses.asdict(layout),
+        "rig": as_rig(rig).record(),
+        "weights": checksum(SHIPPED / WEIGHTS),
+        "version": __version__,
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
+    """A kept labeler; None where there is none, or a damaged one, which is removed."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        stored = file.read_bytes()
+    except OSError:
+        return None
+    try:
+        labeler = LayoutLabeler.of_tensors(layout, load(stored))
+        os.utime(file)
+    except (OSError, SafetensorError, WeightsError):
+        file.unlink(missing_ok=True)
+        return None
+    return labeler
+
+
+def _write(file: Path, labeler: LayoutLabeler) -> None:
+    from safetensors.numpy import save
+
+    tensors: dict[str, NDArray[np.generic]] = labeler.tensors()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(file) as temporary:
+        temporary.write_bytes(save(dict(tensors)))
+    for old in learned_gloves()[MOST:]:
+        old.unlink(missing_ok=True)
+
+
+def fine_tuned_labeler(
+    layout: MarkerLayout,
+    rig: CameraRig | str = "figure5",
+    *,
+    num_clouds: int = NUM_CLOUDS,
+    seed: int = 0,
+) -> LayoutLabeler:
+    """A labeler for any layout that has learned more of this one.
+
+    Args:
+        rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
+        num_clouds: Clouds to learn from, of two thirds as many frames.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    rng = np.random.default_rng(seed)
+    labeler = LayoutLabeler.at_once(layout, seed=seed)
+    rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
+    network = copy.deepcopy(labeler.network).train()
+    recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
+    steps = -(-num_clouds // _BATCH)
+    with torch_threads(1):
+        for step in range(steps):
+            rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
+            for group in optimizer.param_groups:
+                group["lr"] = float(_PEAK_RATE * rate)
+            cloud = draw_batch(rows, recipe, rng=rng).cloud
+            points, present = (
+                torch.from_numpy(cloud.points.astype(np.float32)),
+                torch.from_numpy(cloud.present),
+            )
+            loss = layout_loss(
+                network(points, present, labeler.distances), torch.from_numpy(cloud.truth), present
+            )
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(network.parameters(), _MOST_GRADIENT)
+            optimizer.step()
+    labeler.network = network.eval()
+    return labeler
+
+
+def _simulated_rows(
+    layout: MarkerLayout, rig: CameraRig, num_frames: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Frames as a training set has them, see `train.data.shards.row_dtype`."""
+    config = DatasetConfig()
+    rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
+    for first in range(0, num_frames, _FRAMES_EACH):
+        models = sample_hands(config.population, rng=rng)
+        simulate_frames(rows[first : first + _FRAMES_EACH], models, layout, rig, config, rng=rng)
+    return rows
