@@ -23,7 +23,7 @@ from gloves.fit import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.model import HandModel, skinned_jacobian
 from handsim.hand.shape import JOINTS, HandShape, shape_from_measures
-from handsim.kernels.integration import move
+from handsim.kernels import move
 from track.kinematics.pose_solver import PoseFit, solve_pose
 
 ROUNDS = 12

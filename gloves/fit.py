@@ -18,7 +18,7 @@ from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
 from handsim.hand.shape import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
 from handsim.hand.skin import HandSurface, vertex_normals
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 

@@ -22,8 +22,8 @@ from handsim import __version__
 from handsim._plugins import import_extra
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import JOINT_NAMES, Side
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedFrame, TrackedHand
+from track.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
 
 SCHEMA: Final = 1

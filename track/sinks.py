@@ -28,7 +28,6 @@ from handsim._checks import check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedFrame
 from track.live_message import (
     FORMATS,
@@ -40,6 +39,7 @@ from track.live_message import (
     MessageFormat,
     document_format,
 )
+from track.rigid_body import RigidTemplate
 from track.streams import split_address
 from track.streams.frame_source import StreamedFrame
 

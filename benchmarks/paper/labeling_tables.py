@@ -32,7 +32,7 @@ from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 
-# Median and p90 of real finger markers' gaps [frames]; docs/room_numbers.md.
+# Median and p90 of real finger markers' gaps [frames]; docs/room.md.
 PUBLISHED_GAPS: Final = "3-4", "24-43"
 FIGURES: Final = {
     "slot_accuracy": "Accuracy (slots)",

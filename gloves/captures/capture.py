@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.text import check_rate
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import squared_distance
+from handsim.kernels import kernel, squared_distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)

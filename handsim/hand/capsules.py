@@ -15,8 +15,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.hand.shape import BONES, DIGITS, PALM, HandShape
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.transforms import MIRROR
 
 FIRMNESS: Final = 0.8

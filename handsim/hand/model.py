@@ -34,7 +34,7 @@ from handsim.hand.shape import (
     named_shape,
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
-from handsim.kernels.chain import pose_bones
+from handsim.kernels import pose_bones
 from handsim.space.transforms import MIRROR, euler_matrix
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from handsim.hand.shape import DIGITS, NUM_BONES, PALM
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix
 
 if TYPE_CHECKING:

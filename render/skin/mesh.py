@@ -33,7 +33,7 @@ from handsim.hand.skin import (
     subdivided_loops,
     vertex_normals,
 )
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import bump, smooth
 from render.frames import FOREARM

@@ -22,7 +22,7 @@ from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
 from handsim.hand.skin import vertex_normals
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.fields import bump, noise, smooth
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas
