@@ -44,8 +44,8 @@ from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from track.captures import calibrate
 from track.tracker import Tracker, warm_up
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
 from train.simulation.takes import simulate_calibration, simulate_take
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal
 
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]

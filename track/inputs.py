@@ -9,8 +9,8 @@ from gloves.captures.formats import READABLE, read_capture
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
 AnyCapture = Capture | Take | str | Path
 """A capture, or a take, of which only the points are used; or the path of one."""

@@ -12,14 +12,13 @@ from gloves.fit import GloveFit, attach
 from gloves.layout import list_layouts, load_layout
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
-from track.bodies.body_file import AnyBody, load_bodies
-from track.bodies.rigid_body import RigidTemplate
 from track.config import BOTH, Size, TrackerConfig
 from track.hand_check import check_hands, check_scale
 from track.hand_size import measured_user
 from track.inputs import AnyGlove, AnyLabeler, labeler_of
+from track.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from track.user import User, as_user, nominal_user

@@ -11,7 +11,7 @@ import tyro
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.files.outputs import check_ending, check_outputs
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:

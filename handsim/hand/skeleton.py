@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import BONES, JOINTS, NUM_BONES
-from handsim.kernels.chain import pose_bones
+from handsim.hand.shape import BONES, JOINTS, NUM_BONES, HandShape
+from handsim.kernels import pose_bones
 from handsim.space.transforms import MIRROR, euler_matrix
 
 _MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones

@@ -17,16 +17,16 @@ from jaxtyping import Float
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import Side
+from handsim.space.rig import CameraRig
 from track.captures import label_capture, track_capture
 from track.config import BOTH
 from track.hand_size import measured_user, sample_frames
 from track.settings import USUAL_SIZE
 from track.streams.frame_source import checked_frames
 from track.user import nominal_user
+from train.evaluation import LabelCounts
 from train.labelers.protocol import Labeler
-from train.metrics import LabelCounts
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
