@@ -41,8 +41,8 @@ from handsim.hand.shape import SIZES, HandShape, sample_shape, shape_from_measur
 from handsim.hand.topology import BONES, SIDES
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, is_touching, thumb_contact
-from track.calibration.contacts import contact_geometry, initialize_contacts
-from track.calibration.skin_coordinates import SkinPatch, displace_markers
+from track.calibration.energy import contact_geometry, initialize_contacts
+from track.calibration.hand_parameters import SkinPatch, displace_markers
 from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.scenes import CalibrationTakeConfig

@@ -25,7 +25,7 @@ from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, shape_from_measures
 from handsim.hand.topology import JOINTS
-from handsim.kernels.integration import move
+from handsim.kernels import move
 from track.kinematics.pose_solver import PoseFit, solve_pose
 
 ROUNDS = 12

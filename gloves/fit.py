@@ -20,7 +20,7 @@ from handsim.hand.model import HandModel, load_model
 from handsim.hand.shape import HandShape
 from handsim.hand.skin.surface import HandSurface, vertex_normals
 from handsim.hand.topology import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, Side
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.cameras import CameraRig
 from handsim.space.transforms import MIRROR
 

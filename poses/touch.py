@@ -20,8 +20,7 @@ from handsim.hand.capsules import Capsules
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, gesture, is_valid, make_valid
 
 FINGERS: Final = DIGITS[1:]

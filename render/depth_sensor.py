@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from render.fields import normal_numbers, quantiles, random_words

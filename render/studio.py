@@ -18,7 +18,7 @@ from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
 from handsim.hand.keypoints import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times

@@ -21,13 +21,11 @@ from gloves.takes.corrections import Correction, find_pins, load_corrections, to
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
-from handsim.errors import CaptureError, HandSimWarning
+from handsim.errors import CalibrationError, CaptureError, HandSimWarning
 from handsim.hand.topology import NUM_QPOS, Side
-from track.association.initialization import FEWEST_POINTS
-from track.association.point_linking import change_of_distances
-from track.association.single_frames import label_alone
+from track.association.frame_state import change_of_distances
+from track.association.initialization import FEWEST_POINTS, label_alone
 from track.bidirectional_labeling import label_both_ways
-from track.calibration.frames import CalibrationError
 from track.config import BOTH, Size
 from track.corrected_take import correct_take
 from track.frames import TrackedFrame

@@ -15,8 +15,7 @@ from gloves.takes.corrections import FREE, Correction, applied_corrections, find
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
 from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS
-from track.kinematics.frame_fits import FEWEST_MARKERS
-from track.kinematics.pose_solver import AnglePrior, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, AnglePrior, PoseSolver
 from track.kinematics.pose_spread import SpreadModel
 from track.user import hand_origin
 

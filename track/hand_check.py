@@ -23,8 +23,7 @@ from gloves.takes.status import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.topology import Side
 from track.association.hand_state import HandState
-from track.association.initialization import FEWEST_POINTS, HandInitializer
-from track.association.point_groups import distances_to_nearest
+from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
 from track.hand_size import fit_size
 from track.inputs import designed_glove
 from track.streams.frame_source import StreamedFrame

@@ -22,8 +22,8 @@ from handsim import __version__
 from handsim._extras import import_extra
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES, Side
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedFrame, TrackedHand
+from track.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
 
 SCHEMA: Final = 1

@@ -29,7 +29,6 @@ from handsim._closing import Closing
 from handsim._extras import import_extra
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError, HandSimWarning
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedFrame
 from track.live_message import (
     FORMATS,
@@ -41,6 +40,7 @@ from track.live_message import (
     MessageFormat,
     document_format,
 )
+from track.rigid_body import RigidTemplate
 from track.streams import split_address
 from track.streams.frame_source import StreamedFrame
 

@@ -13,7 +13,7 @@ from gloves.captures.capture import runs_of
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
-from track.association.point_groups import distances_to_nearest
+from track.association.initialization import distances_to_nearest
 from track.label_confidence import Evidence, evidence_of, label_confidence
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import squared_distance
+from handsim.kernels import kernel, squared_distance
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""

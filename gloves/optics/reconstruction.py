@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import squared_distance
+from handsim.kernels import kernel, squared_distance
 from handsim.space.cameras import CameraRig
 from handsim.space.lens import PINHOLE, distort_jacobian
 

@@ -14,8 +14,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.capsules import bounding_spheres
 from handsim.hand.shape import named_shape
 from handsim.hand.skin.surface import build_surface
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import in_picture
 from handsim.space.cameras import CameraRig
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import BONES, DIGITS, PALM
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR
 
 FIRMNESS: Final = 0.8

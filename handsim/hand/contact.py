@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.hand.capsules import Capsules, bounding_spheres
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 
 
 def penetration_depth(

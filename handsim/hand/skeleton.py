@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import BONES, JOINTS, NUM_BONES
-from handsim.kernels.chain import pose_bones
+from handsim.kernels import pose_bones
 from handsim.space.transforms import MIRROR, euler_matrix
 
 _MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.lens import PINHOLE, Lens, distort_ray
 
 _LARGEST: Final = 8192  # [px]

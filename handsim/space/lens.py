@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}

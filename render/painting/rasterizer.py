@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera, camera_matrix
 from handsim.space.lens import Lens
 from render.frames import Pictures

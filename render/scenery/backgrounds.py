@@ -26,7 +26,7 @@ from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular
 from handsim.files.names import plain_path
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from render.fields import normal_numbers

@@ -28,7 +28,7 @@ from handsim.hand.skin.cage_topology import WRIST, cage_topology
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
 from handsim.hand.skin.surface import skin_frames, vertex_normals
 from handsim.hand.topology import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import bump, smooth
 from render.frames import FOREARM

@@ -23,7 +23,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import named_shape
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import DIGITS, NUM_BONES
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.fields import bump, noise, smooth
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas

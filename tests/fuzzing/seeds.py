@@ -22,8 +22,7 @@ from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
-from track.bodies.body_file import save_body
-from track.bodies.rigid_body import RigidTemplate
+from track.rigid_body import RigidTemplate, save_body
 from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
 from track.user import User
 

@@ -28,7 +28,7 @@ from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
-from track.bodies.body_file import load_body
+from track.rigid_body import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 

@@ -25,10 +25,10 @@ from gloves.takes.take import (
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
-from track.bodies.rigid_body import RigidTemplate
 from track.captures import track_capture
 from track.config import TrackerConfig
 from track.recorder import TakeRecorder
+from track.rigid_body import RigidTemplate
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer

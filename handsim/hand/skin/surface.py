@@ -31,7 +31,7 @@ from handsim.hand.skin.cage_topology import (
 )
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
 from handsim.hand.topology import NUM_BONES, PALM
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR
 
 if TYPE_CHECKING:

@@ -33,9 +33,9 @@ from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
 from track import capture_tracking
-from track.bodies.body_file import load_body
 from track.captures import track_capture
 from track.recorder import Recorder
+from track.rigid_body import load_body
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user

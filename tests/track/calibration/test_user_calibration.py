@@ -18,7 +18,7 @@ from handsim.hand.shape import named_shape
 from handsim.hand.topology import JOINT_NAMES, SIDES
 from handsim.space.transforms import MIRROR
 from poses.motion import WristConfig, wrist_path
-from track.calibration.skin_coordinates import displace_markers
+from track.calibration.hand_parameters import displace_markers
 from track.calibration.user_calibration import Calibration, HeldOut, calibrate_hand
 from track.user import User, load_user
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from gloves.captures.capture import Capture
 from gloves.takes.status import Status
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, CalibrationError
 from handsim.space.objects import named_object
-from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
-from track.bodies.constellation import predict_pose, transform_markers, velocity_between
-from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
+from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions, rigid_fit
+from track.constellation import predict_pose, transform_markers, velocity_between
+from track.rigid_body import (
+    BodyError,
+    BodyFrame,
+    BodyTracker,
+    RigidTemplate,
+    learn_body,
+    load_bodies,
+    load_body,
+    save_body,
+)
 from train.simulation.takes import simulate_take
 
 NAMES = ("controller", "ball", "box", "mug")
@@ -323,3 +334,179 @@ def test_velocities_carry_poses_on(rng):
         np.testing.assert_allclose(
             transform_markers(places, first), places @ rotation.T + first[:3], atol=1e-12
         )
+
+
+FILE_NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
+
+
+@st.composite
+def bodies(draw) -> RigidTemplate:
+    names = draw(st.lists(FILE_NAMES, min_size=3, max_size=8, unique=True))
+    places = draw(arrays.arrays(float, (len(names), 3), elements=st.floats(-0.3, 0.3)))
+    try:
+        return RigidTemplate(draw(FILE_NAMES), tuple(names), places)
+    except ArgumentError:  # markers too near to each other, on a line, or alike from two sides
+        assume(False)
+        raise
+
+
+@given(body=bodies())
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, body: RigidTemplate) -> None:
+    path = tmp_path_factory.mktemp("body") / "body.toml"
+    save_body(path, body)
+    again = load_body(path)
+    assert (again.name, again.marker_names) == (body.name, body.marker_names)
+    np.testing.assert_allclose(again.positions, body.positions, rtol=0.0, atol=1e-12)
+    save_body(path.with_name("again.toml"), again)
+    assert path.read_bytes() == path.with_name("again.toml").read_bytes()
+
+
+def text(*, head: str = 'name = "wand"', count: int = 3, **keys: str) -> str:
+    """A good file of `count` markers, of which the second has the given keys replaced (empty: left out)."""
+    places = ["[0, 0, 0]", "[50.0, 0, 0]", "[0, 80, 0]", "[0, 0, 30]"]
+    tables = []
+    for number in range(count):
+        values = {"name": f'"m{number}"', "place_mm": places[number]}
+        if number == 1:
+            values |= keys
+        tables.append(
+            "[[marker]]\n" + "\n".join(f"{key} = {value}" for key, value in values.items() if value)
+        )
+    return "\n".join([head, *tables])
+
+
+def test_files_are_in_millimeters(tmp_path):
+    path = tmp_path / "wand.toml"
+    path.write_text(text(head='name = "wand"\ndescription = "three on a stick"'))
+    body = load_body(path)
+    assert (body.name, body.marker_names) == ("wand", ("m0", "m1", "m2"))
+    np.testing.assert_allclose(body.positions, [[0, 0, 0], [0.05, 0, 0], [0, 0.08, 0]])
+
+
+def test_objects_of_handsim_have_names():
+    np.testing.assert_array_equal(load_body("mug").positions, named_object("mug").markers)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("name = ", "not a TOML file"),
+        ("", "the file lacks the key 'name'"),
+        ('name = "wand"', "wand: 0 markers, expected at least 3"),
+        (text(count=2), "wand: 2 markers, expected at least 3"),
+        (text(head="name = 3"), "name is 3, expected text in quotes"),
+        (text(head='name = " wand"'), "the body's name ' wand': expected printable characters"),
+        (text(head='name = "wand"\ndescription = 3'), "description is 3, expected text in quotes"),
+        (text(head='name = "wand"\nradius_mm = 3'), "the file has an unknown key 'radius_mm'"),
+        ('name = "wand"\nmarker = [1, 2]', "marker is not a list of tables"),
+        (text(name='"m0"'), "wand: a marker name is there twice: m0, m0, m2"),
+        (text(name='"a\\tb"'), "marker name 'a\\tb': expected printable characters"),
+        (text(name=""), "marker number 2 lacks the key 'name'"),
+        (text(place_mm=""), "marker 'm1' lacks the key 'place_mm'"),
+        (text(place="[1, 2, 3]"), "marker 'm1' has an unknown key 'place' (did you mean 'place_mm'?)"),
+        (text(place_mm="[50, 0]"), "marker 'm1': place_mm is [50, 0], expected three numbers [x, y, z] in"),
+        (text(place_mm="[50, 0, nan]"), "marker 'm1': place_mm is [50, 0, NaN], expected three numbers"),
+        (text(place_mm='"50 0 0"'), "marker 'm1': place_mm is \"50 0 0\", expected three numbers"),
+        (text(place_mm="[0.05, 0, 0]"), "m0 and m1 are 0.1 mm apart, expected at least 6 mm"),
+        (text(place_mm="[80, 0, 0]"), "its markers look the same from two sides (m1 at m2, m2 at m1)"),
+    ],
+)
+def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
+    path = tmp_path / "wand.toml"
+    path.write_text(content)
+    with pytest.raises(BodyError) as caught:
+        load_body(path)
+    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_bodies_are_told(tmp_path):
+    with pytest.raises(
+        ArgumentError, match=r"unknown body 'mugg' \(did you mean 'mug'\?\); valid names: contr"
+    ):
+        load_body("mugg")
+    with pytest.raises(ArgumentError, match="pen: 1 markers, expected at least 3"):
+        load_body("pen")
+    with pytest.raises(BodyError, match=r"nowhere.toml: cannot be read: No such file"):
+        load_body(tmp_path / "nowhere.toml")
+    with pytest.raises(BodyError, match="cannot be written"):
+        save_body(tmp_path, load_body("mug"))
+
+
+def test_bodies_that_are_tracked_together_have_names_of_their_own(tmp_path):
+    assert [body.name for body in load_bodies(["mug", "box"])] == ["mug", "box"]
+    for name, other in (("mug", "mug"), ("left", "box")):
+        path = tmp_path / "body.toml"
+        path.write_text(text(head=f'name = "{name}"'))
+        with pytest.raises(
+            ArgumentError, match=f"body.toml: a body is named '{name}', expected a name of its own"
+        ):
+            load_bodies([other, path])
+
+
+FRAMES = 240
+
+
+@functools.cache
+def twin_take() -> Take:
+    return simulate_take(kind="hand-controller", num_frames=FRAMES)
+
+
+def capture_of(points: np.ndarray) -> Capture:
+    points = points[:, np.isfinite(points[..., 0]).any(axis=0)]
+    return Capture(tuple(f"*{number}" for number in range(points.shape[1])), points, 120.0)
+
+
+def controller(rng, ghosts: float = 0.0) -> Capture:
+    """The controller alone, as the room saw it in a hand: columns end where markers are hidden."""
+    take = twin_take()
+    body = np.where((take.labels >= take.hand_labels[-1].stop)[..., None], take.points, np.nan)
+    false = rng.uniform(-0.2, 0.2, (FRAMES, 2, 3)) + np.nanmean(body, axis=(0, 1))
+    false[rng.random((FRAMES, 2)) >= ghosts] = np.nan
+    return capture_of(np.concatenate([body, false], axis=1))
+
+
+def off(found: np.ndarray, true: np.ndarray) -> float:
+    """Largest distance from the true markers [m], in the order and place that suit best."""
+    errors = []
+    for order in itertools.permutations(range(len(true))):
+        rotation, moved = rigid_fit(found, true[list(order)])
+        errors.append(np.linalg.norm(found @ rotation.T + moved - true[list(order)], axis=1).max())
+    return min(errors)
+
+
+@pytest.mark.parametrize("ghosts", [0.0, 0.1])
+def test_all_markers_are_where_they_are(ghosts, rng):
+    capture = controller(rng, ghosts)
+    body = learn_body(capture, "wand")
+    assert body.name == "wand" and body.marker_names == tuple(f"Marker{n}" for n in range(1, 7))
+    assert off(body.positions, named_object("controller").markers) < 0.00005
+    np.testing.assert_allclose(body.positions.mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_one_frame_is_not_enough_to_be_so_right(rng):
+    """What averaging over the frames is for."""
+    capture = controller(rng)
+    whole = capture.positions[np.isfinite(capture.positions[..., 0]).sum(axis=1) == 6][0]
+    assert off(whole[np.isfinite(whole[:, 0])], named_object("controller").markers) > 0.0001
+
+
+def test_captures_of_anything_else_are_told(rng):
+    take = twin_take()
+    hands = np.where(((take.labels >= 0) & (take.labels < 38))[..., None], take.points, np.nan)
+    with pytest.raises(
+        CalibrationError, match="points per frame, expected 3 to 20: one body and nothing else"
+    ):
+        learn_body(capture_of(hands), "wand")
+    fingers = np.where(np.isin(take.labels, (3, 6, 9, 12, 15))[..., None], take.points, np.nan)
+    with pytest.raises(
+        CalibrationError, match="% of the points keep their positions on one rigid body, expected"
+    ):
+        learn_body(capture_of(fingers), "wand")
+    with pytest.raises(CalibrationError, match="a capture of 0 points per frame"):
+        learn_body(Capture(("a",), np.full((5, 1, 3), np.nan), 120.0), "wand")
+    line = np.linspace(0, 0.1, 4)[:, None] * np.array([1.0, 0.0, 0.0]) + rng.normal(0, 1e-5, (9, 4, 3))
+    with pytest.raises(CalibrationError, match="wand: its markers lie on one line"):
+        learn_body(capture_of(line), "wand")
+    with pytest.raises(ArgumentError, match="millimeters"):
+        learn_body(capture_of(1e3 * controller(rng).positions), "wand")

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.space.transforms import quaternion_matrix
-from track.association.frame_state import Numbering
-from track.association.point_linking import PointHistory, PointLinker
+from track.association.frame_state import Numbering, PointHistory, PointLinker
 
 NOWHERE = np.zeros((0, 3))
 

@@ -9,24 +9,32 @@ enough.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures.capture import Capture
+from gloves.captures.plausibility import check_unit
 from gloves.takes.status import Status
 from gloves.takes.take import RigidBody
-from handsim._checks import check_array
-from handsim.errors import ArgumentError
-from handsim.space.objects import RigidObject
-from track.bodies.constellation import (
+from handsim._checks import check_array, check_type
+from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices
+from handsim.files.atomic import atomic_write, read_toml
+from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
+from handsim.hand.topology import SIDES
+from handsim.space.objects import RigidObject, named_object, object_names
+from track.constellation import (
     FEWEST,
     assign_by_id,
     assign_remaining,
     fit_inliers,
     predict_pose,
+    search_constellation,
     shift_to_points,
     track_by_ids,
     transform_markers,
@@ -34,7 +42,7 @@ from track.bodies.constellation import (
     write_labels,
     write_transform,
 )
-from track.bodies.constellation_search import search_constellation
+from track.streams.frame_source import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
@@ -353,3 +361,202 @@ def _frames_to_confirm(count: int, markers: int) -> float:
     if count == FEWEST:
         return 10 if markers == FEWEST else np.inf
     return 2 if count == FEWEST + 1 < markers else 1
+
+
+SUFFIX: Final = ".toml"
+AnyBody = RigidTemplate | str | Path
+"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
+_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
+_BODY_KEYS: Final = ("name", "description", "marker")
+_MARKER_KEYS: Final = ("name", "place_mm")
+
+
+class BodyError(HandSimError):
+    """A body's file that cannot be read or written."""
+
+
+def load_body(name_or_path: AnyBody) -> RigidTemplate:
+    """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
+
+    A body itself is given back.
+    """
+    check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
+    if isinstance(name_or_path, RigidTemplate):
+        return name_or_path
+    path = Path(name_or_path)
+    if str(name_or_path) in object_names():
+        return RigidTemplate.of(named_object(str(name_or_path)))
+    if path.suffix.lower() != SUFFIX:
+        ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
+        unknown = choices(str(name_or_path), ours, noun="body")
+        raise ArgumentError(f"{unknown}, or the path of a .toml file")
+    table = read_toml(path, error=BodyError)
+    try:
+        return _parse_body(table)
+    except HandSimError as error:
+        raise BodyError(f"{path}: {error}") from error
+
+
+def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
+    """Bodies that are tracked together, or one.
+
+    Raises:
+        ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
+        BodyError: A file cannot be loaded.
+    """
+    if isinstance(names_or_paths, AnyBody):
+        names_or_paths = (names_or_paths,)
+    check_type("bodies", names_or_paths, Iterable, _EXPECTED)
+    bodies: list[RigidTemplate] = []
+    for name_or_path in names_or_paths:
+        body = load_body(name_or_path)
+        taken = (*SIDES, *(other.name for other in bodies))
+        if body.name in taken:
+            owner = "" if body is name_or_path else f"{name_or_path}: "
+            raise ArgumentError(
+                f"{owner}a body is named '{body.name}', expected a name of its own; taken are "
+                f"{', '.join(taken)}"
+            )
+        bodies.append(body)
+    return tuple(bodies)
+
+
+def save_body(path: str | Path, body: RigidTemplate) -> None:
+    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again."""
+    lines = [f"name = {quoted(body.name)}"]
+    for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
+        numbers_mm = ", ".join(written(value) for value in position.tolist())
+        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    except OSError as error:
+        raise BodyError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
+    check_keys(table, "the file", _BODY_KEYS, optional=("description", "marker"))
+    text_of(table, "description", default="")
+    name = _printable("the body's name", text_of(table, "name"))
+    markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
+    positions = np.array([position for _, position in markers]).reshape(-1, 3)
+    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * positions)
+
+
+def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
+    name = table.get("name")
+    owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
+    check_keys(table, owner, _MARKER_KEYS)
+    name = _printable("marker name", text_of(table, "name", f"{owner}: "))
+    expected = "three numbers [x, y, z] in millimeters"
+    return name, numbers(f"{owner}: place_mm", table["place_mm"], (3,), expected).tolist()
+
+
+def _printable(what: str, name: str) -> str:
+    """A name that marker files can hold."""
+    if not name or name != name.strip() or not name.isprintable():
+        raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
+    return name
+
+
+_MOST_MARKERS: Final = 20
+_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
+_CANDIDATES: Final = 5  # frames that are tried as the first template
+_ROUNDS: Final = 3  # of averaging the markers over all frames
+_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
+_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
+
+
+def learn_body(capture: Capture, name: str) -> RigidTemplate:
+    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers.
+
+    A first template is taken from one frame and tracked through all frames. Then each marker moves to its
+    median over the frames.
+
+    Args:
+        capture: A capture of the body in motion; gaps and a few false points are allowed. Marker names are
+            not used.
+
+    Raises:
+        ArgumentError: The capture is not in meters.
+        CalibrationError: Most of the points are not of one rigid body, or the body cannot be tracked.
+    """
+    frames = list(capture_frames(capture))
+    check_unit([frame.points for frame in frames])
+    counts = np.array([len(frame.points) for frame in frames])
+    body, tracked = _best_template(name, frames, counts)
+    labeled = _num_labeled(tracked)
+    if labeled < _LABELED_SHARE * counts.sum():
+        raise CalibrationError(
+            f"{100.0 * labeled / counts.sum():.0f} % of the points keep their positions on one rigid body, "
+            "expected a capture with nothing else in it"
+        )
+    for _ in range(_ROUNDS):
+        positions = _median_positions(body, frames, tracked)
+        fault = _fault(name, positions)
+        if fault is not None:
+            raise CalibrationError(fault)
+        body = _template(name, positions)
+        tracked = _track(body, frames)
+    return body
+
+
+def _best_template(
+    name: str, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
+) -> tuple[RigidTemplate, list[BodyFrame]]:
+    """Of several frames' points the template that labels most points, and its track through all frames."""
+    count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
+    if not 3 <= count <= _MOST_MARKERS:
+        raise CalibrationError(
+            f"a capture of {count} points per frame, expected 3 to {_MOST_MARKERS}: one body and nothing else"
+        )
+    chosen = np.flatnonzero(counts == count)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, _CANDIDATES).round().astype(int)]
+    candidates = []
+    faults = {number: _fault(name, frames[number].points) for number in np.unique(chosen)}
+    for number, fault in faults.items():
+        if fault is None:
+            body = _template(name, frames[number].points)
+            candidates.append((body, _track(body, frames)))
+    if not candidates:
+        raise CalibrationError(f"{list(faults.values())[-1]}")
+    return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
+
+
+def _marker_names(positions: NDArray[np.float64]) -> tuple[str, ...]:
+    return tuple(f"Marker{number + 1}" for number in range(len(positions)))
+
+
+def _fault(name: str, positions: NDArray[np.float64]) -> str | None:
+    """What is wrong with a body of markers at these positions (Q, 3), if anything."""
+    return template_fault(name, _marker_names(positions), positions - positions.mean(axis=0))
+
+
+def _template(name: str, positions: NDArray[np.float64]) -> RigidTemplate:
+    """A body of markers at these positions (Q, 3), moved to its own frame."""
+    return RigidTemplate(name, _marker_names(positions), positions - positions.mean(axis=0))
+
+
+def _track(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:
+    tracker = BodyTracker(body)
+    return [tracker.step(frame.points, frame.ids, frame.time) for frame in frames]
+
+
+def _num_labeled(tracked: Sequence[BodyFrame]) -> int:
+    return sum(int((frame.labels >= 0).sum()) for frame in tracked)
+
+
+def _median_positions(
+    body: RigidTemplate, frames: Sequence[StreamedFrame], tracked: Sequence[BodyFrame]
+) -> NDArray[np.float64]:
+    """Median position (Q, 3) of each marker in the body's frame [m]; rarely seen markers are dropped."""
+    seen = np.full((len(frames), len(body.positions), 3), np.nan)
+    for number, (frame, one) in enumerate(zip(frames, tracked, strict=True)):
+        if one.T_world_body is not None:
+            labeled = one.labels >= 0
+            rotation, translation = one.T_world_body[:3, :3], one.T_world_body[:3, 3]
+            seen[number, one.labels[labeled]] = (frame.points[labeled] - translation) @ rotation
+    present = np.isfinite(seen[..., 0])
+    kept = present.sum(axis=0) >= _SEEN_SHARE * present.any(axis=1).sum()
+    median: NDArray[np.float64] = np.nanmedian(seen[:, kept], axis=0)
+    return median
