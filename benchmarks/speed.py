@@ -57,7 +57,7 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from poses.shapes import sample_valid_angles
 from track.settings import warm_up
 from track.tracker import Tracker

@@ -14,7 +14,7 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from gloves.takes.status import Status as Status
+    from gloves.takes.points import Status as Status
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch

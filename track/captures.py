@@ -22,7 +22,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning
-from handsim.hand.topology import NUM_QPOS, Side
+from handsim.hand.shape import NUM_QPOS, Side
 from track.association.frame_state import change_of_distances
 from track.association.initialization import FEWEST_POINTS, label_alone
 from track.bidirectional_labeling import label_both_ways

@@ -15,7 +15,7 @@ from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_choice, check_type, make_settings, shown_value
 from handsim.errors import ArgumentError, HandSimWarning
-from handsim.hand.topology import NUM_QPOS, SIDES, Side
+from handsim.hand.shape import NUM_QPOS, SIDES, Side
 from track.config import BOTH, Size, TrackerConfig
 from track.hand_check import check_hands, check_scale
 from track.hand_size import fit_size

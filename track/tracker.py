@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim._checks import check_type
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.frame_state import FrameState, Numbering, PointHistory, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction

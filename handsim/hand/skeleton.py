@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import BONES, JOINTS, NUM_BONES
+from handsim.hand.shape import BONES, JOINTS, NUM_BONES, HandShape
 from handsim.kernels import pose_bones
 from handsim.space.transforms import MIRROR, euler_matrix
 

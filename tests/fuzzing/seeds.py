@@ -15,9 +15,9 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, starter_layout
-from gloves.takes import columns as table
+from gloves.takes import points as table
+from gloves.takes.archives import GrowingArchive, growing_path
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.growing import GrowingArchive, growing_path
 from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take, take_header, worn_arrays
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape

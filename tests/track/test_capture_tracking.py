@@ -14,7 +14,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import (
     LOST,
     STATUSES,

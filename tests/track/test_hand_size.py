@@ -11,8 +11,7 @@ from scipy.optimize import minimize_scalar
 from gloves.fit import attach
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import ADULTS, DIGITS, SIZES, sample_shape, shape_from_measures
 from poses.motion import sample_motion
 from track.hand_size import (
     _PRECISION,

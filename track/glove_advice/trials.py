@@ -17,8 +17,8 @@ from jaxtyping import Float
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import Side
+from handsim.space.rig import CameraRig
 from track.captures import label_capture, track_capture
 from track.config import BOTH
 from track.hand_size import sample_frames

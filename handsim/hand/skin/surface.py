@@ -16,21 +16,22 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.hand.skin.cage import CageHands
-from handsim.hand.skin.cage_topology import (
+from handsim.hand.shape import NUM_BONES, PALM
+from handsim.hand.skin import (
     CARPUS,
     KNUCKLES,
     METACARPUS,
     PAST_KNUCKLES,
     THENAR,
     WEB,
+    CageHands,
     CageTopology,
     cage_topology,
+    catmull_clark,
     dorsal,
     palmar,
+    subdivided_loops,
 )
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
-from handsim.hand.topology import NUM_BONES, PALM
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
