@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from train.glove_labeler import load_labeler
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
@@ -23,6 +22,7 @@ from track.association.label_consistency import (
     gate_labels,
 )
 from track.config import TrackerConfig
+from train import load_labeler
 from train.labelers.protocol import Labeling
 
 RATE = 120.0
