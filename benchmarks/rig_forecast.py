@@ -23,7 +23,7 @@ from benchmarks.record import describe
 from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.forecast.rig_forecast import Forecast, forecast, light_work, sample_work
 from train.forecast.rig_plan import plan_rig
 from train.simulation.scenes import SimulatedKind

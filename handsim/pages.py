@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -31,8 +31,8 @@ from gloves.optics.visibility import visible_cameras
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, PALM, SIDES
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
+from handsim.space.rig import CameraRig, as_rig
 from track.glove_score import (
     Trial,
     digit_of,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
-from handsim.hand.topology import DIGITS, JOINTS
+from handsim.hand.shape import DIGITS, JOINTS
 from handsim.pages import (
     AMBER,
     BLUE,

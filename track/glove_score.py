@@ -22,8 +22,8 @@ from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.space.rig import CameraRig, as_rig
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
 from track.config import BOTH
@@ -356,7 +356,7 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
         warnings.simplefilter("ignore", HandSimWarning)
         user = measure_hands(capture, layout, labeler=labeler, hands=sides)
         tracked = track_capture(capture, hands=user, labeler=labeler)
-        labeled = label_capture(capture, layout, hands=user, labeler=labeler)
+        labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
     slots, frames = {}, {}
     for name, take in zip(METHODS, (labeled, tracked), strict=True):
         slots[name], frames[name] = right_shares(truth, take)

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
-from handsim.files.atomic import atomic_write, written_together
-from handsim.files.outputs import check_ending
-from handsim.hand.topology import DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.files.outputs import atomic_write, check_ending, written_together
+from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import (
     BAND,
     BLUE,

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Literal, TextIO
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import HandSimWarning
 
 if TYPE_CHECKING:

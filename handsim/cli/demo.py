@@ -13,7 +13,7 @@ from rich.text import Text
 from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
-from handsim.files.atomic import atomic_write, written_together
+from handsim.files.outputs import atomic_write, written_together
 from handsim.pages import write_sections
 
 

@@ -154,7 +154,7 @@ def _hint(default: str) -> str:
     return "" if default in ("", "None") else f"(default: {default})"
 
 
-def _hinted(annotation: Any, aliases: Sequence[str] | None = None) -> Any:
+def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
     """A type whose help tells a default that is one, and nothing where an option may be left out."""
     return Annotated[annotation, tyro.conf.arg(help_behavior_hint=_hint, aliases=aliases)]
 

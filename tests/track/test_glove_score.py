@@ -12,8 +12,8 @@ from gloves.layout import MarkerPlace, load_layout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, JOINT_NAMES, JOINTS
-from handsim.space.cameras import load_rig
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, JOINTS
+from handsim.space.rig import load_rig
 from poses.shapes import sample_poses
 from track.glove_improvement import verdict
 from track.glove_page import trial_rows

@@ -12,7 +12,7 @@ import pytest
 
 from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED, Take
 from handsim.errors import ArgumentError
-from handsim.hand.topology import JOINT_NAMES, JOINTS
+from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track.captures import track_capture
 from track.take_page import decimated, hand_figures, shaded, table_paths, write_take_page
 from train.simulation.takes import simulate_take

@@ -22,7 +22,7 @@ from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruc
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, PoseError
 from handsim.hand.motion import BodyMotion
-from handsim.space.cameras import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
+from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (
     LightSources,

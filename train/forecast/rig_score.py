@@ -38,7 +38,7 @@ from handsim.pages import (
     picture,
     write_sections,
 )
-from handsim.space.cameras import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, as_rig
+from handsim.space.rig import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, as_rig
 from train.forecast.rig_forecast import (
     HALF_SIDE,
     OPTICS,

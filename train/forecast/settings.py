@@ -10,7 +10,7 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, list_layou
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
 from train.labelers.protocol import Labeler
 
 LONGEST_SIDE: Final = 50.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
 from handsim.errors import DatasetError
-from handsim.hand.topology import DIGITS, JOINTS, SIDES
+from handsim.hand.shape import DIGITS, JOINTS, SIDES
 from handsim.pages import (
     BAND,
     BLUE,
@@ -28,7 +28,7 @@ from handsim.pages import (
     picture,
     write_sections,
 )
-from handsim.space.cameras import as_rig
+from handsim.space.rig import as_rig
 from train.data.shards import Dataset, hands_name
 
 if TYPE_CHECKING:

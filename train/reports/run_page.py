@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from gloves.layout import MarkerLayout, stored_layout
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from handsim.pages import (
     BAND,
     BLUE,

@@ -11,7 +11,7 @@ from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.errors import CaptureError
 from handsim.hand.motion import BodyMotion
 from handsim.space.camera import look_at
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train.forecast.rig_forecast import (

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.cameras import CameraRig, named_rig
+from handsim.space.rig import CameraRig, named_rig
 from train.forecast.rig_forecast import light
 from train.forecast.rig_plan import Planning, places, plan_rig, view_candidates
 from train.forecast.settings import MOUNTS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from handsim.space.camera import look_at
-from handsim.space.cameras import ROOM_CENTER, list_rigs, named_rig
+from handsim.space.rig import ROOM_CENTER, list_rigs, named_rig
 from tests.rigs import square_rig
 from train.forecast.rig_forecast import CameraLoss
 from train.forecast.rig_score import (
