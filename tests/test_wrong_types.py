@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ CASES = [
 def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     function = functions()[name]
-    default = inspect.signature(function).parameters[argument].default
+    default = default_of(function, argument)
     if wrong is default or (wrong is None and default is None):
         pytest.skip("the default")
     if is_right(name, argument, wrong):
@@ -86,6 +88,15 @@ def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, m
     said = str(error.value)
     assert said and "\n" not in said, said
     assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def default_of(function, argument: str) -> object:
+    """The default of an argument, or of the field of settings that it stands for."""
+    parameters = inspect.signature(function).parameters
+    if argument in parameters:
+        return parameters[argument].default
+    settings, _ = get_args(get_type_hints(function)["settings"])
+    return next(field.default for field in dataclasses.fields(settings) if field.name == argument)
 
 
 def is_right(name, argument, wrong) -> bool:

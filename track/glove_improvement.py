@@ -134,7 +134,7 @@ def improve_glove(
         settings: How to search.
         name: Name of the new layout.
         on_step: Called with the name of each step.
-        options: Fields of `settings`, by name: `keep=("ThumbTip",)`.
+        options: Fields of `settings`, by name: `keep=("ThumbTip",)`, `minutes=10` [min].
 
     Raises:
         ArgumentError: A setting is unknown or refused.
