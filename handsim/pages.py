@@ -106,7 +106,7 @@ def write_page(path: str | Path, thing: Any) -> None:
 
 def coordinates(point: Iterable[float], separator: str = " ") -> str:
     """A point with two decimals."""
-    return separator.join(f"{one + 0.0:.2f}" for one in point)
+    return separator.join(f"{round(float(one), 2) + 0.0:.2f}" for one in point)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,17 +32,21 @@ def print_line(line: str) -> None:
 def print_table(
     rows: Sequence[Sequence[str | Text]], *, left: int = 1, wraps: bool = False, title: str | None = None
 ) -> None:
-    """Print rows of cells, the header first; the first columns, `left` of them, are words, others numbers."""
+    """Print rows of cells, the header first; the first columns, `left` of them, are words, others numbers.
+
+    Cells keep to one line unless the table `wraps`; units stand below titles then, for eighty columns.
+    """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    cells = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    header, *others = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
     table = Table(box=None, pad_edge=False, title=None if title is None else Text(title))
-    for number, column in enumerate(cells[0]):
+    for number, column in enumerate(header):
         justify: Literal["left", "right"] = "left" if number < left else "right"
-        table.add_column(column, justify=justify, no_wrap=not wraps)
-    for row in cells[1:]:
+        name = column if wraps else Text(column.plain.replace(" [", "\n["))
+        table.add_column(name, justify=justify, no_wrap=not wraps)
+    for row in others:
         table.add_row(*row)
     Console().print(table)
 

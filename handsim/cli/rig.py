@@ -163,9 +163,7 @@ def score_rig(
     with named_steps("getting ready") as step:
         score = rig_score.score_rig(cameras, settings, on_step=step)
     for header, *rows in (rig_score.work_table(score), rig_score.camera_table(score)):
-        # Eighty columns are enough.
-        narrow = [title.replace(" [", "\n[").replace("without ", "without\n") for title in header]
-        print_table([narrow, *rows])
+        print_table([[header[0].replace(" ", "\n"), *header[1:]], *rows])
     print_line(rig_score.COLUMNS_TOLD)
     axes = " x ".join(f"{1e3 * axis:.3f}" for axis in score.whole.error.axes)
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
