@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.settings import Limits, Settings
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, camera_matrix
 from render.fields import normal_numbers, quantiles, random_words
 from render.frames import Flags, Floats, Integers
 

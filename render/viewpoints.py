@@ -18,11 +18,11 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import load_rig
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig import load_rig
+from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.frames import Doubles, Flags, Floats, Integers
 

@@ -15,7 +15,7 @@ from handsim.app.progress import print_above, progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.config import RenderConfig
 from render.depth_sensor import DepthSensor

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from handsim._extras import EGL_PACKAGES
+from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
 from render.frames import Bytes, Doubles
 
