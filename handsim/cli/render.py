@@ -11,7 +11,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
-from handsim.app.progress import print_above, progress_bar
+from handsim.app.progress import progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
@@ -135,14 +135,15 @@ def render(
     check_outputs((take, poses, options.view.cameras), (place if isinstance(place, Path) else None,))
     config, start, counts = options.config(), time.perf_counter(), []
     with (
-        progress_bar("images") as (bar, task),
-        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+        progress_bar("images") as bar,
+        chosen_workers(cluster, workers, bar.say) as chosen,
     ):
 
         def show(done: int, total: int) -> None:
             counts.append((done, total))
             doing = "drawing" if done < total else "writing the annotations and the contact sheet"
-            bar.update(task, completed=done, total=total, description=doing)
+            bar.step(doing)
+            bar(done, total)
 
         count = render_take(source, place, format, config, workers=chosen, progress=show)
     seconds = time.perf_counter() - start
