@@ -38,7 +38,7 @@ from render.captions import (
     titled,
     with_names,
 )
-from render.frames import Doubles, Flags, Integers
+from render.frames import Doubles, Integers
 from render.painting.figures import MARKER_COLOR, Drawn, Material, ball_material, linear, sphere_surface
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, Triangles, join, rasterize
@@ -89,8 +89,7 @@ class PosedHand(NamedTuple):
 
     def vertices(self) -> Float[np.ndarray, "V 3"]:
         """Skin in the world [m]."""
-        vertices: Doubles = self.model.skin(self.qpos[None])[0]
-        return vertices
+        return np.asarray(self.model.skin(self.qpos[None])[0])
 
     def surfaces(self) -> list[Drawn]:
         """Skin with smooth normals, and the glove's markers."""
@@ -166,13 +165,11 @@ def unoccluded(
 ) -> Bool[np.ndarray, "N"]:
     """Which points are in the picture with nothing more than `slack` [m] before them."""
     depth = rasterize(camera, join([one.triangles for one in hand.surfaces()]), with_normals=False).depth
-    assert depth is not None
     column, row = np.floor(camera.project(points)).astype(int).T
     inside = (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
     first = depth[np.clip(row, 0, camera.size[1] - 1), np.clip(column, 0, camera.size[0] - 1)]
     ahead = camera.local(points)[:, 2]
-    free: Flags = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
-    return free
+    return np.asarray(inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack)))
 
 
 SUFFIX: Final = ".mp4"
