@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
-from gloves.takes.growing import GrownArchive
+from gloves.takes.archives import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
 from track.streams import natnet

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.space.camera import Camera, pinhole
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, pinhole
 from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
 from render.depth_sensor import SENSORS, apply_depth_noise, named_sensor, reflectance_of
 from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals

@@ -13,11 +13,10 @@ from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
-from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
-from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, DIGITS
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
+from handsim.hand.shape import BONES, DIGITS
+from handsim.hand.skin import vertex_normals
 from render.formats.records import CENTER, as_sensed
 from render.frames import HandTruth, RenderedFrame
 from render.painting.figures import Material, linear

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.fields import quantiles, random_words
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.kernels import kernel
+from handsim.space.camera import Camera, Lens, camera_matrix
 from render.fields import normal_numbers, quantiles, random_words
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these

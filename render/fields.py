@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt16
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 
 
 @functools.cache

@@ -18,14 +18,12 @@ from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, FileError, HandSimError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIZES
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONE_NAMES, NUM_QPOS
+from handsim.hand.shape import BONE_NAMES, NUM_QPOS, SIZES
+from handsim.hand.skin import vertex_normals
 from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from poses.shapes import gesture, make_valid
 from render.captions import (
     BACKGROUND,

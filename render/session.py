@@ -30,8 +30,7 @@ from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
-from handsim.space.cameras import CameraRig
-from handsim.space.rig_file import check_names
+from handsim.space.rig import CameraRig, check_names
 from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey

@@ -19,11 +19,9 @@ from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.json_files import load_json
-from handsim.files.names import plain_path
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape, pack_hand, sample_shape
-from handsim.hand.topology import NUM_KEYPOINTS, NUM_QPOS, SIDES, Side
+from handsim.files.outputs import plain_path
+from handsim.hand.model import HandModel, hand_keypoints
+from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
 from poses.shapes import load_sampler, mixed_angles

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
-from handsim.hand.keypoints import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.kernels.kernel import kernel
+from handsim.hand.model import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import DIGITS, PALM, bones_of
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times

@@ -23,14 +23,17 @@ from handsim.files.inputs import check_regular, checksum
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import (
     HAND_DTYPE,
+    NUM_JOINTS,
+    NUM_QPOS,
+    SIDES,
     HandShape,
+    Side,
     pack_hand,
     sample_shape,
     shape_from_measures,
     unpack_hand,
 )
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
-from handsim.motion_files.joint_table import read_joint_csv
+from handsim.motion_files.joint_files import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey

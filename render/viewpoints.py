@@ -20,10 +20,10 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import load_rig
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig import load_rig
+from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix
 
 _KEPT: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that a hand's outline depends on

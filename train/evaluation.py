@@ -21,9 +21,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, select_hands
 from gloves.captures.formats import find_captures, read_markers
-from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take, load_take

@@ -13,11 +13,11 @@ from rich.console import Console
 from handsim._checks import check_choice
 from handsim.app.messages import print_line
 from handsim.app.output import Place, place_of
-from handsim.app.progress import print_above, progress_bar
+from handsim.app.progress import progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.config import RenderConfig
 from render.depth_sensor import SENSORS, DepthSensor
@@ -181,14 +181,15 @@ def render(
         _print_left_out(options.photos)
     told: list[tuple[int, int]] = []
     with (
-        progress_bar("images") as (bar, task),
-        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+        progress_bar("images") as bar,
+        chosen_workers(cluster, workers, bar.say) as chosen,
     ):
 
         def show(done: int, total: int) -> None:
             told.append((done, total))
             doing = "drawing" if done < total else "writing the annotations and the contact sheet"
-            bar.update(task, completed=done, total=total, description=doing)
+            bar.step(doing)
+            bar(done, total)
 
         count = render_take(
             source,

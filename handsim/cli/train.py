@@ -40,15 +40,8 @@ def _train(
     if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # the first process tells
         train_labeler(dataset, out, settings, threads=threads)
         return
-    with progress_bar("samples") as (bar, task):
-        card = train_labeler(
-            dataset,
-            out,
-            settings,
-            threads=threads,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-            on_step=lambda step: bar.update(task, description=step),
-        )
+    with progress_bar("samples") as bar:
+        card = train_labeler(dataset, out, settings, threads=threads, progress=bar, on_step=bar.step)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     print_line(f"weights and model card in {out}")
     print_line(f"report in {out / PAGE}")

@@ -26,10 +26,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import DatasetError
-from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
-from handsim.hand.topology import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.hand.model import KEYPOINT_NAMES, SKELETON
+from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.records import (
     CENTER,

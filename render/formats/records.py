@@ -22,11 +22,9 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError, HandSimError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_KEYPOINTS, Side
-from handsim.kernels.kernel import kernel
+from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures, RenderedFrame

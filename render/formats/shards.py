@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write, temporary_beside
+from handsim.files.outputs import atomic_write, temporary_beside
 from render.formats.records import encode_pictures, to_json, without_colors
 from render.frames import RenderedFrame
 

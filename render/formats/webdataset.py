@@ -26,10 +26,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.hand.keypoints import KEYPOINT_DIGITS, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import JOINTS, NUM_BONES, NUM_JOINTS
+from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import JOINTS, NUM_BONES, NUM_JOINTS, HandShape
 from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
 from render.formats.records import (

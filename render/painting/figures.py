@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody
-from handsim.hand.keypoints import keypoint_thickness
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.model import keypoint_thickness
+from handsim.hand.skin import vertex_normals
 from render.frames import PARTS_A_HAND
 from render.painting.rasterizer import Triangles
 from render.skin.look import Forearm, SkinLook, sample_forearm, sample_skin_look

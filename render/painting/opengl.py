@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-from handsim._extras import EGL_PACKAGES
+from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
 
 if TYPE_CHECKING:

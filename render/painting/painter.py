@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.opengl import opengl_has_hardware, paint_opengl

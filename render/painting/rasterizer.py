@@ -19,9 +19,8 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.kernels import kernel
+from handsim.space.camera import Camera, Lens, camera_matrix
 from render.frames import Pictures
 
 NEAR: Final = 0.01

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, nearest_faces, project

@@ -25,10 +25,9 @@ from PIL import Image
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular
-from handsim.files.names import plain_path
-from handsim.kernels.kernel import kernel
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.files.outputs import plain_path
+from handsim.kernels import kernel
+from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
 from render.frames import Pictures
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints

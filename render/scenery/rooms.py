@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from render.fields import normal_numbers
 
 _FURNITURE: Final = (4, 14)

@@ -24,11 +24,16 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.cage_topology import WRIST, cage_topology
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
-from handsim.hand.skin.surface import skin_frames, vertex_normals
-from handsim.hand.topology import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
-from handsim.kernels.kernel import kernel
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
+from handsim.hand.skin import (
+    WRIST,
+    cage_topology,
+    catmull_clark,
+    skin_frames,
+    subdivided_loops,
+    vertex_normals,
+)
+from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import bump, smooth
 from render.frames import FOREARM

@@ -20,16 +20,15 @@ from scipy import ndimage
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import named_shape
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import DIGITS, NUM_BONES
-from handsim.kernels.kernel import kernel
+from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
+from handsim.hand.skin import vertex_normals
+from handsim.kernels import kernel
 from render.fields import bump, noise, smooth
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas
 
 if TYPE_CHECKING:
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 REFERENCE: Final = Forearm(length=0.5)
 """The forearm whose texels are painted; a longer one is stretched."""

@@ -15,8 +15,7 @@ from gloves.takes.take import load_take
 from handsim import Camera, HandModel
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import join_qpos
+from handsim.hand.model import hand_keypoints, join_qpos
 from handsim.space.camera import look_at, pinhole, preset
 from poses import sample_poses
 from render import Backgrounds

@@ -19,8 +19,8 @@ from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
 from track import recorder as module
-from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
+from track.rigid_body import RigidTemplate
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer

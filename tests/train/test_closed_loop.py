@@ -11,7 +11,7 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.cli.main import main
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from render import RenderConfig, draw
 from render.viewpoints import ViewConfig
 from track.captures import track_capture

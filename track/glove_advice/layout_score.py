@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand

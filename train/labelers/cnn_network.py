@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from train.data.batches import Batch, Part
 from train.labelers.cnn_labeler import NUM_MOMENTS, MeanHand, depth_images, random_views
 from train.settings import CNNConfig, TrainSettings

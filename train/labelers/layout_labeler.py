@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gloves.layout import MarkerLayout
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import WeightsError
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import checksum
 from handsim.files.json_files import save_json
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.files.outputs import atomic_write, written_together
+from handsim.hand.shape import SIDES
+from handsim.space.rig import CameraRig, as_rig
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss

@@ -24,9 +24,9 @@ from jaxtyping import Float, Float16, Int
 from gloves.fit import attach_markers, wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, PALM, SIDES
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
 from train.data.batches import Cloud, Corruption, corrupt, stretched
 from train.labelers.layout_labeler import save_layout_network

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from train.labelers.pose_prior import (
     NEAREST,
     PosePrior,

@@ -18,8 +18,7 @@ from jaxtyping import Float, Float32, Int
 from numpy.typing import NDArray
 
 from handsim.errors import WeightsError
-from handsim.kernels.kernel import kernel
-from handsim.kernels.rotations import horn_matrix, write_quaternion_matrix
+from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
 """Components that count, of all those whose mean hand is compared with the points."""

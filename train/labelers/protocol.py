@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
-from gloves.captures.plausibility import check_unit
+from gloves.captures.capture import check_unit
 from handsim._checks import check_count
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError, WeightsError

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from train.labelers.matching import match_scores
 from train.labelers.pose_prior import PosePrior
 from train.labelers.protocol import Labeling, check_clouds, check_output

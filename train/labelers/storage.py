@@ -27,14 +27,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, list_layouts, load_layout
+from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
-from handsim._version import __version__
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
 from train.labelers.pose_prior import PosePrior

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.keypoints import KEYPOINT_NAMES
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.hand.model import KEYPOINT_NAMES
+from handsim.space.camera import Camera, Lens
 from render.formats.records import (
     ABSENT,
     JOINT_ORDERS,

@@ -8,9 +8,8 @@ import trimesh
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.skin.surface import vertex_normals
-from handsim.space.camera import Camera, look_at, pinhole, preset
-from handsim.space.lens import Lens
+from handsim.hand.skin import vertex_normals
+from handsim.space.camera import Camera, Lens, look_at, pinhole, preset
 from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
 from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals

@@ -5,7 +5,7 @@ import pytest
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side
 from poses.shapes import gesture
 from render.illustrations import view_along
 from render.painting.figures import skin_material
