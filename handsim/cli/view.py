@@ -129,7 +129,7 @@ def _view_live(
     from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
     from track.settings import warm_up
-    from track.streams.addresses import open_source
+    from track.streams.live_stream import open_source
     from track.viewer.live_view import LiveView
 
     cameras = None if rig is None else load_rig(rig)
