@@ -31,7 +31,7 @@ from track.streams import LOOPBACK, natnet
 from track.streams.live_stream import open_source
 from track.streams.natnet import ReplayServer, ServerInfo
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

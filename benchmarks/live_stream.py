@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
-from gloves.takes.growing import GrownArchive
+from gloves.takes.archives import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
 from track.streams import LOOPBACK, natnet
@@ -39,7 +39,7 @@ from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream
 from track.streams.natnet import Kind, ReplayServer, ServerInfo, open_stream
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

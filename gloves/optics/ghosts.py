@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_number, check_span
 from handsim.errors import ArgumentError
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 
 def reflect(

@@ -28,10 +28,10 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from gloves.captures.frame_times import HIGHEST_RATE
+from gloves.captures.text import HIGHEST_RATE
 from handsim._checks import check_type
-from handsim._closing import Closing
 from handsim._plugins import is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError
 from handsim.settings import Limits, Settings
 from track.frames import FARTHEST, LATEST_TIME

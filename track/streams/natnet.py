@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import Capture
 from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.settings import Limits, Settings
 from track.inputs import read_points

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track.bodies.rigid_body import BodyTracker, RigidTemplate
+from track.rigid_body import BodyTracker, RigidTemplate
 from track.streams import natnet
 from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import LiveStream, open_source
@@ -287,7 +287,7 @@ def test_multicast_is_heard_on_loopback():
      "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
 )  # fmt: skip
 def test_addresses_that_are_none_are_told(url):
-    with pytest.raises(ArgumentError, match="natnet://host|a port from 1 to 65535"):
+    with pytest.raises(ArgumentError, match=r"natnet://host|a port from 1 to 65535"):
         open_source(url)
 
 
