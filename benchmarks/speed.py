@@ -59,8 +59,7 @@ from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.rig import named_rig
 from poses.shapes import sample_valid_angles
-from track.settings import warm_up
-from track.tracker import Tracker
+from track.tracker import Tracker, warm_up
 from train.data.batches import Corruption, corrupt, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric

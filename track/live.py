@@ -117,7 +117,7 @@ def measured_setup(
         seconds: How long to wait [s], ten seconds at most.
     """
     gc.freeze()  # to look through all that was loaded took the collector a quarter of a second now and then
-    if not setup.is_measured:
+    if not setup.is_auto:
         stream.forgive()
         return setup, stream
     first = _first_frames(stream, setup.fewest_points, seconds, status)

@@ -50,14 +50,14 @@ def _train(
         if world_of().rank:
             _train_silently(dataset, out, config, threads)
             return
-        with progress_bar("samples") as (bar, task):
+        with progress_bar("samples") as bar:
             card = train_labeler(
                 dataset,
                 out,
                 config,
                 threads=threads,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-                on_step=lambda step: bar.update(task, description=step),
+                progress=bar,
+                on_step=bar.step,
             )
     except PeerError as error:  # another process has told it
         raise SystemExit(1) from error

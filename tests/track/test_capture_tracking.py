@@ -195,7 +195,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.captures import track_capture
 from track.label_confidence import label_confidence
-from track.settings import warm_up
+from track.tracker import warm_up
 from track.streams.frame_source import checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
