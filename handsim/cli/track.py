@@ -175,7 +175,7 @@ def _check_options(
 ) -> None:
     from gloves.captures.formats import WRITABLE, check_suffix
     from handsim.cli.options import check_take_file
-    from track.streams.addresses import check_address
+    from track.streams.live_stream import check_address
 
     if (capture is None) == (live is None):
         given = (
