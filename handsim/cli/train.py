@@ -13,8 +13,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.command_table import PresetCommand, given_option
-from handsim.cli.parsing import run_command
+from handsim.cli.parsing import PresetCommand, given_option, run_command
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.signals import Stopped
 from train.devices.world import world_of
