@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.record import describe
 from handsim.space.camera import Camera, Lens, pinhole
 from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
-from render.depth_sensor import SENSORS, apply_depth_noise, named_sensor, reflectance_of
+from render.depth_sensor import DEPTH_NOISES, SENSORS, apply_depth_noise, reflectance_of
 from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals
 
 
@@ -62,7 +62,7 @@ def main() -> None:
 
     print(f"\ndepth noise, {size[0]} x {size[1]}, with normals and colors")
     for name in SENSORS:
-        noise = named_sensor(name)
+        noise = DEPTH_NOISES[name]
         clock(
             name,
             lambda noise=noise: apply_depth_noise(

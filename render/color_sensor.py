@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from render.fields import quantiles, random_words
+from render.frames import Bytes, Floats
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
@@ -86,18 +87,14 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
 
 def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
-    light: NDArray[np.float32] = cv2.LUT(rgb, _decoded())
+    light: Floats = cv2.LUT(rgb, _decoded())
     return light
 
 
 def expose(
     linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture that a sensor takes of light (1 is white, more is as white), sRGB.
-
-    Raises:
-        ArgumentError: The light is not a picture of three colors.
-    """
+    """The picture that a sensor takes of light (1 is white, more is as white), sRGB."""
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
     height, width = linear.shape[:2]
@@ -136,17 +133,17 @@ class _Sensor(NamedTuple):
 
 @kernel
 def _expose(
-    linear: NDArray[np.float32],
+    linear: Floats,
     gain: np.float32,
     lost: np.float32,
     shot: np.float32,
     dark: np.float32,
     words: NDArray[np.uint16],
-    normal: NDArray[np.float32],
-    away: NDArray[np.float32],
-    balance: NDArray[np.float32],
-    curve: NDArray[np.uint8],
-    rgb: NDArray[np.uint8],
+    normal: Floats,
+    away: Floats,
+    balance: Floats,
+    curve: Bytes,
+    rgb: Bytes,
 ) -> None:
     """Write what a sensor makes of light (H, 3 W), row by row, in loops that compile to vector instructions.
 
@@ -185,28 +182,28 @@ def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]
     return _curve().take(scaled.astype(np.uint16), mode="clip")
 
 
-def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+def _through_jpeg(rgb: Bytes, quality: int) -> Bytes:
     done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
-    picture: NDArray[np.uint8] = cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    picture: Bytes = cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     return picture
 
 
 @functools.cache
-def _decoded() -> NDArray[np.float32]:
+def _decoded() -> Floats:
     """Light of the 256 sRGB values (IEC 61966-2-1)."""
     value = np.arange(256) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @functools.cache
-def _root_curve() -> NDArray[np.uint8]:
+def _root_curve() -> Bytes:
     """The sRGB values of light in even steps of its root: sixteen or more to each."""
     return encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
 
 
 @functools.cache
-def _curve() -> NDArray[np.uint8]:
+def _curve() -> Bytes:
     """The sRGB values of light in even steps."""
     light = np.arange(_LEVELS) / (_LEVELS - 1)
     value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
@@ -252,18 +249,6 @@ def shutter_times(
 
     The time in which any row is open is cut into as many equal pieces; a moment is a piece's middle, and a
     row's weights are the shares of its exposure that fall into the pieces.
-
-    Args:
-        exposure: Of a row [s].
-        readout: From the first row's opening to the last one's [s].
-        sub_frames: How many moments.
-        height: Rows of the picture.
-
-    Returns:
-        Times [s], 0 in the middle, and weights, which add up to 1 in every row.
-
-    Raises:
-        ArgumentError: A time is negative or not finite, or there is no moment or no row.
     """
     if not (0.0 <= exposure < np.inf and 0.0 <= readout < np.inf) or sub_frames < 1 or height < 1:
         raise ArgumentError(
@@ -292,11 +277,8 @@ def combine(
 
     Moments come in their order, as sRGB bytes or as light; one is held at a time. Weights are those of
     `shutter_times`.
-
-    Raises:
-        ArgumentError: There are not as many moments as weights, or one has another size.
     """
-    total: NDArray[np.float32] | None = None
+    total: Floats | None = None
     count = 0
     for number, frame in enumerate(sub_frames):
         count = number + 1

@@ -11,18 +11,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice, check_number
+from handsim._checks import check_choice
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
+from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, Lens, camera_matrix
 from render.fields import normal_numbers, quantiles, random_words
+from render.frames import Flags, Floats, Integers
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
 _FIXED: Final = 32.0  # disparities are compared in 1/32 px, which fit sixteen bits up to 1023 px
@@ -106,7 +108,7 @@ def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 
 
 @kernel
-def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
+def _keep_lit(disparity: Floats, kept: Flags) -> None:
     """Clear what is `shadowed` of `kept` (H, W)."""
     height, width = disparity.shape
     most = (
@@ -129,9 +131,7 @@ def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
 
 
 @kernel
-def _keep_supported(
-    disparity: NDArray[np.float32], needed: NDArray[np.int64], most: int, kept: NDArray[np.bool_]
-) -> None:
+def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags) -> None:
     """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
 
     `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
@@ -156,16 +156,16 @@ def _keep_supported(
 
 @kernel
 def _match(
-    disparity: NDArray[np.float32],
-    kept: NDArray[np.bool_],
+    disparity: Floats,
+    kept: Flags,
     shifts: NDArray[np.uint16],
     offsets: NDArray[np.int32],
     words: NDArray[np.uint16],
-    noise: NDArray[np.float32],
+    noise: Floats,
     step: np.float32,
     least: np.float32,
     scale: np.float32,
-    depth: NDArray[np.float32],
+    depth: Floats,
 ) -> None:
     """Write the depth [m] of the pixels that are kept.
 
@@ -256,9 +256,7 @@ def measure_flight(
     return np.where(there, measured, np.float32(0.0))
 
 
-def _mixed(
-    depth: NDArray[np.float32], noise: TimeOfFlight, *, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _mixed(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> Floats:
     """Depth with flying pixels along edges, and 0 where an edge is not measured."""
     mixed = depth.copy()
     if noise.flying + noise.dropped <= 0.0:
@@ -281,11 +279,8 @@ def _mixed(
 
 
 def _sigma(
-    depth: NDArray[np.float32],
-    cosines: NDArray[np.float32] | None,
-    reflectance: NDArray[np.float32] | None,
-    noise: TimeOfFlight,
-) -> NDArray[np.float32] | None:
+    depth: Floats, cosines: Floats | None, reflectance: Floats | None, noise: TimeOfFlight
+) -> Floats | None:
     """Standard deviation of each pixel [m]; None: there is none."""
     c0, c1, c2 = (np.float32(c) for c in noise.sigma)
     if not (any(noise.sigma) or noise.angle_sigma):
@@ -300,10 +295,10 @@ def _sigma(
 
 
 def _drop_weak(
-    there: NDArray[np.bool_],
-    depth: NDArray[np.float32],
-    cosines: NDArray[np.float32] | None,
-    reflectance: NDArray[np.float32] | None,
+    there: Flags,
+    depth: Floats,
+    cosines: Floats | None,
+    reflectance: Floats | None,
     noise: TimeOfFlight,
     *,
     rng: np.random.Generator,
@@ -326,7 +321,7 @@ def _drop_weak(
 
 
 @functools.lru_cache(maxsize=16)
-def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
+def _angle_terms(angle_sigma: float) -> Floats:
     angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
     angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
     return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
@@ -334,7 +329,7 @@ def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
 
 DepthNoise = StructuredLight | TimeOfFlight
 # Numbers and their sources are in docs/sensors.md.
-_SENSORS: Final[dict[str, DepthNoise]] = {
+DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
     "kinect1": StructuredLight(),
     "d435": StructuredLight(
         sensor="d435",
@@ -356,14 +351,14 @@ _SENSORS: Final[dict[str, DepthNoise]] = {
         farthest=3.86,
     ),
 }
-SENSORS: Final = tuple(_SENSORS)
+SENSORS: Final = tuple(DEPTH_NOISES)
 
 
 _OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
 @dataclass(frozen=True, slots=True)
-class DepthSensor:
+class DepthSensor(Settings):
     """A depth sensor whose noise is added to depth, or several, one of which is drawn each time.
 
     Raises:
@@ -372,32 +367,24 @@ class DepthSensor:
 
     sensors: tuple[str, ...] = ("kinect2",)
     """Some of `SENSORS`; a name stands for itself alone."""
-    noise: float = 1.0
+    noise: Annotated[float, Limits(0.0)] = 1.0
     """Factor of the noise that was published of it."""
-    spread: float = 0.2
+    spread: Annotated[float, Limits(0.0)] = 0.2
     """Standard deviation of the logarithm of a copy's noise."""
-    offset: float = 0.0035
+    offset: Annotated[float, Limits(0.0)] = 0.0035
     """Standard deviation of a time-of-flight camera's own offset [m]."""
 
-    def __post_init__(self) -> None:
-        given = (self.sensors,) if isinstance(self.sensors, str) else tuple(self.sensors)
-        names = tuple(_OTHER_NAMES.get(name, name) for name in given)
+    def check(self) -> None:
+        """Refuse names of sensors that are unknown."""
+        names = tuple(_OTHER_NAMES.get(name, name) for name in self.sensors)
         for name in names:
             check_choice(name, SENSORS, noun="depth sensor")
-        for name in ("noise", "spread", "offset"):
-            check_number(name, getattr(self, name), 0.0)
         object.__setattr__(self, "sensors", names)
-
-
-def named_sensor(name: str) -> DepthNoise:
-    """A depth sensor as it was published."""
-    check_choice(name, _SENSORS, noun="depth sensor")
-    return _SENSORS[name]
 
 
 def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> DepthNoise | None:
     """One copy of one of the sensors; None if there are none."""
-    sensors = [named_sensor(name) for name in config.sensors]
+    sensors = [DEPTH_NOISES[name] for name in config.sensors]
     if not sensors:
         return None
     noise = sensors[int(rng.integers(len(sensors)))]
@@ -438,13 +425,13 @@ def apply_depth_noise(
     return measure_flight(depth, cosines, reflectance, noise, rng=rng)
 
 
-def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def _facing(normals: Floats, camera: Camera) -> Floats:
     """Cosines between normals and the rays that come back."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     if camera.lens.kind == "pinhole":
         return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
     rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
-    cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
+    cosines: Floats = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
     np.maximum(cosines, np.float32(0.0), out=cosines)
@@ -452,7 +439,7 @@ def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]
 
 
 @kernel
-def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: float, cy: float) -> Any:
+def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float) -> Any:
     """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
     height, width = normals.shape[:2]
     cosines = np.zeros((height, width), np.float32)
@@ -469,9 +456,7 @@ def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: floa
 
 
 @functools.lru_cache(maxsize=16)
-def _back(
-    size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
-) -> NDArray[np.float32]:
+def _back(size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens) -> Floats:
     """Directions (3, H, W) from what is seen to the camera."""
     rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
     return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
@@ -479,10 +464,10 @@ def _back(
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
-    light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
+    light: Floats = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
     return light
 
 
 @functools.cache
-def _luminance() -> NDArray[np.float32]:
+def _luminance() -> Floats:
     return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
@@ -40,6 +39,7 @@ from render.captions import (
     titled,
     with_names,
 )
+from render.frames import Doubles, Flags, Integers
 from render.painting.figures import MARKER_COLOR, Drawn, Material, ball_material, linear, sphere_surface
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, Triangles, join, rasterize
@@ -54,11 +54,7 @@ _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera: its pose and its field of view.
-
-    Raises:
-        HandSimError: The pose is not (4, 4), or the angle is out of range.
-    """
+    """A camera: its pose and its field of view."""
 
     T_world_camera: Float[np.ndarray, "4 4"]
     """Pose in the world [m], OpenCV axes: x right, y down, z into the picture."""
@@ -82,7 +78,7 @@ class View:
         rotation, center = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         local = (points - center) @ rotation
         focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
-        pixels: NDArray[np.float64] = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
+        pixels: Doubles = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
         return pixels
 
 
@@ -124,14 +120,14 @@ class PosedHand:
 
     def vertices(self) -> Float[np.ndarray, "V 3"]:
         """Skin in the world [m]."""
-        vertices: NDArray[np.float64] = self.model.skin(self.qpos[None])[0]
+        vertices: Doubles = self.model.skin(self.qpos[None])[0]
         return vertices
 
     def markers(self) -> Float[np.ndarray, "M 3"]:
         """Marker centers in the world [m]; none without a glove."""
         if not isinstance(self.hand, GloveFit):
             return np.empty((0, 3))
-        markers: NDArray[np.float64] = self.hand.markers(self.qpos[None])[0][0]
+        markers: Doubles = self.hand.markers(self.qpos[None])[0][0]
         return markers
 
 
@@ -207,11 +203,7 @@ def _ball_surfaces(balls: Balls) -> list[Drawn]:
 
 
 def _surface(
-    vertices: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    colors: NDArray[np.float64],
-    material: Material,
+    vertices: Doubles, normals: Doubles, faces: Integers, colors: Doubles, material: Material
 ) -> Drawn:
     """A surface without ids, its colors (V, 3) linear factors on the material's."""
     ids = np.zeros(len(faces), dtype=np.uint8)
@@ -237,11 +229,7 @@ def render_rgb(
 
 
 def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
-    """Depth picture: distance along the camera's axis [m] at each pixel's center, 0 where there is nothing.
-
-    Raises:
-        ArgumentError: No picture has that size.
-    """
+    """Distance along the camera's axis [m] at each pixel's center, 0 where there is nothing."""
     camera, surfaces = scene.view.camera(size), scene_surfaces(scene)
     if not surfaces:
         return np.zeros(size[::-1], dtype=np.float32)
@@ -253,19 +241,13 @@ def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray,
 def unoccluded(
     depth: Float32[np.ndarray, "H W"], view: View, points: Float[np.ndarray, "N 3"], *, slack: float
 ) -> Bool[np.ndarray, "N"]:
-    """Which points lie in a depth picture with nothing in front of them.
-
-    Args:
-        depth: The picture [m], 0 where there is nothing.
-        points: Points in the world [m].
-        slack: How far behind the first surface a point still counts [m], such as a marker's radius.
-    """
+    """Which points lie in a depth picture with nothing in front of them."""
     height, width = depth.shape
     column, row = np.floor(view.project(points, (width, height))).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     first = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
     ahead = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
-    free: NDArray[np.bool_] = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
+    free: Flags = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
     return free
 
 
@@ -331,11 +313,7 @@ def _check_written(path: Path) -> None:
 
 
 def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:
-    """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out.
-
-    Args:
-        radius: Radius of the points [m].
-    """
+    """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out."""
     hands = tuple(PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all())
     balls = (Balls(frame.points, radius, frame.colors),) if len(frame.points) else ()
     picture = render_rgb(HandScene(view, hands, balls), _SIZE)
@@ -365,12 +343,7 @@ def draw_row(
     covering: Covering = "skin",
     width: int = _WIDTH,
 ) -> Picture:
-    """Hands side by side at one scale, wrists on one line, each with its caption.
-
-    Args:
-        hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
-        direction: Direction of view.
-    """
+    """Hands side by side at one scale, wrists on one line, each with its caption."""
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
     posed, centers, extent = [], [], 0.0
@@ -429,11 +402,7 @@ def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:
     return draw_row(rows, direction=(0.0, -0.75, 1.0))
 
 
-def draw_glove(
-    fit: GloveFit,
-    *,
-    sides: Sequence[str] = tuple(SIDES_OF_HAND),
-) -> Picture:
+def draw_glove(fit: GloveFit, *, sides: Sequence[str] = tuple(SIDES_OF_HAND)) -> Picture:
     """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows."""
     colors = marker_colors(fit.layout)
     hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
@@ -456,10 +425,7 @@ def draw_glove(
 
 
 def draw_camera(
-    fit: GloveFit,
-    qpos: Float[np.ndarray, "27"],
-    rig: CameraRig,
-    camera: int,
+    fit: GloveFit, qpos: Float[np.ndarray, "27"], rig: CameraRig, camera: int
 ) -> tuple[Picture, Bool[np.ndarray, "M"]]:
     """The view of a camera of a rig, zoomed in, and which markers it sees: green, the others red rings."""
     size = _CAMERA_SIZE
@@ -480,9 +446,7 @@ def draw_camera(
     return with_names(picture, pixels, fit.layout.names, colors * 0.8), seen
 
 
-def zoom(
-    towards: NDArray[np.float64], points: NDArray[np.float64], up: NDArray[np.float64], size: tuple[int, int]
-) -> float:
+def zoom(towards: Doubles, points: Doubles, up: Doubles, size: tuple[int, int]) -> float:
     """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
     for _ in range(
@@ -495,10 +459,7 @@ def zoom(
 
 
 def draw_labels(
-    hand: PosedHand,
-    points: Float[np.ndarray, "N 3"],
-    labels: Int[np.ndarray, "N"],
-    layout: MarkerLayout,
+    hand: PosedHand, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], layout: MarkerLayout
 ) -> Picture:
     """A frame's points [m] without labels, and beside them with their labels (-1: a ghost) and the hand."""
     size = _LABELS_SIZE

@@ -23,7 +23,19 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
-from render.frames import FOREARM, PARTS_A_HAND, PASSES, BodyTruth, HandTruth, Pictures, RenderedFrame
+from render.frames import (
+    FOREARM,
+    PARTS_A_HAND,
+    PASSES,
+    BodyTruth,
+    Bytes,
+    Doubles,
+    Flags,
+    Floats,
+    HandTruth,
+    Pictures,
+    RenderedFrame,
+)
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, faces_for, join, rasterize, warp, warp_depth, warp_normals
@@ -68,12 +80,7 @@ def hand_truth(
 
 
 def _visible(
-    keypoints: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    number: int,
-    camera: Camera,
-    pictures: Pictures,
+    keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Pictures
 ) -> Bool[np.ndarray, "21"]:
     """Keypoints whose pixel shows the finger that they are in.
 
@@ -92,7 +99,7 @@ def _visible(
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
     # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
-    visible: NDArray[np.bool_] = own & np.where(ahead, under <= thickness, True)
+    visible: Flags = own & np.where(ahead, under <= thickness, True)
     return visible
 
 
@@ -160,7 +167,7 @@ class Moment:
         (before, after), share = self._around(rows, shift)
         if before[3:7] @ after[3:7] < 0.0:
             after = np.concatenate([after[:3], -after[3:7], after[7:]])
-        pose: NDArray[np.float64] = before + share * (after - before)
+        pose: Doubles = before + share * (after - before)
         pose[3:7] /= np.linalg.norm(pose[3:7])
         return pose
 
@@ -171,12 +178,12 @@ class Moment:
             return None
         poses, share = self._around(rows, shift)
         before, after = pose_matrices(poses)
-        T_world_body: NDArray[np.float64] = before + share * (after - before)
+        T_world_body: Doubles = before + share * (after - before)
         left, _, right = np.linalg.svd(T_world_body[:3, :3])
         T_world_body[:3, :3] = left @ right
         return T_world_body
 
-    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[NDArray[np.float64], float]:
+    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[Doubles, float]:
         """The rows before and after a time, and the share of the way between them.
 
         Rows without numbers, and those of others than the frame's person, count as the frame's own.
@@ -193,15 +200,7 @@ class Moment:
 
 
 class Studio:
-    """Draws moments of the same people and rigid bodies.
-
-    Args:
-        hands: The hands, in the order of the takes.
-        bodies: The rigid bodies, in the order of the takes.
-        body_colors: Color of each of them, sRGB in [0, 1].
-        passes: Some of `PASSES`.
-        painter: What paints colors.
-    """
+    """Draws moments of the same people and rigid bodies."""
 
     def __init__(
         self,
@@ -235,9 +234,6 @@ class Studio:
         """Draw one moment of the studio's hands and bodies, with all other choices.
 
         Where `recorded`, the frame has its choices as JSON and the hands' vertices, which take time.
-
-        Raises:
-            HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
         drawn = self._still(moment)
@@ -347,7 +343,7 @@ class Studio:
     def _noisy_depth(
         self,
         truth: Pictures,
-        rgb: NDArray[np.uint8] | None,
+        rgb: Bytes | None,
         present: Sequence[int],
         camera: Camera,
         sensor: DepthNoise | None,
@@ -384,7 +380,7 @@ class Studio:
         return noisy
 
     def _infrared(
-        self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
+        self, truth: Pictures, rgb: Bytes | None, present: Sequence[int]
     ) -> Float32[np.ndarray, "H W"]:
         """Infrared reflectance of each pixel, from its color; bare skin has its own."""
         assert truth.instances is not None
@@ -416,16 +412,11 @@ class Studio:
         light = light_behind(camera, drawn, choices.lighting, backdrop)
         if light is None:
             return plain
-        lit: NDArray[np.float32] = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
+        lit: Floats = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
         return lit
 
     def _exposed(
-        self,
-        moment: Moment,
-        camera: Camera,
-        rgb: NDArray[np.uint8],
-        choices: FrameChoices,
-        rng: np.random.Generator,
+        self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
     ) -> UInt8[np.ndarray, "H W 3"] | None:
         """The color picture of shutter and sensor; None when they change nothing."""
         if choices.exposure is None and choices.shutter is None:
@@ -439,7 +430,7 @@ class Studio:
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
-    def _requested(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
+    def _requested(self, truth: Pictures, rgb: Bytes | None) -> Pictures:
         ids = "ids" in self.passes
         return Pictures(
             rgb,

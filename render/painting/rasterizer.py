@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens, camera_matrix
-from render.frames import Pictures
+from render.frames import Bytes, Doubles, Flags, Floats, Integers, Pictures
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -60,9 +60,6 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
 
     The surface is closed; the backs of its faces are not drawn.
-
-    Raises:
-        ArgumentError: The camera's lens is not a pinhole.
     """
     if camera.lens.kind != "pinhole":
         raise ArgumentError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', expected a pinhole")
@@ -92,11 +89,6 @@ def nearest_faces(
     """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
 
     Faces that run counter-clockwise in the picture, where y is down, are drawn.
-
-    Args:
-        corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
-            as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
-        farthest: Nearness of nothing.
     """
     nearness = np.full(size[::-1], farthest, dtype=np.float32)
     first = np.full(size[::-1], -1, dtype=np.int32)
@@ -105,7 +97,7 @@ def nearest_faces(
 
 
 @kernel
-def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
+def project(local: Doubles, K: Doubles) -> Any:
     """Pixels [px] and one over the depth [1/m] (V, 3) of points; NaN for those nearer than `NEAR`.
 
     Args:
@@ -133,12 +125,7 @@ def _where_positive(value: float, step: float, low: float, high: float) -> Any:
 
 
 @kernel
-def _draw(
-    corners: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    nearness: NDArray[np.float32],
-    first: NDArray[np.int32],
-) -> None:
+def _draw(corners: Doubles, faces: Integers, nearness: Floats, first: NDArray[np.int32]) -> None:
     """Draw faces into a z-buffer `nearness` with their numbers `first`, both (H, W); see `nearest_faces`."""
     height, width = nearness.shape
     for face in range(len(faces)):
@@ -183,13 +170,13 @@ def _draw(
 
 @kernel
 def _write(
-    inverse: NDArray[np.float32],
+    inverse: Floats,
     first: NDArray[np.int32],
-    labels: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    parts: NDArray[np.uint8],
-    instances: NDArray[np.uint8],
-    markers: NDArray[np.uint8],
+    labels: Bytes,
+    depth: Floats,
+    parts: Bytes,
+    instances: Bytes,
+    markers: Bytes,
 ) -> None:
     """Write depth [m] and ids of the nearest faces, -1 for none; `inverse` is one over the depth (H, W)."""
     height, width = first.shape
@@ -205,11 +192,7 @@ def _write(
 
 @kernel
 def _interpolate(
-    faces: NDArray[np.int64],
-    normals: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    first: NDArray[np.int32],
-    picture: NDArray[np.float32],
+    faces: Integers, normals: Doubles, corners: Doubles, first: NDArray[np.int32], picture: Floats
 ) -> None:
     """Write the unit normals behind the centers of all pixels with a face into `picture` (H, W, 3)."""
     height, width = first.shape
@@ -257,7 +240,7 @@ class _Face:
     size: tuple[int, int]
     focal: float
     center: tuple[float, float]
-    rotation: NDArray[np.float64]
+    rotation: Doubles
     """Rotation (3, 3): the face's axes in the camera's."""
     part: tuple[slice, slice]
     """Rows and columns of the lens's picture that hold all of this face's pixels."""
@@ -273,9 +256,6 @@ def faces_for(camera: Camera) -> list[Camera]:
     """Pinhole cameras at the same position that together see what a camera sees.
 
     A pinhole camera is its only face.
-
-    Raises:
-        ArgumentError: The lens sees nothing, or its faces would be larger than pictures may be.
     """
     if camera.lens.kind == "pinhole":
         return [camera]
@@ -292,9 +272,6 @@ def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interp
     """The picture through the lens, from one for each of `faces_for`; 0 where it sees nothing.
 
     The interpolation is `linear` for colors, `nearest` for ids.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
     """
     if camera.lens.kind == "pinhole":
         return pictures[0].copy()
@@ -311,9 +288,6 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 
     Between pixels of one surface the reciprocal is interpolated, which is exact for planes; at edges the
     nearest pixel counts. What is not ahead of the camera (a fisheye may see it) has depth 0.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
     """
     if camera.lens.kind == "pinhole":
         return depths[0].copy()
@@ -333,11 +307,7 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 def warp_normals(
     camera: Camera, normals: Sequence[Float32[np.ndarray, "h w 3"]]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Normals in the camera's axes from those of its faces in theirs, of the nearest pixels; 0 for nothing.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
-    """
+    """Normals in the camera's axes from those of its faces in theirs; 0 where there is nothing."""
     if camera.lens.kind == "pinhole":
         return normals[0].copy()
     whole = np.zeros((*camera.size[::-1], 3), np.float32)
@@ -401,7 +371,7 @@ def _faces_of_lens(
     return tuple(face for face in faces if face is not None)
 
 
-def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], rotation: NDArray[np.float64]) -> _Face | None:
+def _face(rays: Doubles, mine: Flags, rotation: Doubles) -> _Face | None:
     """The face that has some of a picture's pixels."""
     rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
     if not len(rows):
@@ -428,7 +398,7 @@ def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], rotation: NDArray[
     )
 
 
-def _finest(local: NDArray[np.float64], mine: NDArray[np.bool_]) -> float:
+def _finest(local: Doubles, mine: Flags) -> float:
     """Focal length [px] at which no step between the lens's pixels is less than a pixel of the face."""
     near = local[..., 2] > 0.2  # a face's own pixels are, and their neighbors
     flat = np.full_like(local[..., :2], np.nan)

@@ -9,12 +9,12 @@ import pytest
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, pinhole
 from render.depth_sensor import (
+    DEPTH_NOISES,
     SENSORS,
     DepthSensor,
     StructuredLight,
     TimeOfFlight,
     apply_depth_noise,
-    named_sensor,
     reflectance_of,
     sample_depth_noise,
     shadowed,
@@ -72,7 +72,7 @@ def test_normal_numbers_are_normal():
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_same_seed_gives_the_same_depth(name):
     depth, normals = slanted(1.0, 0.6)
-    first, second, other = (noisy(depth, normals, named_sensor(name), seed) for seed in (3, 3, 4))
+    first, second, other = (noisy(depth, normals, DEPTH_NOISES[name], seed) for seed in (3, 3, 4))
     assert first.dtype == np.float32 and first.shape == SHAPE
     assert first.tobytes() == second.tobytes() != other.tobytes()
     assert np.isfinite(first).all() and (first >= 0.0).all()
@@ -83,9 +83,9 @@ def test_what_is_not_there_stays_away(name):
     depth, normals = facing(0.9)
     depth[50:120, 60:200] = 0.0
     normals[50:120, 60:200] = 0.0
-    assert (noisy(depth, normals, named_sensor(name))[50:120, 60:200][8:-8, 8:-8] == 0.0).all()
+    assert (noisy(depth, normals, DEPTH_NOISES[name])[50:120, 60:200][8:-8, 8:-8] == 0.0).all()
     nothing = np.zeros(SHAPE, np.float32)
-    assert (noisy(nothing, None, named_sensor(name)) == 0.0).all()
+    assert (noisy(nothing, None, DEPTH_NOISES[name]) == 0.0).all()
 
 
 def test_no_noise_changes_no_byte():
@@ -100,7 +100,7 @@ def test_no_noise_changes_no_byte():
 
 def test_disparities_are_eighths_of_a_pixel():
     depth, normals = slanted(1.2, 0.7)
-    noise = named_sensor("kinect1")
+    noise = DEPTH_NOISES["kinect1"]
     out = noisy(depth, normals, noise)
     seen = out > 0
     assert seen.mean() > 0.8
@@ -163,7 +163,7 @@ def test_windows_fail_at_corners_thin_things_and_grazing_angles():
 @pytest.mark.parametrize("distance", [0.7, 1.0, 2.0, 3.0])
 @pytest.mark.parametrize("name", ["kinect2", "azure_kinect"])
 def test_time_of_flight_noise_is_as_stated(name, distance):
-    noise = named_sensor(name)
+    noise = DEPTH_NOISES[name]
     assert isinstance(noise, TimeOfFlight)
     depth, _ = facing(distance)
     c0, c1, c2 = noise.sigma
@@ -188,7 +188,7 @@ def test_time_of_flight_noise_grows_with_the_angle():
 
 def test_dark_surfaces_are_noisier_and_then_gone():
     depth, normals = facing(2.0)
-    noise = dataclasses.replace(named_sensor("azure_kinect"), step=0.0)
+    noise = dataclasses.replace(DEPTH_NOISES["azure_kinect"], step=0.0)
 
     def out(level):
         return noisy(depth, normals, noise, reflectance=reflectance_of(np.full((*SHAPE, 3), level, np.uint8)))
@@ -204,7 +204,7 @@ def test_dark_surfaces_are_noisier_and_then_gone():
 
 def test_steep_surfaces_are_gone():
     camera = pinhole("narrow", (100, 100), 4000.0)
-    noise = named_sensor("kinect2")
+    noise = DEPTH_NOISES["kinect2"]
     shares = []
     for angle in (1.3, 1.44, 1.5):
         depth, normals = slanted(1.0, angle, camera)
