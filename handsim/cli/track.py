@@ -150,7 +150,7 @@ def _print_take(out: Path, tracked: LiveTake, seconds: float) -> None:
 
 def _check_source(capture: Path | None, live: str | None, seconds: float | None, *, calibrate: bool) -> None:
     """Refuse a capture beside a stream, and options that go with the other one."""
-    from track.streams.addresses import check_address
+    from track.streams.live_stream import check_address
 
     if (capture is None) == (live is None):
         both = f"a capture, {capture}, and --live {live}"

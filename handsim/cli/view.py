@@ -110,7 +110,7 @@ def _view_live(
     from handsim.space.rig import load_rig
     from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
-    from track.streams.addresses import open_source
+    from track.streams.live_stream import open_source
     from track.tracker import warm_up
     from track.viewer.live_view import LiveView
 
