@@ -187,8 +187,7 @@ class HandFigure:
 
     def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Centers of the glove's markers in the world [m]."""
-        markers: Doubles = self.fit.markers(qpos[None])[0][0]
-        return markers
+        return np.asarray(self.fit.markers(qpos[None])[0][0])
 
     def _material(self) -> Material:
         if self._painted is None:

@@ -140,8 +140,7 @@ def light_behind(
     mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
     light = 1.0 - np.float32(_SHADED * _key_share(lighting, normal)) * mask
     whole = cv2.resize(light, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
-    shown: Floats = whole[: camera.size[1], : camera.size[0]]
-    return shown
+    return np.asarray(whole[: camera.size[1], : camera.size[0]])
 
 
 @kernel

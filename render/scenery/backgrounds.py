@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -29,8 +29,11 @@ from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
-from render.frames import Bytes, Doubles, Floats, Pictures
+from render.frames import Bytes, Doubles, Floats
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
+
+if TYPE_CHECKING:
+    from render.painting.rasterizer import Geometry
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
@@ -120,8 +123,7 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     scaled = cv2.resize(
         np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     )
-    light: Floats = (scaled.astype(np.float32) / 255.0) ** _GAMMA
-    return light
+    return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
 
 
 SHARE: Final = 0.6
@@ -270,8 +272,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    drawn: Floats = np.clip(picture, 0.0, 1.0, dtype=np.float32)
-    return drawn
+    return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -287,8 +288,7 @@ def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.rand
     y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(angle))
     share = (x[None, :] + y[:, None])[..., None]
     share = 0.5 + 0.5 * share / np.abs(share).max()
-    blend: Floats = first + share * (second - first)
-    return blend
+    return np.asarray(first + share * (second - first))
 
 
 def _octaves(
@@ -323,8 +323,7 @@ def _noise(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.
     grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
     share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
     color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
-    mixed: Floats = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
-    return mixed
+    return np.asarray((first + np.clip(share, 0.0, 1.0) * (second - first)) * color)
 
 
 def _clutter(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
@@ -414,17 +413,14 @@ class Surroundings:
     signs: Int8[np.ndarray, "H W"]
     """Whether it points along that axis (1) or against it (-1)."""
 
-    def put_behind(self, pictures: Pictures, camera: Camera) -> Pictures:
+    def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
         """Pictures of hands and objects with depth and normals behind them, too."""
-        assert pictures.depth is not None and pictures.instances is not None
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
             normals = normals.copy()
             normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
-        return dataclasses.replace(
-            pictures, depth=np.where(bare, self.depth, pictures.depth), normals=normals
-        )
+        return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
 
 
 def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:

@@ -77,8 +77,7 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
-    drawn: Floats = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
-    return drawn
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # rays have no width, pixels have
 
 
 def _seen(scene: _Scene, size: tuple[int, int], across: Floats, down: Floats) -> Floats:

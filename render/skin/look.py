@@ -374,8 +374,7 @@ def _out_of_pictures(
         to_camera = camera.T_world_camera[:3, 3] - elbow
         nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
         bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
-    best: Doubles = tried[int(bad.argmin())]
-    return best
+    return np.asarray(tried[int(bad.argmin())])
 
 
 def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:

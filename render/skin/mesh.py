@@ -266,24 +266,21 @@ class _Skin(NamedTuple):
         size = self.scale
         hill = bump(place[:, 0] - size * at[0], size * along) * bump(place[:, 1] - size * at[1], size * aside)
         hill *= smooth(facing, -0.1, 0.5) * (place[:, 2] > -0.004)
-        result: Doubles = size * height * hill
-        return result
+        return np.asarray(size * height * hill)
 
     def girth(self, bone: int, height: float, at: float, along: float) -> Doubles:
         """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
         place, facing = self.local(bone)
         near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
         hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
-        result: Doubles = self.scale * height * hill
-        return result
+        return np.asarray(self.scale * height * hill)
 
     def ball(self, center: tuple[float, float], height: float, width: float, *, back: bool) -> Doubles:
         """A hill on the back or the palm, around a place of the wrist's frame [m]."""
         size = self.scale
         distance = np.linalg.norm(self.points[:, :2] - size * np.array(center), axis=1)
         facing = self.normals[:, 2] if back else -self.normals[:, 2]
-        result: Doubles = size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6)
-        return result
+        return np.asarray(size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6))
 
 
 def _joint(name: str) -> int:

@@ -485,8 +485,7 @@ def _add(lab: Floats, share: NDArray[Any], color: tuple[float, float, float]) ->
 def lab_to_srgb(lab: NDArray[Any]) -> UInt8[np.ndarray, "H W 3"]:
     """SRGB of CIELAB colors (D65), clipped to the gamut of sRGB."""
     rgb = cv2.cvtColor(np.asarray(lab, dtype=np.float32), cv2.COLOR_Lab2RGB)
-    color: Bytes = np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
-    return color
+    return np.asarray(np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8))
 
 
 @functools.cache
