@@ -48,9 +48,9 @@ from train.forecast.settings import ImproveGloveSettings
 from train.labelers.layout_labeler import learned_labeler, mean_features, shipped_network
 from train.labelers.layout_training import sample_places
 from train.labelers.matching import match_probabilities, pair_probabilities
+from train.labelers.protocol import labeling_threads
 from train.simulation.scenes import sample_hands
 from train.simulation.training_frames import DatasetConfig, sample_single_hand
-from train.threads import labeling_threads
 
 _PEOPLE, _POSES_EACH = 40, 40
 _JOINT_POSES: Final = 6  # poses of a person from which the joints' spread is taken

@@ -31,7 +31,7 @@ from track.inputs import AnyGlove
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import known_hand, pose_spreads, tip_lengths
 from train.data.batches import Corruption, corrupt, paper_corruption
-from train.evaluation import LabelCounts, LabelingReport, evaluate_clouds, evaluate_labeler
+from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
 from train.labelers.layout_labeler import learned_labeler
@@ -222,7 +222,7 @@ def score_layout(
     np.fill_diagonal(near, 0.0)
     return LayoutScore(
         layout,
-        evaluate_clouds(labeler, cloud),
+        evaluate_frames(labeler, [cloud_frames(cloud)]),
         evaluate_labeler(labeler, markers - center, nothing, rng=rng),
         evaluate_labeler(labeler, markers - center, recipe, rng=rng),
         np.isfinite(observed[..., 0]).mean(axis=0),

@@ -22,9 +22,8 @@ from track.frames import FARTHEST, TrackedFrame
 from track.recorder import Recorder
 from track.settings import TrackerSetup
 from track.sinks import SinkGroup
-from track.streams.addresses import open_source
 from track.streams.frame_source import StreamedFrame
-from track.streams.live_stream import MOST_LAG, LiveStream
+from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them

@@ -38,7 +38,7 @@ def label(
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
     from track.captures import label_capture
-    from train.threads import label_on
+    from train.labelers.protocol import label_on
 
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it

@@ -50,9 +50,6 @@ def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dic
     """The visible hands: their indices in the frame, and their entries in each of the lists.
 
     The skin is added where `vertices`, some 150 kB a hand.
-
-    Raises:
-        HandSimError: The camera's lens is not a pinhole.
     """
     K = centered_K(frame.camera).tolist()
     entries = []
@@ -80,10 +77,6 @@ class FreihandWriter:
     One entry per hand: a picture of two hands comes twice. Shards wait in `parts` until `finish` moves their
     pictures to their numbers, which a shard keeps: what is rendered later comes after it. The shards' lists
     stay in `parts`.
-
-    Args:
-        folder: Where the set shall be.
-        vertices: Whether to write `training_verts.json`, some 150 kB a hand.
     """
 
     def __init__(self, folder: Path, *, vertices: bool = False) -> None:
@@ -96,12 +89,7 @@ class FreihandWriter:
         return shards_in(self.parts)
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard.
-
-        Raises:
-            HandSimError: The shard has its numbers already, a camera is not a pinhole camera, there are no
-                color pictures, or the disk takes no more.
-        """
+        """Write a shard."""
         if str(shard) in self._numbers():
             raise HandSimError(f"{self.folder}: shard {shard} is numbered already and cannot be written anew")
         folder = self.parts / shard_name(shard)
@@ -117,11 +105,7 @@ class FreihandWriter:
             save_index(temporary, entries)
 
     def finish(self) -> None:
-        """Number the pictures and write the lists.
-
-        Raises:
-            HandSimError: A shard is damaged, or the disk takes no more.
-        """
+        """Number the pictures and write the lists."""
         with one_sentence(self.folder, "numbering the pictures"):
             numbers = self._numbered()
             for shard, (first, count) in numbers.items():
@@ -129,10 +113,9 @@ class FreihandWriter:
             shards = sorted(numbers, key=lambda shard: numbers[shard])
             names = (*LISTS, "verts") if self.vertices else LISTS
             for name in names:
-                entries = (
-                    entry for shard in shards for entry in load_index(self.parts / shard_name(int(shard)))
-                )
-                save_text(self.folder / f"{SET}_{name}.json", json_list(entry[name] for entry in entries))
+                folders = (self.parts / shard_name(int(shard)) for shard in shards)
+                entries = (entry[name] for folder in folders for entry in load_index(folder))
+                save_text(self.folder / f"{SET}_{name}.json", json_list(entries))
 
     def _numbers(self) -> dict[str, list[int]]:
         """First number and count of every shard that has been numbered."""

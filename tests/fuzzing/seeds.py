@@ -23,7 +23,8 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.rigid_body import RigidTemplate, save_body
-from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
+from track.streams.frame_source import StreamedFrame
+from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
 from track.user import User
 
 FRAMES, COLUMNS = 4, 24
@@ -80,7 +81,7 @@ def c3d(folder: Path) -> list[Path]:
 def csv(folder: Path) -> list[Path]:
     """Two of Motive, with labels of rows and as we write it, one of Vicon among others; two European."""
     from tests.gloves.captures.test_text import rewritten
-    from tests.gloves.captures.test_vicon_csv import DEVICES, nexus
+    from tests.gloves.captures.test_text_formats import DEVICES, nexus
 
     (folder / "take.csv").write_text(MOTIVE)
     write_capture(folder / "ours.csv", capture())
@@ -92,7 +93,7 @@ def csv(folder: Path) -> list[Path]:
 
 
 def tsv(folder: Path) -> list[Path]:
-    from tests.gloves.captures.test_qtm_tsv import qtm
+    from tests.gloves.captures.test_text_formats import qtm
 
     (folder / "take.tsv").write_text(qtm(version=True, events=("Start",)))
     (folder / "bare.tsv").write_text(qtm(columns=False, leading=False))
@@ -132,7 +133,7 @@ def camera_files(folder: Path) -> list[Path]:
 
 def calibrations(folder: Path) -> list[Path]:
     """Of camera systems: Vicon's, Qualisys', Motive's, and OpenCV's of many cameras."""
-    from tests.handsim.space.rig_formats.known_rig import written
+    from tests.handsim.space.known_rig import written
 
     return list(written(folder).values())
 
@@ -243,7 +244,7 @@ def settings(folder: Path) -> list[Path]:
 
 def packets(folder: Path) -> list[Path]:
     rng = _rng()
-    frame = MarkerFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
+    frame = StreamedFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
     info = ServerInfo("Motive", (3, 1), 1511, "239.255.42.99")
     contents = {
         "frame-3.0": pack_frame(frame, (3, 0)),

@@ -29,9 +29,9 @@ from track.captures import track_capture
 from track.config import TrackerConfig
 from track.recorder import TakeRecorder
 from track.rigid_body import RigidTemplate
-from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
-from track.streams.natnet_server import ReplayServer
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
