@@ -884,10 +884,7 @@ def _check(take: Take) -> None:
 
 
 def _check_values(take: Take) -> None:
-    """Raise a `ValueError` for numbers that nothing can be computed with.
-
-    These are times and rates beyond all clocks, and orientations whose quaternions have not unit length.
-    """
+    """Raise a `ValueError` for numbers that nothing can be computed with."""
     _check_range(take.times, -_LATEST, _LATEST)
     _check_range(np.array(take.rate), 1.0 / _LATEST, _LATEST)
     for poses in (take.qpos, take.body_poses):

@@ -37,10 +37,7 @@ _KINDS: Final = (
 
 
 def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
-    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes.
-
-    A path that does not exist, or is a folder, is left to whoever opens it.
-    """
+    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes."""
     try:
         found = path.stat()
     except OSError:

@@ -32,10 +32,7 @@ def as_text(name: str) -> str:
 
 @contextmanager
 def plain_path(path: Path) -> Iterator[Path]:
-    """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other.
-
-    The file need not exist: what is written to the link is written to the file.
-    """
+    """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -214,10 +211,7 @@ def _remove(leftover: Path) -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove what was to become `final`, or was it before, and whose process is gone.
-
-    What processes of other machines left stays.
-    """
+    """Remove what was to become `final`, or was it before, and whose process is gone."""
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)

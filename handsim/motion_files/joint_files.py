@@ -75,10 +75,7 @@ class JointTable(NamedTuple):
 
 
 def read_joint_csv(path: Path) -> JointTable:
-    """The poses in a .csv of `write_joint_csv`, or in another with its columns of frame, time, hand and qpos.
-
-    Further columns, such as the positions of joints, are passed over; columns may come in any order.
-    """
+    """The poses in a .csv of `write_joint_csv`, or another with its columns of frame, time, hand and qpos."""
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:

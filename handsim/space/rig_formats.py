@@ -372,10 +372,7 @@ _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
-    """A camera for each image of a reconstruction in meters, called after it.
-
-    `path` is the folder of `cameras.txt` and `images.txt`, or one of the two.
-    """
+    """A camera for each image of a reconstruction in meters, called after it."""
     folder = path if path.is_dir() else path.parent
     lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
     lines = _colmap_lines(folder / IMAGES, keep_empty=True)
@@ -799,19 +796,12 @@ _CLOSED: Final = {
 
 
 def load_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a file, by its ending.
-
-    Returns:
-        Cameras with intrinsics [px], lenses and poses in the file's world [m].
-    """
+    """The cameras of a file, by its ending."""
     return tuple(one.camera for one in load_lab_cameras(path))
 
 
 def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]:
-    """The cameras of a calibration that see markers, in a world with z up.
-
-    Those that take pictures are left out where there are others, and named in a warning.
-    """
+    """The cameras of a calibration that see markers, in a world with z up."""
     found = load_lab_cameras(path)
     seeing = [one for one in found if not one.video] or list(found)
     if len(seeing) < len(found):
