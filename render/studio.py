@@ -132,14 +132,10 @@ class FrameChoices:
 
     lighting: Lighting
     background: Background
-    exposure: Exposure | None
-    """None for a perfect color sensor."""
-    shutter: Shutter | None
-    """None for a picture of a moment."""
-    depth_noise: DepthNoise | None
-    """None for a perfect depth sensor."""
-    seed: int
-    """Seed of the sensors' noise."""
+    exposure: Exposure | None  # None for a perfect color sensor
+    shutter: Shutter | None  # None for a picture of a moment
+    depth_noise: DepthNoise | None  # None for a perfect depth sensor
+    seed: int  # seed of the sensors' noise
     enclosure: Enclosure | None = None
     """The box whose walls have the background, for several cameras; None: a picture without depth."""
 

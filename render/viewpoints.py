@@ -258,10 +258,8 @@ class _Path(NamedTuple):
     """A camera on its way."""
 
     camera: Camera
-    poses: Doubles
-    """(T, 4, 4)."""
-    zoom: Doubles | None = None
-    """Factor on its focal lengths (T,); None: it keeps them."""
+    poses: Doubles  # (T, 4, 4)
+    zoom: Doubles | None = None  # factor on its focal lengths (T,); None: it keeps them
 
     def at(self, frame: int) -> Camera:
         """The camera of one frame."""
