@@ -61,8 +61,7 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
         reddening += mine * np.clip(share, 0.0, 1.0)
     pale = np.clip(-vertex_normals(surface.vertices, surface.faces)[:, 2], 0.0, 1.0)[:, None]
     paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
-    tint: Doubles = 1.0 + pale * paleness + reddening[:, None] * redness
-    return tint
+    return np.asarray(1.0 + pale * paleness + reddening[:, None] * redness)
 
 
 Picture = UInt8[np.ndarray, "H W 3"]
@@ -164,8 +163,7 @@ def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: f
         blocks.append((mean, count))
     means = np.repeat([mean for mean, _ in blocks], [count for _, count in blocks]) if blocks else slots
     most = max(low, high - (slots[-1] if len(slots) else 0.0))
-    heights: Doubles = np.clip(means, low, most) + slots
-    return heights
+    return np.asarray(np.clip(means, low, most) + slots)
 
 
 def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Picture:
@@ -268,8 +266,7 @@ def _scaled(picture: Picture, scale: float) -> Picture:
     if scale == 1.0:
         return picture
     size = [max(1, round(scale * length)) for length in picture.shape[1::-1]]
-    smaller: Bytes = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return smaller
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 def _padded(picture: Picture, height: int, width: int) -> Picture:

@@ -24,8 +24,7 @@ from handsim._checks import check_count, check_type
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.arrays import check_members
-from handsim.files.json_files import claim
-from handsim.files.outputs import atomic_write, written_together
+from handsim.files.outputs import atomic_write, claim, written_together
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from train.data.batches import (
     Batch,

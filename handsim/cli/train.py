@@ -12,7 +12,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.command_table import PresetCommand, given_option
+from handsim.cli.parsing import PresetCommand, given_option
 from train.settings import KINDS, PRESETS, EvaluateSettings, Preset, TrainSettings, usual_settings
 
 
@@ -80,8 +80,7 @@ def evaluate(
     """
     import numpy as np
 
-    from handsim.files.json_files import save_json
-    from handsim.files.outputs import check_outputs
+    from handsim.files.outputs import check_outputs, save_json
     from train.evaluation import evaluate_labeler, print_figures
     from train.labelers.protocol import label_on
     from train.labelers.storage import load_labeler

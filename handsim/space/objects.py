@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, ObjectError, shortened
-from handsim.files.inputs import check_regular
-from handsim.files.json_files import package_data
+from handsim.files.inputs import check_regular, package_data
 from handsim.space.transforms import axis_angle_matrix
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
@@ -256,13 +255,6 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 
     Cameras see the mesh as it is; fingers touch its convex hull, so they cannot reach into hollows. The
     object carries no markers. A file with several meshes makes one object.
-
-    Args:
-        path: An .stl, .obj, .ply or .glb file, in meters.
-        mass: Its mass [kg].
-
-    Raises:
-        ObjectError: The file cannot be read, or is not a closed surface of a size that a hand can hold.
     """
     path = Path(path)
     mesh = _read_mesh(path)

@@ -35,12 +35,9 @@ _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light 
 class Material:
     """How a surface reflects light: the microfacet model of glTF 2.0, without metals."""
 
-    color: Float[np.ndarray, "3"]
-    """Linear light."""
-    roughness: float
-    """From 0 (mirror) to 1 (chalk)."""
-    glow: float = 0.0
-    """Emitted light, as a share of its color."""
+    color: Float[np.ndarray, "3"]  # linear light
+    roughness: float  # from 0 (mirror) to 1 (chalk)
+    glow: float = 0.0  # emitted light, as a share of its color
     scatter: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Light that travels under the surface, for red, green and blue: cosine beyond grazing at which lamps
     still light it."""
@@ -113,8 +110,7 @@ class Appearance:
 
     skin: SkinLook
     forearm: Forearm
-    glove: GloveLook | None
-    """The marker glove on it, drawn with its markers; None for a bare hand."""
+    glove: GloveLook | None  # the marker glove on it, drawn with its markers; None for a bare hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,8 +118,7 @@ class Drawn:
     """A surface that is ready to be drawn."""
 
     triangles: Triangles
-    colors: Float32[np.ndarray, "V 4"]
-    """Factors on the material's color, linear."""
+    colors: Float32[np.ndarray, "V 4"]  # factors on the material's color, linear
     uv: Float32[np.ndarray, "V 2"] | None
     material: Callable[[], Material]
     """Returns the same material every time; only called for colors, because textures take time."""
@@ -187,8 +182,7 @@ class HandFigure:
 
     def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Centers of the glove's markers in the world [m]."""
-        markers: Doubles = self.fit.markers(qpos[None])[0][0]
-        return markers
+        return np.asarray(self.fit.markers(qpos[None])[0][0])
 
     def _material(self) -> Material:
         if self._painted is None:

@@ -40,18 +40,15 @@ class Lamp:
     """Direction towards the lamp in the camera's axes; of any length."""
     strength: float
     """Light that a white surface facing the lamp reflects, 1 for the picture's full white."""
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Linear color, about 1 in the mean."""
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear color, about 1 in the mean
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
     """All light of one picture."""
 
-    lamps: tuple[Lamp, ...]
-    """The first casts shadows."""
-    ambient: tuple[float, float, float]
-    """Ambient light that a white surface reflects, linear."""
+    lamps: tuple[Lamp, ...]  # the first casts shadows
+    ambient: tuple[float, float, float]  # ambient light that a white surface reflects, linear
     surroundings: tuple[tuple[float, float, float], ...] = ()
     """Ambient light by the surface's normal, see `surroundings.irradiance`; OpenGL uses `ambient` instead."""
 

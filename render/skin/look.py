@@ -212,20 +212,13 @@ _MARGIN: Final = 0.1  # of a picture around it where no arm ends
 class Forearm:
     """A forearm in plain values."""
 
-    length: float = 0.22
-    """Length behind the wrist [m]."""
-    flexion: float = 0.0
-    """Flexion of the wrist towards the palm [rad]."""
-    deviation: float = 0.0
-    """Deviation of the wrist towards the thumb [rad]."""
-    girth: float = 1.0
-    """Factor on the mean girth for the hand's breadth."""
-    sleeve: float = 1.0
-    """Start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm."""
-    sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)
-    """sRGB in [0, 1]."""
-    looseness: float = 1.2
-    """Girth of the sleeve over the arm's in it."""
+    length: float = 0.22  # length behind the wrist [m]
+    flexion: float = 0.0  # flexion of the wrist towards the palm [rad]
+    deviation: float = 0.0  # deviation of the wrist towards the thumb [rad]
+    girth: float = 1.0  # factor on the mean girth for the hand's breadth
+    sleeve: float = 1.0  # start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm
+    sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)  # sRGB in [0, 1]
+    looseness: float = 1.2  # girth of the sleeve over the arm's in it
 
     def __post_init__(self) -> None:
         if not 0.02 <= self.length <= _LONGEST:
@@ -374,8 +367,7 @@ def _out_of_pictures(
         to_camera = camera.T_world_camera[:3, 3] - elbow
         nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
         bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
-    best: Doubles = tried[int(bad.argmin())]
-    return best
+    return np.asarray(tried[int(bad.argmin())])
 
 
 def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:

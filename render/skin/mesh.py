@@ -52,24 +52,19 @@ _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
 class Atlas(NamedTuple):
     """Numbers only; vertices are `HandSurface`'s, then the forearm's rings, then the end's middle."""
 
-    used: Integers
-    """Vertices (U,) of the base surface that are drawn: those from the wrist's ring on."""
+    used: Integers  # vertices (U,) of the base surface that are drawn: those from the wrist's ring on
     wrist: Integers
     """The wrist's ring (R,), indices of the drawn vertices, from the index side over the back."""
     faces: Integers
     """Triangles (F, 3) of the drawn vertices, closed, counter-clockwise from outside on a right hand."""
     corners: Integers
     """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
-    corner_faces: Integers
-    """The same triangles (F, 3) as indices of `corners`."""
+    corner_faces: Integers  # the same triangles (F, 3) as indices of `corners`
     coarse_faces: Integers
     """A quarter as many triangles (G, 3) of the same corners: the surface to a few tenths of a millimeter."""
-    uv: Floats
-    """Texture coordinates (D, 2), the origin at the bottom left."""
-    tiles: Integers
-    """Drawn vertices (K, 5, 5) of each tile's grid."""
-    size: tuple[int, int]
-    """Width and height of the texture [texels]."""
+    uv: Floats  # texture coordinates (D, 2), the origin at the bottom left
+    tiles: Integers  # drawn vertices (K, 5, 5) of each tile's grid
+    size: tuple[int, int]  # width and height of the texture [texels]
 
     @property
     def num_hand(self) -> int:
@@ -188,14 +183,10 @@ _FINGERS: Final = ("index", "middle", "ring", "little")
 class _Hill(NamedTuple):
     """A shape of the skin."""
 
-    joint: int
-    """Whose angle decides the height; -1 for a shape that is always there."""
-    start: float
-    """Angle without height [deg]."""
-    full: float
-    """Angle with full height [deg]."""
-    heights: Doubles
-    """Full height at each vertex (U,) along the normal [m]."""
+    joint: int  # whose angle decides the height; -1 for a shape that is always there
+    start: float  # angle without height [deg]
+    full: float  # angle with full height [deg]
+    heights: Doubles  # full height at each vertex (U,) along the normal [m]
 
 
 class Flexion:
@@ -242,10 +233,8 @@ class _Skin(NamedTuple):
 
     points: Doubles
     normals: Doubles
-    frames: Doubles
-    """Transforms of the bones (16, 4, 4)."""
-    scale: float
-    """Of the hand against the reference."""
+    frames: Doubles  # transforms of the bones (16, 4, 4)
+    scale: float  # of the hand against the reference
 
     def local(self, bone: int) -> tuple[Doubles, Doubles]:
         """Points (U, 3) [m] in a bone's frame, and how far they face its back, -1 to 1 (U,)."""
@@ -266,24 +255,21 @@ class _Skin(NamedTuple):
         size = self.scale
         hill = bump(place[:, 0] - size * at[0], size * along) * bump(place[:, 1] - size * at[1], size * aside)
         hill *= smooth(facing, -0.1, 0.5) * (place[:, 2] > -0.004)
-        result: Doubles = size * height * hill
-        return result
+        return np.asarray(size * height * hill)
 
     def girth(self, bone: int, height: float, at: float, along: float) -> Doubles:
         """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
         place, facing = self.local(bone)
         near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
         hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
-        result: Doubles = self.scale * height * hill
-        return result
+        return np.asarray(self.scale * height * hill)
 
     def ball(self, center: tuple[float, float], height: float, width: float, *, back: bool) -> Doubles:
         """A hill on the back or the palm, around a place of the wrist's frame [m]."""
         size = self.scale
         distance = np.linalg.norm(self.points[:, :2] - size * np.array(center), axis=1)
         facing = self.normals[:, 2] if back else -self.normals[:, 2]
-        result: Doubles = size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6)
-        return result
+        return np.asarray(size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6))
 
 
 def _joint(name: str) -> int:
@@ -360,16 +346,12 @@ class DrawnSkin:
 
     vertices: Float32[np.ndarray, "D 3"]
     """In the world [m]; vertices on borders of texture tiles are repeated for each tile."""
-    normals: Float32[np.ndarray, "D 3"]
-    """Outward unit normals."""
-    uv: Float32[np.ndarray, "D 2"]
-    """Texture coordinates, the origin at the bottom left."""
+    normals: Float32[np.ndarray, "D 3"]  # outward unit normals
+    uv: Float32[np.ndarray, "D 2"]  # texture coordinates, the origin at the bottom left
     shade: Float32[np.ndarray, "D"]
     """Share of the ambient light that the hand itself does not block, 0 to 1."""
-    faces: Int[np.ndarray, "F 3"]
-    """Triangles, counter-clockwise from outside."""
-    parts: UInt8[np.ndarray, "F"]
-    """Bone of each triangle, an index of `topology.BONES` or `FOREARM`."""
+    faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
+    parts: UInt8[np.ndarray, "F"]  # bone of each triangle, an index of `topology.BONES` or `FOREARM`
     coarse_faces: Int[np.ndarray, "G 3"]
     """Fewer triangles of the same vertices, nearly the same surface."""
 

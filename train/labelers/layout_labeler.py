@@ -29,8 +29,7 @@ from gloves.layout import MarkerLayout
 from handsim import __version__
 from handsim.errors import WeightsError
 from handsim.files.inputs import checksum
-from handsim.files.json_files import save_json
-from handsim.files.outputs import atomic_write, written_together
+from handsim.files.outputs import atomic_write, save_json, written_together
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig, as_rig
 from train.data.batches import Cloud, draw_batch

@@ -32,8 +32,7 @@ from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
 from handsim.files.inputs import read_bytes
-from handsim.files.json_files import save_json
-from handsim.files.outputs import atomic_write, plain_path, written_together
+from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
 from train.labelers.pose_prior import PosePrior
