@@ -19,7 +19,6 @@ from render.frames import Doubles, Integers
 from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
 from render.skin.look import SkinLook
 
-_MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
 _SIZE: Final = (64, 48)  # of the picture that gives light
 _DIRECTIONS: Final = 1024
 _MIDDLE_SKIN: Final = 0.3  # reflectance

@@ -174,7 +174,6 @@ def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
     return float(lows[-1] + along)
 
 
-_LONGEST: Final = 1.0  # [m]
 _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
