@@ -18,7 +18,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, DatasetError, PoseError
-from handsim.files.json_files import load_json
+from handsim.files.inputs import load_json
 from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape

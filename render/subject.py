@@ -33,7 +33,7 @@ from handsim.hand.shape import (
     shape_from_measures,
     unpack_hand,
 )
-from handsim.motion_files.joint_files import read_joint_csv
+from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
