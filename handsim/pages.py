@@ -28,26 +28,33 @@ _WRITERS: Final = {
     "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
-INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
-BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
+
+
+class Paint:
+    """The colors of all pictures."""
+
+    INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
+    BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
+
+
 NOTHING: Final = "-"
 """The cell of a table where there is no number."""
 _PICTURES: Final[dict[str, Any]] = {
     "font.size": 9.0,
-    "text.color": INK,
-    "axes.labelcolor": SOFT,
+    "text.color": Paint.INK,
+    "axes.labelcolor": Paint.SOFT,
     "axes.labelsize": 9.0,
     "axes.titlesize": 9.5,
-    "axes.edgecolor": LINE,
+    "axes.edgecolor": Paint.LINE,
     "axes.facecolor": "none",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "xtick.color": LINE,
-    "ytick.color": LINE,
-    "xtick.labelcolor": SOFT,
-    "ytick.labelcolor": SOFT,
-    "figure.facecolor": CARD,  # the page's card, light on dark pages too, so that no frame shows
-    "savefig.facecolor": CARD,
+    "xtick.color": Paint.LINE,
+    "ytick.color": Paint.LINE,
+    "xtick.labelcolor": Paint.SOFT,
+    "ytick.labelcolor": Paint.SOFT,
+    "figure.facecolor": Paint.CARD,  # the page's card, light on dark pages too, so that no frame shows
+    "savefig.facecolor": Paint.CARD,
     "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
 }
 _STYLE: Final = """
@@ -182,12 +189,14 @@ def picture(
     return "data:image/svg+xml;base64," + base64.b64encode(drawn.getvalue()).decode()
 
 
-def color_scale(low: float, high: float, colors: Sequence[str]) -> ScalarMappable:
-    """Colors for numbers from `low` to `high`; `to_rgba` gives the color of one."""
+def color_scale(worst: float, best: float) -> ScalarMappable:
+    """Colors for numbers from the worst to the best; `to_rgba` gives the color of one."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    return ScalarMappable(Normalize(low, high), LinearSegmentedColormap.from_list("scale", list(colors)))
+    colors = [Paint.WARM, Paint.AMBER, Paint.PALE, Paint.BLUE]
+    scale = LinearSegmentedColormap.from_list("scale", colors if worst < best else colors[::-1])
+    return ScalarMappable(Normalize(min(worst, best), max(worst, best)), scale)
 
 
 def color_bar(figure: Figure, colors: ScalarMappable, label: str, **place: Any) -> Axes:

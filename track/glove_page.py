@@ -11,22 +11,7 @@ from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.hand.shape import DIGITS, JOINTS
-from handsim.pages import (
-    AMBER,
-    BLUE,
-    CARD,
-    INK,
-    NOTHING,
-    PALE,
-    SOFT,
-    WARM,
-    Section,
-    color_bar,
-    color_scale,
-    html_list,
-    picture,
-    write_sections,
-)
+from handsim.pages import NOTHING, Paint, Section, color_bar, color_scale, html_list, picture, write_sections
 from track.glove_score import METHODS, NOISE, LayoutScore, Trial
 from train.evaluation import percent
 from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
@@ -150,15 +135,15 @@ def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"
     panel.set_axis_off()
     panel.set_aspect("equal")
     hand.draw(panel, bone_width=2.5, zorder=1)
-    panel.plot(*hand.markers.T, "o", color=SOFT, markersize=5.0, markerfacecolor=CARD, zorder=2)
-    colors = color_scale(0, _MOST, [BLUE, PALE, AMBER, WARM])
+    panel.plot(*hand.markers.T, "o", color=Paint.SOFT, markersize=5.0, markerfacecolor=Paint.CARD, zorder=2)
+    colors = color_scale(_MOST, 0.0)
     for bone in sorted({joint.bone for joint in JOINTS}):
         worst = max(degrees[number] for number, joint in enumerate(JOINTS) if joint.bone == bone)
         x, y = hand.bones[bone - 1][0]
         color = colors.to_rgba(worst)
-        panel.plot(x, y, "o", markersize=15.0, color=color, markeredgecolor=INK, zorder=3)
+        panel.plot(x, y, "o", markersize=15.0, color=color, markeredgecolor=Paint.INK, zorder=3)
         panel.annotate(
-            f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=INK, zorder=4
+            f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=Paint.INK, zorder=4
         )
     color_bar(
         figure, colors, "standard deviation of the worst joint [deg]", ax=panel, shrink=0.6, extend="max"

@@ -35,8 +35,8 @@ from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
 from train.labelers.layout_labeler import learned_labeler
+from train.labelers.pose_prior import SideClassifier
 from train.labelers.protocol import Labeler
-from train.labelers.side import SideClassifier
 from train.labelers.storage import load_labeler
 from train.reports.hand_plot import mistakes
 from train.simulation.scenes import SimulatedKind

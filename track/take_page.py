@@ -23,21 +23,7 @@ from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
-from handsim.pages import (
-    BAND,
-    BLUE,
-    CARD,
-    GREEN,
-    LINE,
-    NOTHING,
-    SOFT,
-    VIOLET,
-    WARM,
-    Section,
-    html_list,
-    picture,
-    write_sections,
-)
+from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
 from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
@@ -53,7 +39,12 @@ _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "larges
 _CHUNK: Final = 4096  # frames whose bones are posed at once
 _MOST_SPANS: Final = 100  # rows; with more a take is not worth reading line by line
 _BINS: Final = 750  # of a long take; the curve has the least and the largest value of each
-_STROKES: Final = (VIOLET, BLUE, WARM, GREEN)  # of a digit's joints, from the knuckle outwards
+_STROKES: Final = (
+    Paint.VIOLET,
+    Paint.BLUE,
+    Paint.WARM,
+    Paint.GREEN,
+)  # of a digit's joints, from the knuckle outwards
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
@@ -292,7 +283,7 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
     names = np.reshape([joint.split("_", 1)[1].replace("_", " ") for joint in JOINT_NAMES], angles.shape[1:])
     for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
         _prepare(panel, times, hand.status)
-        panel.axhline(0.0, color=LINE, linewidth=0.8)
+        panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
         for joint, (name, stroke) in enumerate(zip(names[number], _STROKES, strict=True)):
             values = angles[:, number, joint]
             panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
@@ -355,11 +346,11 @@ def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigu
     panel = figure.subplots()
     starts, ends = _bins(len(times))
     share = np.add.reduceat(hand.seen, starts, axis=0, dtype=np.float64) / (ends - starts)[:, None]
-    colors = LinearSegmentedColormap.from_list("seen", (CARD, BLUE))
+    colors = LinearSegmentedColormap.from_list("seen", (Paint.CARD, Paint.BLUE))
     edges = np.append(times[starts], _end(times))
     rows = np.arange(share.shape[1] + 1)
     panel.pcolormesh(edges, rows, share.T, cmap=colors, vmin=0.0, vmax=1.0, rasterized=True)
-    panel.hlines(rows[1:-1], edges[0], edges[-1], color=CARD, linewidth=1.5)
+    panel.hlines(rows[1:-1], edges[0], edges[-1], color=Paint.CARD, linewidth=1.5)
     panel.set_yticks(rows[:-1] + 0.5, hand.marker_names, fontsize=7.5)
     panel.tick_params(axis="y", length=0.0)
     panel.invert_yaxis()
@@ -381,7 +372,7 @@ def _residuals_section(title: str, take: Take, hand: HandFigures) -> Section:
 def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
     panel = figure.subplots()
     _prepare(panel, times, hand.status)
-    panel.plot(*decimated(times, 1e3 * hand.rms), color=BLUE, linewidth=1.1)
+    panel.plot(*decimated(times, 1e3 * hand.rms), color=Paint.BLUE, linewidth=1.1)
     panel.set_ylim(bottom=0.0)
     panel.set_ylabel("RMS [mm]")
     panel.set_xlabel("time [s]")
@@ -389,13 +380,13 @@ def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFig
 
 def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
     """Grid and limits of a panel, with the frames shaded in which the hand is lost or coasts."""
-    panel.grid(axis="y", color=BAND, linewidth=0.8)
+    panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
     panel.set_xlim(times[0], _end(times))
-    for state, color in ((COASTING, _COASTING), (LOST, LINE)):
+    for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
         spans: Sequence[tuple[float, float]] = shaded(times, status == state)
         across = panel.get_xaxis_transform()
         panel.broken_barh(spans, (0.0, 1.0), transform=across, facecolors=color, linewidth=0.0)
-    panel.tick_params(labelcolor=SOFT)
+    panel.tick_params(labelcolor=Paint.SOFT)
 
 
 def decimated(

@@ -12,10 +12,22 @@ import tyro
 from handsim.app.messages import print_line, print_table
 from handsim.app.progress import named_steps
 from handsim.errors import RigError
-from handsim.files.json_files import save_json
-from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter, written_together
+from handsim.files.outputs import (
+    as_text,
+    check_ending,
+    check_outputs,
+    save_json,
+    write_starter,
+    written_together,
+)
 from handsim.pages import coordinates
-from handsim.space.rig import CameraRig, list_rigs, load_rig, named_rig, rig_description
+from handsim.space.rig import (
+    CameraRig,
+    list_rigs,
+    load_rig,
+    named_rig,
+    rig_description,
+)
 from handsim.space.rig_formats import import_cameras
 from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 

@@ -21,15 +21,8 @@ from gloves.optics.reconstruction import MARKER_RADIUS
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.pages import (
-    AMBER,
-    BLUE,
-    CARD,
-    INK,
-    LINE,
     NOTHING,
-    PALE,
-    SOFT,
-    WARM,
+    Paint,
     Section,
     color_bar,
     color_scale,
@@ -519,10 +512,10 @@ def _draw_losses(figure: Figure, losses: list[CameraLoss], missing: float) -> No
     panel = figure.subplots()
     numbers = np.arange(1, len(losses) + 1)
     without = [100.0 if one.without is None else 100 * one.without.missing for one in losses]
-    panel.bar(numbers, without, color=PALE)
-    panel.axhline(100 * missing, color=WARM, linewidth=1.2)
+    panel.bar(numbers, without, color=Paint.PALE)
+    panel.axhline(100 * missing, color=Paint.WARM, linewidth=1.2)
     end = (numbers[-1] + 0.5, 100 * missing)
-    panel.annotate("with all cameras", end, color=WARM, ha="right", va="bottom", fontsize=8)
+    panel.annotate("with all cameras", end, color=Paint.WARM, ha="right", va="bottom", fontsize=8)
     panel.set_xticks(numbers)
     panel.set_xlabel("without camera")
     panel.set_ylabel("marker-frames missing [%]")
@@ -548,7 +541,7 @@ def _volume_section(score: RigScore) -> Section:
 def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
     """Draw the volume colored by the share of markers that two cameras see, averaged along the view."""
     panels = figure.subplots(1, 2)
-    colors = color_scale(0, 100, [WARM, AMBER, PALE, BLUE])
+    colors = color_scale(0, 100)
     shares = 100 * volume.seen_by_two.reshape(GRID, GRID, GRID)
     points = volume.points.reshape(GRID, GRID, GRID, 3)
     for panel, (title, right, up) in zip(panels, _VIEWS, strict=True):
@@ -558,7 +551,7 @@ def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
             cmap=colors.cmap, norm=colors.norm, shading="nearest", rasterized=False,
         )  # fmt: skip
         _draw_cameras(panel, rig, right, up)
-        panel.set_title(title, color=SOFT)
+        panel.set_title(title, color=Paint.SOFT)
         panel.set_xlabel("x [m]")
         panel.set_ylabel(f"{'xyz'[up]} [m]")
         panel.set_aspect("equal", adjustable="datalim")
@@ -569,8 +562,8 @@ def _draw_cameras(panel: Axes, rig: CameraRig, right: int, up: int) -> None:
     for number, pose in enumerate(rig.T_world_camera, 1):
         begin, ahead = pose[[right, up], 3], pose[[right, up], 2]
         end = begin + _ARROW * ahead
-        panel.plot(*np.stack([begin, end]).T, color=LINE, linewidth=2.0, zorder=2)
-        panel.plot(*begin, "o", color=CARD, markeredgecolor=INK, markersize=11, zorder=3)
+        panel.plot(*np.stack([begin, end]).T, color=Paint.LINE, linewidth=2.0, zorder=2)
+        panel.plot(*begin, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=11, zorder=3)
         panel.annotate(
-            str(number), begin, ha="center", va="center_baseline", fontsize=6.5, color=INK, zorder=4
+            str(number), begin, ha="center", va="center_baseline", fontsize=6.5, color=Paint.INK, zorder=4
         )

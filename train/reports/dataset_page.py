@@ -13,21 +13,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import run_lengths
 from handsim.errors import DatasetError
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
-from handsim.pages import (
-    BAND,
-    BLUE,
-    CARD,
-    INK,
-    LINE,
-    PALE,
-    SOFT,
-    WARM,
-    Section,
-    annotate,
-    color_bar,
-    picture,
-    write_sections,
-)
+from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
 from handsim.space.rig import as_rig
 from train.data.shards import Dataset, hands_name
 
@@ -155,13 +141,15 @@ def _draw_angles(
             panel.sharex(panels[row, 1])
             panel.sharey(panels[row, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
-        panel.axvspan(joint.low, joint.high, color=BAND, linewidth=0)
-        panel.stairs(density, edges[number], fill=True, color=BLUE)
-        panel.set_title(joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=SOFT, fontsize=8.5)
+        panel.axvspan(joint.low, joint.high, color=Paint.BAND, linewidth=0)
+        panel.stairs(density, edges[number], fill=True, color=Paint.BLUE)
+        panel.set_title(
+            joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=Paint.SOFT, fontsize=8.5
+        )
         panel.margins(x=0.03, y=0.08)
-        panel.axhline(0.0, color=LINE, linewidth=0.8)
+        panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
         panel.plot(
-            middle[number], [0.0, 0.0], color=WARM, linewidth=2.6, solid_capstyle="butt", clip_on=False
+            middle[number], [0.0, 0.0], color=Paint.WARM, linewidth=2.6, solid_capstyle="butt", clip_on=False
         )
         panel.xaxis.set_major_formatter("{x:.0f}°")
         panel.locator_params(axis="x", nbins=5)
@@ -172,7 +160,7 @@ def _draw_angles(
     for digit, name in enumerate(DIGITS):
         place = (0.0, 1.0), (0.0, 20.0)
         annotate(panels[0, digit], name, *place, xycoords="axes fraction", weight="bold", fontsize=10.5)
-    figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=SOFT)
+    figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=Paint.SOFT)
 
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
@@ -206,10 +194,12 @@ def _draw_visibility(
     """Bars of the share of frames without each marker; beside them how many cameras see it."""
     rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
-    left.barh(rows, 100.0 * lost, color=BLUE, height=0.62)
+    left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
     for row, share in enumerate(lost):
-        annotate(left, f"{100 * share:.1f}", (100 * share, row), (4, 0), va="center", color=SOFT, fontsize=8)
-    left.set_yticks(rows, names, color=INK, parse_math=False)
+        annotate(
+            left, f"{100 * share:.1f}", (100 * share, row), (4, 0), va="center", color=Paint.SOFT, fontsize=8
+        )
+    left.set_yticks(rows, names, color=Paint.INK, parse_math=False)
     left.set_ylim(len(names) - 0.4, -0.6)
     left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
     left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
@@ -217,14 +207,16 @@ def _draw_visibility(
     most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
     shades = right.pcolormesh(
         np.arange(most + 2) - 0.5, np.arange(len(names) + 1) - 0.5, 100.0 * seen_by[:, : most + 1],
-        cmap="Blues", vmin=0.0, edgecolors=CARD, linewidth=1.2,
+        cmap="Blues", vmin=0.0, edgecolors=Paint.CARD, linewidth=1.2,
     )  # fmt: skip
     means = seen_by @ np.arange(seen_by.shape[1])
-    right.plot(means, rows, "o", color=CARD, markeredgecolor=INK, markersize=4.5, markeredgewidth=0.9)
+    right.plot(
+        means, rows, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=4.5, markeredgewidth=0.9
+    )
     annotate(right, "mean", (means[0], 0.0), (0, 13), ha="center", fontsize=8.0)
     least = min_cameras - 0.5
-    right.axvline(least, color=WARM, linewidth=1.4)
-    annotate(right, f"at least {min_cameras}", (least, -0.5), (3, 3), color=WARM, fontsize=8.0)
+    right.axvline(least, color=Paint.WARM, linewidth=1.4)
+    annotate(right, f"at least {min_cameras}", (least, -0.5), (3, 3), color=Paint.WARM, fontsize=8.0)
     right.set_xlabel("cameras that see it")
     right.locator_params(axis="x", integer=True)
     right.tick_params(axis="y", length=0)
@@ -258,13 +250,13 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
     """Ghosts per frame, and how far [m] each lies from the nearest marker."""
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
     shares = 100.0 * counts / max(1, counts.sum())
-    left.bar(np.arange(len(counts)), shares, color=BLUE, width=0.62)
+    left.bar(np.arange(len(counts)), shares, color=Paint.BLUE, width=0.62)
     for count, share in enumerate(shares):
-        annotate(left, f"{share:.1f}", (count, share), (0, 3), ha="center", color=SOFT, fontsize=8.0)
+        annotate(left, f"{share:.1f}", (count, share), (0, 3), ha="center", color=Paint.SOFT, fontsize=8.0)
     left.set_xlabel("ghosts in a frame")
     left.set_ylabel("share of frames [%]")
     left.locator_params(axis="x", integer=True)
-    right.stairs(*_histogram(distances, _bins(distances)), fill=True, color=BLUE)
+    right.stairs(*_histogram(distances, _bins(distances)), fill=True, color=Paint.BLUE)
     right.set_ylabel("share of ghosts [% per mm]")
     right.set_xlim(left=0.0)
     right.margins(y=0.12)
@@ -272,9 +264,9 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
         right.set_ylim(0.0, 1.0)
     right.set_xlabel("from a ghost to the nearest marker [mm]")
     if len(distances):
-        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", INK)
+        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
     else:
-        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=SOFT)
+        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:
@@ -304,20 +296,20 @@ def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diamete
     """How near each marker's nearest neighbor is, and the nearest pair of each frame [m]."""
     panel = figure.subplots()
     nearest, bins = distances.min(axis=1), _bins(distances)
-    panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=PALE)
-    panel.stairs(*_histogram(nearest, bins), color=BLUE, linewidth=1.6)
+    panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
+    panel.stairs(*_histogram(nearest, bins), color=Paint.BLUE, linewidth=1.6)
     panel.margins(y=0.12)
     panel.set_ylabel("share [% per mm]")
     panel.set_xlabel("distance to the nearest other marker, center to center [mm]")
     for values, name, color in (
-        (nearest, "nearest pair\nof each frame", BLUE),
-        (distances, "every marker", SOFT),
+        (nearest, "nearest pair\nof each frame", Paint.BLUE),
+        (distances, "every marker", Paint.SOFT),
     ):
         shares, _ = _histogram(values.ravel(), bins)
         peak = int(shares.argmax())
         annotate(panel, name, (bins[peak], shares[peak]), (10, 4), color=color, annotation_clip=False)
     panel.set_xlim(left=0.0)
-    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", WARM)
+    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", Paint.WARM)
 
 
 def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
@@ -375,7 +367,7 @@ def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> No
     longest = int(max(ordered[-1], 1.3 * _PUBLISHED_P90[1]))
     steps = np.arange(1, longest + 2)
     shares = 100.0 * np.searchsorted(ordered, steps, side="right") / len(ordered)
-    panel.step(steps, shares, where="post", color=BLUE, linewidth=1.8)
+    panel.step(steps, shares, where="post", color=Paint.BLUE, linewidth=1.8)
     panel.set_xscale("log")
     panel.set_xlim(0.9, 1.15 * longest)
     panel.set_ylim(0.0, 103.0)
@@ -389,9 +381,13 @@ def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> No
     milliseconds.set_xlabel(f"[ms at {rate:g} Hz]")
     for height, name, published in ((50.0, "median", _PUBLISHED_MEDIAN), (90.0, "p90", _PUBLISHED_P90)):
         mine = int(np.percentile(ordered, height, method="inverted_cdf"))
-        panel.axhline(height, color=BAND, linewidth=1.0, zorder=0)
-        panel.plot(published, (height, height), color=WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85)
+        panel.axhline(height, color=Paint.BAND, linewidth=1.0, zorder=0)
+        panel.plot(
+            published, (height, height), color=Paint.WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85
+        )
         told = f"real finger markers: {name} {published[0]} to {published[1]}"
-        annotate(panel, told, (published[1], height), (8, -11), color=WARM)
-        panel.plot(mine, height, "o", color=BLUE, markersize=6.0, markeredgecolor=CARD)
-        annotate(panel, f"{name} {mine}", (mine, height), (-8, 5), color=BLUE, ha="right", weight="bold")
+        annotate(panel, told, (published[1], height), (8, -11), color=Paint.WARM)
+        panel.plot(mine, height, "o", color=Paint.BLUE, markersize=6.0, markeredgecolor=Paint.CARD)
+        annotate(
+            panel, f"{name} {mine}", (mine, height), (-8, 5), color=Paint.BLUE, ha="right", weight="bold"
+        )

@@ -13,20 +13,7 @@ from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONES, PALM
-from handsim.pages import (
-    AMBER,
-    BAND,
-    BLUE,
-    CARD,
-    INK,
-    LINE,
-    PALE,
-    SOFT,
-    WARM,
-    color_bar,
-    color_scale,
-    picture,
-)
+from handsim.pages import Paint, color_bar, color_scale, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,9 +53,9 @@ class FlatHand(NamedTuple):
 
         outlines = [Path(scale * loop + shift, closed=True) for loop in self.outlines]
         outline = Path.make_compound_path(*outlines)
-        panel.add_patch(PathPatch(outline, facecolor=BAND, edgecolor=LINE, linewidth=1.0))
+        panel.add_patch(PathPatch(outline, facecolor=Paint.BAND, edgecolor=Paint.LINE, linewidth=1.0))
         for bone in scale * self.bones + shift:
-            panel.plot(*bone.T, color=LINE, linewidth=bone_width, solid_capstyle="round", **bones)
+            panel.plot(*bone.T, color=Paint.LINE, linewidth=bone_width, solid_capstyle="round", **bones)
 
 
 def flat_hand(layout: MarkerLayout) -> FlatHand:
@@ -165,10 +152,11 @@ def _draw_hand(
     hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
-    colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0, [WARM, AMBER, PALE, BLUE])
+    colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
     for dot, color, ring in zip(dots, colors.to_rgba(100.0 * accuracy), hand.below, strict=True):
-        panel.plot(*dot, "o", markersize=2.0 * _DOT_RADIUS, zorder=5, markeredgecolor=color if ring else INK,
-                   markerfacecolor=CARD if ring else color, markeredgewidth=2.2 if ring else 0.7)  # fmt: skip
+        edge, face, width = (color, Paint.CARD, 2.2) if ring else (Paint.INK, color, 0.7)
+        panel.plot(*dot, "o", markersize=2.0 * _DOT_RADIUS, zorder=5, markeredgecolor=edge,
+                   markerfacecolor=face, markeredgewidth=width)  # fmt: skip
     labels = [short(name) for name in names]
     curves = [arrow_curve(dots[arrow.truth], dots[arrow.called]) for arrow in arrows]
     centers = place_names(labels, dots, curves, (width, height))
@@ -185,13 +173,13 @@ def short(name: str) -> str:
 def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], center: NDArray[np.float64]) -> None:
     """A name, with a line to its dot where it is not beside it."""
     panel.annotate(
-        name, (center[0], center[1]), fontsize=_FONT_SIZE, color=INK, ha="center", va="center_baseline",
+        name, (center[0], center[1]), fontsize=_FONT_SIZE, color=Paint.INK, ha="center", va="center_baseline",
         zorder=6, parse_math=False,
     )  # fmt: skip
     half = np.array(name_extent(name)) / 2.0
     end = np.clip(dot, center - half, center + half)
     if np.linalg.norm(end - dot) > _DISTANCES[1] + 1.0:
-        panel.plot(*np.stack([dot, end]).T, color=SOFT, linewidth=0.5, zorder=4)
+        panel.plot(*np.stack([dot, end]).T, color=Paint.SOFT, linewidth=0.5, zorder=4)
 
 
 def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) -> None:
@@ -204,7 +192,7 @@ def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) 
             FancyArrowPatch(
                 dots[arrow.truth], dots[arrow.called], connectionstyle=f"arc3,rad={_BEND}",
                 arrowstyle=f"-|>,head_length={2.2 + wide},head_width={1.2 + 0.7 * wide}", mutation_scale=1.0,
-                shrinkA=_DOT_RADIUS + 1.0, shrinkB=_DOT_RADIUS + 1.5, color=WARM, linewidth=wide,
+                shrinkA=_DOT_RADIUS + 1.0, shrinkB=_DOT_RADIUS + 1.5, color=Paint.WARM, linewidth=wide,
                 alpha=0.75, zorder=3,
             )
         )  # fmt: skip

@@ -12,21 +12,7 @@ from jaxtyping import Int
 
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.files.outputs import atomic_write
-from handsim.pages import (
-    BAND,
-    BLUE,
-    INK,
-    LINE,
-    NOTHING,
-    PALE,
-    SOFT,
-    WARM,
-    Section,
-    annotate,
-    color_bar,
-    picture,
-    write_sections,
-)
+from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
 from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
 from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
 
@@ -116,26 +102,28 @@ def draw_curves(figure: Figure, history: History) -> None:
     done, losses, rates = np.array(history.losses, dtype=np.float64).reshape(-1, 3).T
     single = "o" if len(done) == 1 else None
     upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=(2.6, 1.5, 0.9))
-    upper.plot(done, losses, color=BLUE, linewidth=1.6, marker=single)
+    upper.plot(done, losses, color=Paint.BLUE, linewidth=1.6, marker=single)
     upper.set_yscale("log")
     for axis in (upper.yaxis.set_major_formatter, upper.yaxis.set_minor_formatter):
         axis(LogFormatter(minor_thresholds=(2.0, 0.5)))
     upper.set_ylabel("loss")
     if history.accuracies:
         seen, _, accuracy = np.array(history.accuracies, dtype=np.float64).T
-        middle.plot(seen, 100.0 * accuracy, "o-", color=WARM, linewidth=1.6, markersize=4.5)
+        middle.plot(seen, 100.0 * accuracy, "o-", color=Paint.WARM, linewidth=1.6, markersize=4.5)
         last = 100.0 * accuracy[-1]
-        annotate(middle, f"{last:.2f}", (seen[-1], last), (0, -12), ha="right", color=WARM, weight="bold")
+        annotate(
+            middle, f"{last:.2f}", (seen[-1], last), (0, -12), ha="right", color=Paint.WARM, weight="bold"
+        )
     middle.set_ylabel("held-out slots\nright [%]")
     middle.margins(y=0.2)
-    lower.plot(done, rates, color=SOFT, linewidth=1.4, marker=single)
+    lower.plot(done, rates, color=Paint.SOFT, linewidth=1.4, marker=single)
     lower.set_ylabel("learning\nrate")
     lower.set_ylim(bottom=0.0)
     lower.set_xlim(left=0.0)
     lower.xaxis.set_major_formatter("{x:,.0f}")
     lower.set_xlabel("samples")
     for panel in (upper, middle, lower):
-        panel.grid(axis="y", which="major", color=BAND, linewidth=0.8)
+        panel.grid(axis="y", which="major", color=Paint.BAND, linewidth=0.8)
     figure.align_ylabels()
 
 
@@ -172,17 +160,17 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
     panel: Axes = figure.subplots()
     for place, right in enumerate(shares.diagonal()):
         low, high = place - 0.5, place + 0.5
-        panel.fill([low, high, high, low], [low, low, high, high], color=BAND, linewidth=0)
+        panel.fill([low, high, high, low], [low, low, high, high], color=Paint.BAND, linewidth=0)
         if len(classes) <= _MOST_WRITTEN and np.isfinite(right):
             panel.annotate(f"{right:.1f}" if right < 99.95 else "100", (place, place), ha="center",
-                           va="center", fontsize=6.0, color=SOFT)  # fmt: skip
+                           va="center", fontsize=6.0, color=Paint.SOFT)  # fmt: skip
     edges = np.arange(len(classes) + 1) - 0.5
     shades = panel.pcolormesh(edges, edges, np.ma.masked_invalid(wrong), cmap="Oranges", norm=norm)
-    panel.hlines(edges, edges[0], edges[-1], color=BAND, linewidth=0.5)
-    panel.vlines(edges, edges[0], edges[-1], color=BAND, linewidth=0.5)
+    panel.hlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
+    panel.vlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
     small = 8.0 if len(classes) <= _MOST_WRITTEN else 6.5
-    panel.set_xticks(places, classes, rotation=90, fontsize=small, color=INK, parse_math=False)
-    panel.set_yticks(places, classes, fontsize=small, color=INK, parse_math=False)
+    panel.set_xticks(places, classes, rotation=90, fontsize=small, color=Paint.INK, parse_math=False)
+    panel.set_yticks(places, classes, fontsize=small, color=Paint.INK, parse_math=False)
     panel.set_xlim(edges[0], edges[-1])
     panel.set_ylim(edges[-1], edges[0])
     panel.set_aspect("equal")
@@ -248,15 +236,15 @@ def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
     """Share right by confidence, and below it how many points have that confidence."""
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3.0, 1.0))
     there = bins.count > 0
-    upper.plot([0.0, 100.0], [0.0, 100.0], color=LINE, linewidth=1.4, zorder=1)
+    upper.plot([0.0, 100.0], [0.0, 100.0], color=Paint.LINE, linewidth=1.4, zorder=1)
     confidence, right = 100.0 * bins.confidence[there], 100.0 * bins.right[there]
-    upper.vlines(confidence, confidence, right, color=WARM, linewidth=2.0, zorder=2)
-    upper.plot(confidence, right, "o-", color=BLUE, markersize=5.0, linewidth=1.4, zorder=3)
+    upper.vlines(confidence, confidence, right, color=Paint.WARM, linewidth=2.0, zorder=2)
+    upper.plot(confidence, right, "o-", color=Paint.BLUE, markersize=5.0, linewidth=1.4, zorder=3)
     upper.set_ylim(-3.0, 103.0)
     upper.set_ylabel("points right [%]")
-    upper.set_title(f"expected calibration error {100.0 * error:.2f} %", loc="left", color=WARM)
+    upper.set_title(f"expected calibration error {100.0 * error:.2f} %", loc="left", color=Paint.WARM)
     edges = np.linspace(0.0, 100.0, BINS + 1)
-    lower.stairs(np.maximum(bins.count, 0.5), edges, fill=True, color=PALE, baseline=0.5)
+    lower.stairs(np.maximum(bins.count, 0.5), edges, fill=True, color=Paint.PALE, baseline=0.5)
     lower.set_yscale("log")
     lower.set_ylim(0.5, 2.0 * max(1, int(bins.count.max())))
     lower.set_ylabel("points")
