@@ -39,6 +39,7 @@ from gloves.captures.text import (
     cell_number,
     check_width,
     header_cells,
+    marker_titles,
     meters_per,
     parse_table,
     plain_lines,
@@ -85,19 +86,8 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
     names += _unnamed(lines[_HEADER_LINES:], len(names))
 
-    def column_name(column: int) -> str:
-        if column < _LEADING:
-            return ("frame number", "time")[column]
-        marker, axis = divmod(column - _LEADING, 3)
-        return f"{names[marker]} {'XYZ'[axis]}"
-
-    table = parse_table(
-        lines,
-        start=_HEADER_LINES,
-        ended=ended,
-        num_columns=_LEADING + 3 * len(names),
-        column_name=column_name,
-    )
+    titles = marker_titles(("frame number", "time"), names)
+    table = parse_table(lines, start=_HEADER_LINES, ended=ended, titles=titles)
     positions = table[:, _LEADING:].reshape(len(table), len(names), 3) * scale
     times = StatedTimes(
         stated.get("datarate", ""),
@@ -211,8 +201,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=end + 1,
         ended=ended,
-        num_columns=len(axes),
-        column_name=lambda column: f"{names[column]} {axes[column]}".strip(),
+        titles=[f"{name} {axis}".strip() for name, axis in zip(names, axes, strict=False)],
         text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
     )
     positions = table[:, np.array(columns)[:, None] + np.arange(3)]
@@ -343,8 +332,7 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
         lines[:end],
         start=start,
         ended=ended or end < len(lines),
-        num_columns=len(axes),
-        column_name=lambda column: f"{_name_of(names, column)} {axes[column]}".strip(),
+        titles=[f"{_name_of(names, column)} {axis}".strip() for column, axis in enumerate(axes)],
     )
     positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
@@ -412,19 +400,8 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
     names = _names(stated)
     start, leading = _begin_of_rows(lines, start, 3 * len(names))
 
-    def column_name(column: int) -> str:
-        if column < leading:
-            return _QTM_LEADING[column]
-        marker, axis = divmod(column - leading, 3)
-        return f"{names[marker]} {'XYZ'[axis]}"
-
-    table = parse_table(
-        lines,
-        start=start,
-        ended=ended,
-        num_columns=leading + 3 * len(names),
-        column_name=column_name,
-    )
+    titles = marker_titles(_QTM_LEADING[:leading], names)
+    table = parse_table(lines, start=start, ended=ended, titles=titles)
     positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per(_UNIT)
     times = StatedTimes(
         _first(stated, "FREQUENCY"),

@@ -56,7 +56,8 @@ from handsim.hand.shape import (
 from handsim.motion_files.motion import (
     OPENXR_SUFFIX,
     Motion,
-    posed_hands,
+    PosedBody,
+    PosedHand,
     write_bvh,
     write_joint_csv,
     write_joint_parquet,
@@ -91,7 +92,7 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
     """The keypoints of all hands as markers, in the take's axes, so that they lie among its markers."""
     del up
     positions, names = [], []
-    for hand in posed_hands(motion):
+    for hand in motion.hands:
         keypoints = hand_keypoints(hand.model, hand.qpos)
         positions.append(np.where(hand.present[:, None, None], keypoints, np.nan))
         names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
@@ -655,7 +656,7 @@ class Take:
         motion = self.poses_alone(rate)
         if form.steady and not is_steady(motion.times, motion.rate):
             motion = motion.poses_alone(motion.rate)
-        form.write(path, motion, up)
+        form.write(path, posed_motion(motion), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take (.npz), whole or not at all; `load_take` gives the same numbers again.
@@ -686,6 +687,13 @@ class Take:
         check_choice(name, names, noun="hand or body")
         counts = [hand.layout.num_markers for hand in self.hands]
         return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
+
+
+def posed_motion(take: Take) -> Motion:
+    """The hands and bodies of a take, each with a pose in one frame at least, as writers take them."""
+    hands = [PosedHand.of(hand.model, take.qpos[:, n]) for n, hand in enumerate(take.hands)]
+    bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
+    return Motion(take.rate, take.times, hands, bodies)
 
 
 def load_take(path: str | Path) -> Take:
