@@ -42,8 +42,16 @@ from gloves.takes.points import (
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
+from handsim.hand.model import (
+    KEYPOINT_NAMES,
+    HandModel,
+    HandMotion,
+    between_poses,
+    bridge_gaps,
+    hand_keypoints,
+    is_steady,
+    times_at,
+)
 from handsim.hand.shape import (
     HAND_DTYPE,
     JOINT_NAMES,

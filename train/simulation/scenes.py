@@ -16,8 +16,7 @@ from gloves.fit import GlovedHand, GloveFit, wear
 from gloves.layout import MarkerLayout
 from handsim._checks import check_count
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import ADULTS, BONES, EVERYBODY, NUM_JOINTS, SIDES, Population, sample_shape
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import CameraRig
