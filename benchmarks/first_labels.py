@@ -27,7 +27,7 @@ from train.data.shards import Dataset
 from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 from train.training_state import TrainingState
 
 GLOVE = "dense19"
@@ -70,7 +70,7 @@ def race(
 ) -> dict[str, dict[str, float]]:
     """Minutes from the start until the paper's best network was beaten, by test set and kind of test."""
     start, measuring = time.perf_counter(), 0.0
-    make_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
+    make_dataset(GenerateSettings(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
     recipe = batch_recipe(config, len(names))

@@ -39,7 +39,7 @@ from train.labelers import kinds
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.protocol import Labeler
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 SECTIONS: Final = ("labels", "training", "pictures")
 CPU: Final = torch.device("cpu")
@@ -91,7 +91,7 @@ def labels(count: int) -> None:
 def training(samples: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         dataset = Path(folder) / "set"
-        make_dataset(DatasetConfig(num_frames=20_000), dataset)
+        make_dataset(GenerateSettings(num_frames=20_000), dataset)
         plans = [("cpu", "32"), *((("cuda", "32"), ("cuda", "bf16")) if len(devices()) > 1 else ())]
         for kind, count in (("set", samples), ("cnn", samples // 20)):
             for device, precision in plans:

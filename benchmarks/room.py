@@ -41,11 +41,11 @@ from train.simulation.room import (
 )
 from train.simulation.scenes import sample_hands
 from train.simulation.takes import sample_scene, simulate_take
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
-PEOPLE = DatasetConfig()
+PEOPLE = GenerateSettings()
 
 
 class Stopwatch:

@@ -73,7 +73,7 @@ from train.labelers.storage import load_network
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 from train.threads import TrainingThreads
 from train.training_state import TrainingState
 
@@ -293,7 +293,7 @@ def training(speeds: Speeds) -> None:
     torch.set_num_threads(CORES)
     config = default_config("cnn")
     with tempfile.TemporaryDirectory() as folder:
-        make_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
+        make_dataset(GenerateSettings(num_frames=2000), Path(folder) / "set")
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
         rng, recipe = np.random.default_rng(0), batch_recipe(config, rows["markers"].shape[1])
@@ -376,7 +376,7 @@ def generation(speeds: Speeds) -> None:
         ("frames_mix_one", "the default mix", SceneMix(), 1),
     ):
         with tempfile.TemporaryDirectory() as folder:
-            config = DatasetConfig(num_frames=speeds.some(100_000, 3000), scenes=scenes)
+            config = GenerateSettings(num_frames=speeds.some(100_000, 3000), scenes=scenes)
             seconds = timed(lambda: make_dataset(config, Path(folder) / "set", workers=workers))  # noqa: B023
         speeds.rate(key, f"training frames of {name}, workers: {workers}", config.num_frames / seconds)
 

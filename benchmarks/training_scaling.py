@@ -25,7 +25,7 @@ import torch
 from benchmarks.record import describe
 from train.loop import CHECKPOINT
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main; sys.exit(main())"]
 EVERY = 1.0  # [s] between two looks at the memory
@@ -67,7 +67,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         dataset = given.set or Path(folder) / "set"
         if given.set is None:
-            make_dataset(DatasetConfig(num_frames=given.frames), dataset)
+            make_dataset(GenerateSettings(num_frames=given.frames), dataset)
         runs: dict[int, list[Run]] = {devices: [] for devices in given.devices}
         for seed in range(given.seeds):
             for devices in given.devices:

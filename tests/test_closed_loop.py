@@ -14,7 +14,7 @@ from handsim.hand.model import HandModel
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
 from track.captures import track_capture
-from train.simulation.takes import TakeConfig
+from train.simulation.takes import SimulateSettings
 
 MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0
@@ -24,7 +24,7 @@ FRAMES = 120
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
-    simulate(folder / "take.c3d", TakeConfig(kind="hand-hand", num_frames=FRAMES))
+    simulate(folder / "take.c3d", SimulateSettings(kind="hand-hand", num_frames=FRAMES))
     return load_take(folder / "take.truth.npz"), folder
 
 

@@ -19,7 +19,7 @@ from train.glove_labeler import load_labeler
 from train.labelers.storage import WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 from train.training_state import TrainingError
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
@@ -30,7 +30,7 @@ OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--n
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 

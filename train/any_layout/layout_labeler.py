@@ -29,7 +29,7 @@ from train.labelers.protocol import Labeling, label_by_scores, label_in_batches,
 from train.matching.pose_prior import PosePrior
 from train.matching.prior_learning import learn_pose_prior
 from train.simulation.scenes import sample_hands, wear_gloves
-from train.simulation.training_frames import DatasetConfig, sample_single_hand
+from train.simulation.training_frames import GenerateSettings, sample_single_hand
 from train.threads import labeling_threads
 
 NUM_POSES: Final = 40_000
@@ -164,13 +164,13 @@ def sample_worn_markers(
     Raises:
         LayoutError: A marker misses the skin.
     """
-    config = DatasetConfig()
+    config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts = []
     for first in range(0, num_frames, _POSES_EACH):
         count = min(_POSES_EACH, num_frames - first)
         right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
-        scene = sample_single_hand(right, count, config.poses, config.volume, rng=rng)
+        scene = sample_single_hand(right, count, config, rng=rng)
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)

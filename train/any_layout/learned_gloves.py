@@ -32,7 +32,7 @@ from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.labelers.storage import LEARNED, learned_folder, learned_gloves
 from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, simulate_frames
+from train.simulation.training_frames import FrameSource, GenerateSettings, simulate_frames
 from train.threads import torch_threads
 
 MOST: Final = 32
@@ -163,9 +163,10 @@ def _simulated_rows(
     layout: MarkerLayout, rig: CameraRig, num_frames: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Frames as a training set has them, see `train.data.shards.row_dtype`."""
-    config = DatasetConfig()
+    config = GenerateSettings()
+    source = FrameSource(config, layout, rig)
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
     for first in range(0, num_frames, _FRAMES_EACH):
         models = sample_hands(config.population, rng=rng)
-        simulate_frames(rows[first : first + _FRAMES_EACH], models, layout, rig, config, rng=rng)
+        simulate_frames(rows[first : first + _FRAMES_EACH], models, source, rng=rng)
     return rows

@@ -4,44 +4,34 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Annotated, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_callable, check_number, check_rng, check_type, shown_value
+from handsim._checks import check_callable, check_rng, check_type, shown_value
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.topology import SIDES
+from handsim.settings import Limits, Settings
 from train.data.shards import MappedRows
 
 _MOST: Final = 100  # points to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
-class Corruption:
-    """The paper's corruption, as it is drawn for training and for tests.
+class Corruption(Settings):
+    """The paper's corruption, as it is drawn for training and for tests."""
 
-    Raises:
-        ArgumentError: A number is of another type or out of range.
-    """
-
-    occlude: int = 5
+    occlude: Annotated[int, Limits(0, _MOST)] = 5
     """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
-    ghosts: int = 2
+    ghosts: Annotated[int, Limits(0, _MOST)] = 2
     """Most ghosts added, uniform in the sample's box grown by `margin`."""
-    jitter: float = 0.0
+    jitter: Annotated[float, Limits(0.0, 0.1)] = 0.0
     """Half width of the uniform noise on each coordinate [m]."""
-    margin: float = 0.1
+    margin: Annotated[float, Limits(0.0, 10.0)] = 0.1
     """Growth of the box [share of its sides]."""
-
-    def __post_init__(self) -> None:
-        for name in ("occlude", "ghosts"):
-            check_type(name, getattr(self, name), (int, np.integer), "a whole number")
-            check_number(name, getattr(self, name), 0, _MOST)
-        check_number("jitter", self.jitter, 0.0, 0.1)
-        check_number("margin", self.margin, 0.0, 10.0)
 
 
 class Cloud(NamedTuple):

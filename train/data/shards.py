@@ -7,7 +7,6 @@ system keeps one copy for all processes.
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import tempfile
 from collections import Counter
@@ -29,7 +28,7 @@ from handsim.errors import DatasetError, LayoutError, choices
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
-from handsim.files.json_files import load_json, save_json
+from handsim.files.json_files import load_json
 from handsim.hand.shape import HAND_DTYPE, HandShape, unpack_hand
 from handsim.hand.topology import NUM_QPOS
 
@@ -119,11 +118,6 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
         file.write(np.ascontiguousarray(array).tobytes())
-
-
-def save_manifest(out: Path, manifest: Manifest) -> None:
-    """Write the manifest, which makes the training set complete."""
-    save_json(out / MANIFEST, dataclasses.asdict(manifest))
 
 
 def load_manifest(path: Path) -> Manifest:

@@ -11,7 +11,7 @@ from handsim.cli.main import main
 from train.config import EPOCHS, CNNConfig, TrainConfig, default_config, preset_config
 from train.data.batches import Corruption, paper_corruption
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 from train.training_state import _rate
 
 FRAMES = 16
@@ -20,7 +20,7 @@ FRAMES = 16
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return out
 
 

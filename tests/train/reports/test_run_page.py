@@ -26,7 +26,7 @@ from train.metrics import error_without, expected_calibration_error, macro_f1, p
 from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
@@ -41,7 +41,7 @@ def pictures(page: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
     return Dataset(out)
 
 

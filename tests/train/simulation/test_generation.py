@@ -30,17 +30,17 @@ from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import frame_scenes, generation, people
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import NO_REST
-from train.simulation.training_frames import NO_GRASP, NO_TOUCH, DatasetConfig, SceneMix
+from train.simulation.training_frames import NO_GRASP, NO_TOUCH, GenerateSettings, SceneMix
 
-CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
 import sys
 from pathlib import Path
 from train.simulation import generation
-from train.simulation.training_frames import (DatasetConfig)
+from train.simulation.training_frames import (GenerateSettings)
 generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
-    config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+    config = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
     generation.make_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
@@ -155,7 +155,7 @@ def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):
 
     monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", no_touch)
     monkeypatch.setattr(frame_scenes, "settle_hold", no_touch)
-    config = DatasetConfig(
+    config = GenerateSettings(
         num_frames=600,
         frames_per_hand=20,
         population=Population(girth_spread=0.2),
@@ -175,7 +175,7 @@ def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monk
         raise ArgumentError("qpos has shape (3,), expected (..., 27)")
 
     monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", broken)
-    config = DatasetConfig(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
+    config = GenerateSettings(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
     with pytest.raises(ArgumentError, match="qpos has shape"):
         make_dataset(config, tmp_path / "set", workers=1)
 
@@ -229,13 +229,13 @@ def test_a_damaged_shard_is_named(finished, tmp_path):
 def test_bad_settings_leave_nothing_behind(tmp_path, change, error, sentence):
     out = tmp_path / "set"
     with pytest.raises(error, match=sentence):
-        make_dataset(DatasetConfig(num_frames=10, **change), out)
+        make_dataset(GenerateSettings(num_frames=10, **change), out)
     assert not out.exists()
 
 
 def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     rig = mixed_rig()
-    config = DatasetConfig(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
+    config = GenerateSettings(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
     make_dataset(config, tmp_path / "set", workers=1)
     dataset = Dataset(tmp_path / "set")
     assert as_rig(dataset.manifest.config["rig"]) == rig
