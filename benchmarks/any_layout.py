@@ -1,6 +1,6 @@
 """The labeler for any layout beside trained ones: slots right, clean and with drops and ghosts; its time.
 
-Without any training of the glove (at once), after a minute of it (`train.any_layout.learned_gloves`), and
+Without any training of the glove (at once), after a minute of it (`train.labelers.layout_labeler`), and
 with the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of
 6 to 30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
 
@@ -20,14 +20,12 @@ import numpy as np
 from benchmarks.record import describe
 from gloves.captures.formats import read_markers
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from train.any_layout.layout_labeler import LayoutLabeler, sample_worn_markers
-from train.any_layout.learned_gloves import fine_tuned_labeler
-from train.any_layout.skin_bank import sample_places
 from train.data.batches import Corruption, paper_corruption
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
+from train.evaluation import evaluate_labeler
+from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler, sample_worn_markers
+from train.labelers.layout_training import sample_places
 from train.labelers.protocol import Labeler
-from train.labelers.storage import shipped_labelers
+from train.labelers.storage import load_labeler, shipped_labelers
 
 CAPTURE_FRAMES = 3000
 

@@ -29,7 +29,7 @@ from gloves.takes.take import Take
 from track.captures import label_capture, track_capture
 from track.label_confidence import evidence_of
 from track.take_summary import find_suspect_spans, frame_confidence
-from train.metrics import expected_calibration_error
+from train.evaluation import expected_calibration_error
 
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")
 WHAT = (

@@ -21,14 +21,13 @@ from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from benchmarks.record import add_save, describe, save_figures
 from gloves.captures.formats import find_captures, read_markers
 from gloves.layout import load_layout
-from train.config import KINDS, TrainConfig, batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
-from train.labelers.kinds import labeler_of
-from train.loop import start_fabric
+from train.labelers.networks import labeler_of
+from train.loop import TrainingState, start_fabric
+from train.settings import KINDS, TrainSettings, batch_recipe, default_config
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings
-from train.training_state import TrainingState
 
 GLOVE = "dense19"
 EVERY = {"set": 40_000, "cnn": 20_000}  # samples between two looks
@@ -66,7 +65,7 @@ def main() -> None:
 
 
 def race(
-    tests: dict[str, np.ndarray], frames: int, config: TrainConfig, folder: Path
+    tests: dict[str, np.ndarray], frames: int, config: TrainSettings, folder: Path
 ) -> dict[str, dict[str, float]]:
     """Minutes from the start until the paper's best network was beaten, by test set and kind of test."""
     start, measuring = time.perf_counter(), 0.0

@@ -31,13 +31,13 @@ from benchmarks.held_out import held_out_markers
 from benchmarks.record import describe
 from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
 from benchmarks.training_scaling import train
-from render.painting.gl import _renderer_name, opengl_has_hardware
-from train.config import CNNConfig
+from render.painting.opengl import _renderer_name, opengl_has_hardware
 from train.data.batches import Corruption, corrupt
-from train.glove_labeler import load_labeler
-from train.labelers import kinds
-from train.labelers.kinds import labeler_of, new_network
+from train.labelers import networks
+from train.labelers.networks import labeler_of, new_network
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+from train.settings import CNNConfig
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings
 
@@ -79,7 +79,7 @@ def labels(count: int) -> None:
     }
     for name, (make, clouds) in makers.items():
         for device in devices():
-            kinds.batch_device = lambda device=device: device
+            networks.batch_device = lambda device=device: device
             labeler = make()
             labeler.label_frames(clouds[:512])  # to warm up
             start = time.perf_counter()

@@ -28,7 +28,7 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.captures import calibrate, measure_hands, track_capture
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.takes import simulate_take

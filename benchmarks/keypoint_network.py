@@ -42,13 +42,12 @@ import trimesh
 
 from benchmarks import keypoint_training as training
 from benchmarks.record import Figures, add_save, describe, save_figures
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
 from render.config import RenderConfig
 from render.frames import RenderedFrame
 from render.painting.figures import Appearance, sample_people
-from render.painting.gl import load_pyrender, offscreen_renderer
-from render.painting.opengl_painter import OPENGL_FROM_OPENCV
+from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
 from render.scenery.backgrounds import Backgrounds
 
 FEW_BACKGROUNDS: Final = Backgrounds({"plain": 1, "gradient": 1})
@@ -87,7 +86,7 @@ def draw_no_relief(count: int, seed: int) -> Any:
         people = sample_people(*args, **options)
         return tuple(replace(one, skin=replace(one.skin, relief=0.0, creases=0.0)) for one in people)
 
-    with patch("render.drawing.sample_people", smooth_people):
+    with patch("render.session.sample_people", smooth_people):
         return training.draw(count, seed)
 
 

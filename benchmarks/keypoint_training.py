@@ -26,7 +26,7 @@ from torch.nn import functional
 from handsim import HandModel
 from poses import load_gestures, sample_poses
 from render import RenderConfig, RenderedFrame, ViewConfig
-from render.drawing import Drawing
+from render.session import Drawing
 from render.subject import subject_of_poses
 
 SIZE = 128  # of a crop [px]

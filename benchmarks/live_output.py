@@ -32,7 +32,7 @@ from track.streams.addresses import open_source
 from track.streams.natnet import ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
-from gloves.takes.growing import GrownArchive
+from gloves.takes.archives import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
 from track.streams import natnet
@@ -40,7 +40,7 @@ from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

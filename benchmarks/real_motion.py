@@ -35,7 +35,7 @@ from track.captures import label_capture
 from track.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 SIDES = ("right", "left")
 

@@ -26,7 +26,7 @@ from handsim.app.workers import chosen_workers, run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.data.batches import Corruption, corrupt
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
 from train.simulation.training_frames import GenerateSettings

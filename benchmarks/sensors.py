@@ -17,12 +17,10 @@ import cv2
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.space.camera import Camera, pinhole
-from handsim.space.lens import Lens
-from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
-from render.sensors.depth_noise import SENSORS, apply_depth_noise, named_sensor, reflectance_of
-from render.sensors.exposure import Exposure, expose, linear_of
-from render.sensors.shutter import combine, shutter_times
+from handsim.space.camera import Camera, Lens, pinhole
+from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
+from render.depth_sensor import SENSORS, apply_depth_noise, named_sensor, reflectance_of
+from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals
 
 
 def sphere_and_wall(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

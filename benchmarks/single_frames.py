@@ -23,9 +23,9 @@ from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.captures.capture import Capture
 from gloves.captures.formats import find_captures, read_markers
 from track.captures import label_capture
-from train.glove_labeler import load_labeler
-from train.labeler_evaluation import Report
+from train.evaluation import LabelingReport
 from train.labelers.protocol import Labeler, Labeling
+from train.labelers.storage import load_labeler
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "
@@ -57,7 +57,7 @@ class CommandLabeler:
         ]
 
 
-def figures_of(report: Report, markers: tuple[str, ...], title: str) -> Figures:
+def figures_of(report: LabelingReport, markers: tuple[str, ...], title: str) -> Figures:
     """The shares of a report [%], and its worst marker."""
     share = {name: 100 * value for name, value in report.figures.items()}
     row = [

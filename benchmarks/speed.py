@@ -57,25 +57,23 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from poses.shapes import sample_valid_angles
 from track.settings import warm_up
 from track.tracker import Tracker
-from train.config import CNNConfig, batch_recipe, default_config
 from train.data.batches import Corruption, corrupt, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
-from train.glove_labeler import load_labeler
-from train.labelers.kinds import labeler_of, new_network
-from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
+from train.labelers.networks import labeler_of, new_network
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_network
+from train.labelers.storage import OnnxLabeler, export_onnx, load_labeler, load_network
+from train.loop import TrainingState
+from train.settings import CNNConfig, batch_recipe, default_config
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 from train.simulation.training_frames import GenerateSettings, SceneMix
 from train.threads import TrainingThreads
-from train.training_state import TrainingState
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count

@@ -45,8 +45,8 @@ from gloves.takes.take import Take
 from track.captures import calibrate
 from track.settings import warm_up
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
 from train.simulation.takes import simulate_calibration, simulate_take
 

@@ -18,7 +18,7 @@ from train import (
     Corruption,
     Labeler,
     Labeling,
-    Report,
+    LabelingReport,
     corrupt,
     evaluate_labeler,
     generate_dataset,
@@ -37,7 +37,7 @@ def main() -> None:
     for label, confidence in zip(labeling.labels[:4], labeling.confidence[:4], strict=True):
         print("ghost" if label < 0 else labeler.marker_names[label], f"{confidence:.3f}")
     for corruption in (Corruption(occlude=0, ghosts=0), Corruption(occlude=5, ghosts=2)):
-        report: Report = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
+        report: LabelingReport = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
         share = 100 * report.figures["slot_accuracy"]
         print(f"occlude {corruption.occlude}, ghosts {corruption.ghosts}: {share:.2f} % of slots right")
 

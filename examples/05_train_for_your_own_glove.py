@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gloves import MarkerLayout, MarkerPlace
-from train import Corruption, Dataset, TrainConfig, evaluate_labeler, generate_dataset, train_labeler
+from train import Corruption, Dataset, TrainSettings, evaluate_labeler, generate_dataset, train_labeler
 
 DIGITS = ("thumb", "index", "middle", "ring", "little")
 TIPS = [MarkerPlace(f"{digit}_tip", f"{digit}_distal", 0.7, 0.0) for digit in DIGITS]
@@ -29,7 +29,7 @@ GLOVE = MarkerLayout("ten", (*TIPS, *BACK), radius=0.0032)  # [m]
 
 
 def main() -> None:
-    config = TrainConfig(samples=25_000, network={"width": 32, "gates": 8, "depth": 3})
+    config = TrainSettings(samples=25_000, network={"width": 32, "gates": 8, "depth": 3})
     with TemporaryDirectory() as name:
         folder = Path(name)
         made: dict[str, Dataset] = {

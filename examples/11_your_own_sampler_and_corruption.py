@@ -15,12 +15,12 @@ from own_ideas import Pointing, hide_a_side
 from torch.utils.data import DataLoader
 
 from handsim import HandSimError
-from train import CloudStream, OwnCorruption, TrainConfig, evaluate_labeler, generate_dataset, train_labeler
+from train import CloudStream, OwnCorruption, TrainSettings, evaluate_labeler, generate_dataset, train_labeler
 
 
 def main() -> None:
     small = {"width": 16, "gates": 4, "depth": 2}
-    config = TrainConfig(samples=10_000, corruption=hide_a_side, rig_share=0.2, network=small)
+    config = TrainSettings(samples=10_000, corruption=hide_a_side, rig_share=0.2, network=small)
     with TemporaryDirectory() as name:
         folder = Path(name)
         dataset = generate_dataset(

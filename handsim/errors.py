@@ -45,6 +45,10 @@ class PoseError(HandSimError):
     """A pose, grasp, touch or path that a hand cannot reach."""
 
 
+class CalibrationError(HandSimError):
+    """A capture that does not determine what is calibrated from it."""
+
+
 class FileError(HandSimError):
     """A file that cannot be read, used or written, or content that no such file may hold."""
 

@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim.hand.capsules import bounding_spheres
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import bounding_spheres, overlap_between
 from handsim.hand.model import HandModel, join_qpos
-from handsim.kernels.chain import pose_digit_axes
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles

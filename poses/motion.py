@@ -19,10 +19,9 @@ from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape
 from handsim.settings import Limits, Settings
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.shapes import (
     HIGH,

@@ -16,8 +16,7 @@ from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import JOINTS, NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
 from handsim.settings import Expected, Mixture
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
@@ -337,7 +336,7 @@ class PoseSampler(Protocol):
             rng: Source of all randomness.
 
         Returns:
-            Joint angles [rad], in the order of `handsim.hand.topology.JOINTS`; or whole poses: wrist position
+            Joint angles [rad], in the order of `handsim.hand.shape.JOINTS`; or whole poses: wrist position
             [m], wrist orientation (wxyz) and these angles.
         """
 

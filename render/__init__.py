@@ -11,21 +11,21 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from render.cameras.viewpoints import ViewConfig as ViewConfig
+    from render.color_sensor import ExposureConfig as ExposureConfig
+    from render.color_sensor import ShutterConfig as ShutterConfig
     from render.config import RenderConfig as RenderConfig
-    from render.drawing import draw as draw
-    from render.formats.merging import merge_renderings as merge_renderings
+    from render.depth_sensor import DepthSensor as DepthSensor
+    from render.formats.writer import merge_renderings as merge_renderings
     from render.frames import BodyTruth as BodyTruth
     from render.frames import HandTruth as HandTruth
     from render.frames import Pictures as Pictures
     from render.frames import RenderedFrame as RenderedFrame
     from render.scenery.backgrounds import Backgrounds as Backgrounds
-    from render.sensors.depth_noise import DepthSensor as DepthSensor
-    from render.sensors.exposure import ExposureConfig as ExposureConfig
-    from render.sensors.shutter import ShutterConfig as ShutterConfig
+    from render.session import draw as draw
     from render.session import render_take as render_take
     from render.skin.look import SkinLook as SkinLook
     from render.stream import PictureStream as PictureStream
     from render.subject import PoseFile as PoseFile
+    from render.viewpoints import ViewConfig as ViewConfig
 
 __getattr__, __dir__ = lazy_exports(__name__)

@@ -12,14 +12,13 @@ import numpy as np
 
 from handsim._checks import check_choice, check_count, check_type, fill_settings
 from handsim.errors import ArgumentError
-from render.cameras.viewpoints import ViewConfig
+from render.color_sensor import ExposureConfig, ShutterConfig
+from render.depth_sensor import DepthSensor
 from render.frames import PASSES
 from render.painting.painter import PainterChoice, choose_painter
 from render.scenery.backgrounds import KINDS, Backgrounds
-from render.sensors.depth_noise import DepthSensor
-from render.sensors.exposure import ExposureConfig
-from render.sensors.shutter import ShutterConfig
 from render.skin.look import ALL_TONES, TONES, check_tones, hyphened, named_tones
+from render.viewpoints import ViewConfig
 
 NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""

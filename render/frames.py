@@ -9,11 +9,13 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from handsim.hand.shape import HandShape
+from handsim.hand.shape import NUM_BONES, HandShape
 from handsim.space.camera import Camera
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""
+FOREARM: Final = NUM_BONES
+"""Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
 PARTS_A_HAND: Final = 32
 """Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is not a hand."""
 
@@ -48,7 +50,7 @@ class HandTruth:
     qpos: Float[np.ndarray, "27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
     keypoints: Float[np.ndarray, "21 2"]
-    """Keypoints in the picture or beside it [px], see `handsim.hand.keypoints`; NaN where the lens cannot see
+    """Keypoints in the picture or beside it [px], see `handsim.hand.model`; NaN where the lens cannot see
     them."""
     keypoints_world: Float[np.ndarray, "21 3"]
     """The same keypoints in the world [m]; `frame.camera.local` gives them in the camera's axes."""

@@ -85,7 +85,7 @@ def heeded_signals() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def drawing() -> None:
     """Skips where nothing can be drawn."""
-    from render.painting.gl import offscreen_renderer
+    from render.painting.opengl import offscreen_renderer
 
     try:
         offscreen_renderer(16, 16)

@@ -14,8 +14,7 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from gloves.takes.status import Status as Status
-    from track.bodies.rigid_body import RigidTemplate as RigidTemplate
+    from gloves.takes.points import Status as Status
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from track.live_message import LiveMessage as LiveMessage
     from track.live_message import LiveSink as LiveSink
     from track.recorder import Recorder as Recorder
+    from track.rigid_body import RigidTemplate as RigidTemplate
     from track.settings import TrackSettings as TrackSettings
     from track.sinks import SinkGroup as SinkGroup
     from track.sinks import open_sinks as open_sinks

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.frames import TrackedHand
 from track.label_confidence import label_confidence
 from track.streams.frame_source import StreamedFrame

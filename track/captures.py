@@ -21,13 +21,11 @@ from gloves.takes.corrections import Correction, find_pins, load_corrections, to
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
-from handsim.errors import CaptureError, HandSimWarning
-from handsim.hand.topology import NUM_QPOS, Side
-from track.association.initialization import FEWEST_POINTS
-from track.association.point_linking import change_of_distances
-from track.association.single_frames import label_alone
+from handsim.errors import CalibrationError, CaptureError, HandSimWarning
+from handsim.hand.shape import NUM_QPOS, Side
+from track.association.frame_state import change_of_distances
+from track.association.initialization import FEWEST_POINTS, label_alone
 from track.bidirectional_labeling import label_both_ways
-from track.calibration.frames import CalibrationError
 from track.config import BOTH, Size
 from track.corrected_take import correct_take
 from track.frames import TrackedFrame
@@ -51,7 +49,7 @@ from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
 from track.user import MEASURED, User, checked_sides
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
 _CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most

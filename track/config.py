@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from handsim._checks import check_number
 from handsim.errors import ArgumentError
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]
 """Size of hands; auto is measured."""

@@ -16,21 +16,20 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gloves.captures.plausibility import spacing
+from gloves.captures.capture import spacing
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.association.hand_state import HandState
-from track.association.initialization import FEWEST_POINTS, HandInitializer
-from track.association.point_groups import distances_to_nearest
+from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
 from track.hand_size import fit_size
 from track.inputs import designed_glove
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.glove_labeler import labeler_at_once
 from train.labelers.protocol import Labeler, Labeling
+from train.labelers.storage import labeler_at_once
 
 _WINDOW: Final = 30  # frames of each of two parts in which hands are compared
 _LEAST_FRAMES: Final = 10  # that tell anything

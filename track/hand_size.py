@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES, shape_from_measures
-from handsim.hand.topology import Side
+from handsim.hand.shape import SIZES, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
-from track.calibration.energy import Estimate, Problem
-from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
-from track.calibration.skin_coordinates import nearest_coordinates
-from track.calibration.solver import levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.energy import Estimate, Problem, levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, nearest_coordinates
 from track.config import TrackerConfig
 from track.frames import TrackedHand
 from track.kinematics.pose_solver import PoseSolver

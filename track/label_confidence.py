@@ -14,10 +14,9 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.takes.take import LOST, Take
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import point_distance
-from track.kinematics.joint_prior import resting_prior
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
+from handsim.kernels import kernel, point_distance
+from track.kinematics.pose_spread import resting_prior
 
 LABELED: Final = (
     "other labels in its life",

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.takes.growing import check_free, growing_path
+from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take
 from handsim.app.messages import LiveStatus
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
@@ -165,7 +165,7 @@ def track_live(
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
         Stopped: A signal came before the recording began, or a second one after that.
     """
-    check_free(growing_path(out))
+    check_unused(growing_path(out))
     until = [math.inf]  # [s], when it is over by this machine's clock
     interrupted = InterruptFlag()
 

@@ -15,18 +15,17 @@ from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_choice, check_type, make_settings, shown_value
 from handsim.errors import ArgumentError, HandSimWarning
-from handsim.hand.topology import NUM_QPOS, SIDES, Side
-from track.bodies.body_file import AnyBody, load_bodies
-from track.bodies.rigid_body import RigidTemplate
+from handsim.hand.shape import NUM_QPOS, SIDES, Side
 from track.config import BOTH, Size, TrackerConfig
 from track.hand_check import check_hands, check_scale
 from track.hand_size import fit_size
 from track.inputs import AnyGlove, AnyLabeler, designed_glove
+from track.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from track.user import MEASURED, User, as_user, nominal_user
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
 AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 """A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""

@@ -23,13 +23,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim._checks import check_type
-from handsim._closing import Closing
-from handsim._extras import import_extra
-from handsim._plugins import is_plugin, list_plugins, make_plugin
+from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import TrackedFrame
 from track.live_message import (
     FORMATS,
@@ -41,6 +39,7 @@ from track.live_message import (
     MessageFormat,
     document_format,
 )
+from track.rigid_body import RigidTemplate
 from track.streams import split_address
 from track.streams.frame_source import StreamedFrame
 

@@ -17,24 +17,27 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim._checks import check_type
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
-from track.association.candidates import SETTLED_EVIDENCE
-from track.association.frame_state import FrameState, Numbering, targets_of
+from track.association.frame_state import FrameState, Numbering, PointHistory, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction
 from track.association.initialization import HandInitializer, InitializedHand
-from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, refit_labels
-from track.association.label_new_points import digit_table, label_new_points
-from track.association.labeler_review import LabelerReview
-from track.association.point_linking import PointHistory
-from track.bodies.rigid_body import BodyTracker, RigidTemplate
+from track.association.label_consistency import (
+    LabelerReview,
+    exchange_labels,
+    fit_labels,
+    gate_labels,
+    refit_labels,
+)
+from track.association.label_new_points import SETTLED_EVIDENCE, digit_table, label_new_points
 from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
 from track.inputs import AnyLabeler, designed_glove
+from track.rigid_body import BodyTracker, RigidTemplate
 from track.user import User, as_user
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost

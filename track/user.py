@@ -16,11 +16,10 @@ from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError, FileError, HandSimError
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, Size
 

@@ -12,9 +12,6 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from train.config import CNNConfig as CNNConfig
-    from train.config import SetLabelerConfig as SetLabelerConfig
-    from train.config import TrainConfig as TrainConfig
     from train.data.batches import Cloud as Cloud
     from train.data.batches import Corruption as Corruption
     from train.data.batches import OwnCorruption as OwnCorruption
@@ -22,11 +19,11 @@ if TYPE_CHECKING:
     from train.data.cloud_stream import CloudStream as CloudStream
     from train.data.shards import Dataset as Dataset
     from train.data.shards import MappedRows as MappedRows
-    from train.evaluate import evaluate_labeler as evaluate_labeler
-    from train.glove_labeler import load_labeler as load_labeler
-    from train.labeler_evaluation import Report as Report
+    from train.evaluation import LabelingReport as LabelingReport
+    from train.evaluation import evaluate_labeler as evaluate_labeler
     from train.labelers.protocol import Labeler as Labeler
     from train.labelers.protocol import Labeling as Labeling
+    from train.labelers.storage import load_labeler as load_labeler
     from train.loop import train_labeler as train_labeler
     from train.rig_advice.forecast import CameraLoss as CameraLoss
     from train.rig_advice.forecast import ErrorEllipsoid as ErrorEllipsoid
@@ -36,6 +33,9 @@ if TYPE_CHECKING:
     from train.rig_advice.rig_score import RigScore as RigScore
     from train.rig_advice.rig_score import VolumeMap as VolumeMap
     from train.rig_advice.scoring import score_rig as score_rig
+    from train.settings import CNNConfig as CNNConfig
+    from train.settings import SetLabelerConfig as SetLabelerConfig
+    from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
     from train.simulation.takes import simulate_take as simulate_take
 

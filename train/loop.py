@@ -1,11 +1,13 @@
-"""The training loop: rows, corruption, network, checkpoints, weights, and a page about the run."""
+"""Training of a labeler: its state, its steps and checkpoints, and the weights, card and page of its end."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import io
 import time
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,22 +16,356 @@ from typing import Any, Final
 import numpy as np
 import torch
 from lightning_fabric import Fabric
+from numpy.typing import NDArray
+from torch import nn
 
+from handsim import __version__
 from handsim._checks import check_type, make_settings
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
-from handsim.errors import ArgumentError, DatasetError, WeightsError
+from handsim.errors import ArgumentError, DatasetError, HandSimError, WeightsError
+from handsim.files.arrays import check_members
 from handsim.files.json_files import claim
+from handsim.files.outputs import atomic_write, written_together
 from handsim.files.signals import Stopped, interrupt_flag, interrupts_bare
-from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
-from train.data.batches import Batch, check_corruption, draw_batch
-from train.data.shards import Dataset, MappedRows, load_dataset
+from train.data.batches import (
+    Batch,
+    Corruption,
+    Part,
+    check_corruption,
+    draw_batch,
+    paper_corruption,
+    right_hands,
+)
+from train.data.shards import Dataset, Manifest, MappedRows, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric
 from train.devices.local_processes import LossProgress, Tell, in_local_processes
 from train.devices.world import world_of
-from train.run_result import MOST_HELD_OUT, few, finish_run
+from train.evaluation import History, LabelingReport, evaluate_markers, paper_report
+from train.labelers.cnn_labeler import label_by_distance
+from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.networks import (
+    SetLabeler,
+    batch_loss,
+    cnn_labeler,
+    labeler_of,
+    new_network,
+    prepare_network,
+)
+from train.labelers.pose_prior import learn_pose_prior
+from train.labelers.protocol import Labeling
+from train.labelers.storage import save_network
+from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
+from train.reports.run_page import write_run_page
+from train.settings import KINDS, CNNConfig, Kind, TrainSettings, batch_recipe, default_config
 from train.threads import TrainingThreads, check_threads
-from train.training_state import TrainingState, passed
+
+_CURVE: Final = 200  # points of the loss curve
+
+
+class TrainingError(HandSimError):
+    """A training run that does not converge."""
+
+
+class TrainingState:
+    """The state that a run carries from step to step and a checkpoint keeps."""
+
+    def __init__(self, config: TrainSettings, fabric: Fabric, rows: NDArray[np.void] | MappedRows) -> None:
+        self.config = config
+        self.fabric = fabric
+        self.part = Part(fabric.global_rank, fabric.world_size)
+        network = new_network(config.chosen)
+        prepare_network(network, rows)
+        self.network, self.optimizer = fabric.setup(network, _optimizer(config, network))
+        self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
+        self.done = 0
+        self.history = History()
+        self.began = time.monotonic(), 0
+
+    def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
+        """Make one gradient step together with the other devices and return the loss before it.
+
+        Each device learns from its part of the batch; the rng is the same on each.
+
+        Raises:
+            TrainingError: The loss is not finite; the state is of no use then.
+        """
+        began = time.perf_counter()
+        rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        loss = self._loss(batch, rng)
+        self.optimizer.zero_grad()
+        self.fabric.backward(loss)
+        if self.config.optimizer == "adamw":
+            self.fabric.clip_gradients(self.network, self.optimizer, max_norm=1.0)
+        self.optimizer.step()
+        self.done += self.config.batch
+        self._average()
+        value = float(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))  # type: ignore[arg-type]
+        if not np.isfinite(value):
+            raise TrainingError(
+                f"the loss is {value} after {self.done} samples; begin again with a learning rate below "
+                f"{self.config.learning_rate:g}"
+            )
+        self.history.add(value)
+        self.history.minutes += (time.perf_counter() - began) / 60.0
+        if passed(self.done, self.config, _CURVE) or self.done >= self.config.samples:
+            self._log(rate)
+        return value
+
+    def _loss(self, batch: Batch, rng: np.random.Generator) -> torch.Tensor:
+        return batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng, part=self.part)
+
+    def _average(self) -> None:
+        every = self.config.batch * self.config.average_every
+        if self.done % every and self.done < self.config.samples:
+            return
+        decay = min(self.config.average, self.done / (self.done + 20.0 * every))
+        with torch.no_grad():
+            for name, tensor in self.network.state_dict().items():
+                if tensor.is_floating_point():
+                    self.mean[name].lerp_(tensor, 1.0 - decay)
+                else:
+                    self.mean[name].copy_(tensor)
+
+    def _log(self, rate: float) -> None:
+        loss = self.history.close(self.done, rate)
+        since, done = self.began
+        now = time.monotonic()
+        speed = (self.done - done) / (now - since)
+        self.began = now, self.done
+        self.fabric.log_dict(
+            {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
+        )
+
+    def evaluate(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
+        """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
+        report = paper_report(labeler_of(self.averaged(), names), rows)
+        accuracy = report.figures["slot_accuracy"]
+        self.history.accuracies.append((self.done, self.history.minutes, accuracy))
+        self.fabric.log_dict({"held_out_slot_accuracy": accuracy}, step=self.done)
+
+    def averaged(self) -> nn.Module:
+        """The network with the mean weights."""
+        with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
+            network = new_network(self.config.chosen)
+        network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint; the first process does."""
+        if not self.fabric.is_global_zero:
+            return
+        content = {
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "mean": self.mean,
+            "done": self.done,
+            "history": dataclasses.asdict(self.history),
+        }
+        # Through memory: torch puts the temporary name into a file that it opens itself, and does not say
+        # that the disk is full.
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
+
+    def restore(self, path: Path) -> None:
+        """Continue from a checkpoint, if there is one; the first process reads it for all."""
+        found = path.read_bytes() if self.fabric.is_global_zero and path.is_file() else None
+        found = self.fabric.broadcast(found)
+        if found is None:
+            return
+        stored = io.BytesIO(found)  # torch calls some damage an OSError
+        try:
+            with zipfile.ZipFile(stored) as archive:
+                check_members(archive, len(found))
+            stored.seek(0)
+            content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
+            self._check(content)
+            self.network.load_state_dict(content["network"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.mean, self.done = content["mean"], content["done"]
+            self.history = History(**content.get("history", {}))  # older checkpoints have none
+        except MemoryError:
+            raise
+        except Exception as error:  # a file can be damaged in more ways than torch names
+            raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
+        self.began = time.monotonic(), self.done
+
+    def _check(self, content: dict[str, Any]) -> None:
+        """Raise a ValueError unless a checkpoint's tensors are this run's, finite, and its count is one."""
+        check_stored(content)
+        done, mean, network = content["done"], content["mean"], content["network"]
+        if type(done) is not int or done < 0 or done % self.config.batch:
+            raise ValueError("the number of samples is none of this run's")
+        for name, tensor in self.mean.items():
+            for stored in (mean[name], network[name]):
+                if stored.shape != tensor.shape or stored.dtype != tensor.dtype:
+                    raise ValueError(f"{name} has another shape")
+                if not torch.isfinite(stored).all():
+                    raise ValueError(f"{name} is not finite")
+
+    def try_step(self, batch: Batch, *, rng: np.random.Generator) -> None:
+        """Do the work of a step, to time it; the state stays as it is."""
+        kept = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
+        try:
+            self.fabric.backward(self._loss(batch, rng))
+        finally:
+            self.optimizer.zero_grad()
+            self.network.load_state_dict(kept)  # means of batch normalization move in a forward pass
+
+
+def _optimizer(config: TrainSettings, network: nn.Module) -> torch.optim.Optimizer:
+    if config.optimizer == "sgd":
+        return torch.optim.SGD(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+    return torch.optim.AdamW(
+        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
+
+
+def _rate(config: TrainSettings, progress: float) -> float:
+    """Share of the peak learning rate at a share of the run."""
+    if config.schedule == "steps":
+        return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
+    return float(min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress))))
+
+
+def check_stored(content: object, seen: set[int] | None = None) -> None:
+    """Raise a ValueError for a tensor in nested tables that has more entries than are stored of it."""
+    seen = set() if seen is None else seen
+    if id(content) in seen:
+        return
+    seen.add(id(content))
+    if isinstance(content, torch.Tensor):
+        if content.numel() * content.element_size() > content.untyped_storage().nbytes():
+            raise ValueError("a tensor of more entries than are stored")
+    elif isinstance(content, dict | list | tuple):
+        for entry in content.values() if isinstance(content, dict) else content:
+            check_stored(entry, seen)
+
+
+def passed(done: int, config: TrainSettings, parts: int) -> bool:
+    """Whether the last step ended one of this many parts of the run, each at least one step long."""
+    part = max(config.batch, config.samples // parts)
+    return (done - config.batch) // part != done // part
+
+
+MOST_HELD_OUT: Final = 8192
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": MOST_HELD_OUT, "cnn": 1024}  # of the evaluation
+_PRIOR_STRETCH: Final = 0.03  # anisotropy of the hands of the pose prior: people differ more than simulated
+_COST_FRAMES: Final = 400  # for the costs of the paper's network
+_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m]
+_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m]
+
+
+def finish_run(
+    state: TrainingState,
+    rows: MappedRows,
+    held_out: MappedRows,
+    manifest: Manifest,
+    out: Path,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """Evaluate the network, write weights, card and page, and return the card.
+
+    Args:
+        rows: What it was trained on.
+        held_out: What it has not seen.
+        out: Folder of the run.
+        tell: Called with the name of each step.
+    """
+    config, names = state.config, manifest.marker_names
+    network = state.averaged()
+    if isinstance(network, DeepLabelCNN):
+        tell("costs of the paper's labeler")
+        choose_costs(network, names, few(held_out, _COST_FRAMES))
+    else:
+        assert isinstance(network, SetLabeler)
+        tell("pose prior")
+        rng = np.random.default_rng(config.seed)
+        network.prior = learn_pose_prior(right_hands(rows, _PRIOR_STRETCH, rng=rng), rng=rng)
+    tell("held-out frames")
+    card, report = _card(network, few(held_out, _CARD_FRAMES[config.labeler]), config, manifest)
+    card["curve"] = state.history.accuracies
+    tell("weights and report")
+    with written_together():
+        save_network(out, network, card)
+        write_run_page(out, card, state.history, report)
+        write_model_card(out, card)
+    return card
+
+
+def few(rows: MappedRows, count: int) -> NDArray[np.void]:
+    """Every nth of these rows, at most `count`."""
+    return rows[np.arange(0, len(rows), -(-len(rows) // count))]
+
+
+def _card(
+    network: nn.Module, rows: NDArray[np.void], config: TrainSettings, manifest: Manifest
+) -> tuple[dict[str, Any], LabelingReport]:
+    """Model card with figures on held-out simulated frames; the evaluation with the paper's corruption."""
+    labeler = labeler_of(network, manifest.marker_names)
+    markers = rows["markers"].astype(np.float64)
+    clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
+    paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
+    card = {
+        "marker_names": list(manifest.marker_names),
+        "trained_on": "simulated frames only",
+        "handsim": __version__,
+        "license": UNKNOWN_LICENSE,
+        "dataset": manifest.config,
+        "train": config.record(),
+        "held_out_simulated": {
+            "clean": clean.figures,
+            f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,
+        },
+    }
+    return card, report
+
+
+def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:
+    """The network's settings with the reject that labels most slots right, and the best calibrated spread.
+
+    Settings that the network has already are kept.
+
+    Args:
+        rows: A few hundred held-out rows of a training set; they get the paper's corruption.
+    """
+    labeler = _Recalling(network, marker_names)
+
+    def report(reject: float, spread: float) -> LabelingReport:
+        labeler.reject, labeler.spread = reject, spread
+        return paper_report(labeler, rows)
+
+    config = network.config
+    reject = config.reject or max(
+        _REJECTS, key=lambda tried: report(tried, _SPREADS[0]).figures["slot_accuracy"]
+    )
+    spread = config.spread or min(
+        _SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
+    )
+    network.config = dataclasses.replace(config, reject=reject, spread=spread)
+    return network.config
+
+
+class _Recalling:
+    """A labeler that runs its network once: later calls label the same frames with other costs."""
+
+    def __init__(self, network: DeepLabelCNN, marker_names: tuple[str, ...]) -> None:
+        self.marker_names = marker_names
+        self.reject = self.spread = 0.0
+        self._labeler = cnn_labeler(network, marker_names)
+        self._distances: list[NDArray[np.float64]] = []
+
+    def label_frames(self, frames: Sequence[NDArray[np.float64]]) -> list[Labeling]:
+        """Label the frames that were given first."""
+        self._distances = self._distances or self._labeler.distances(list(frames))
+        return [label_by_distance(distances, self.reject, self.spread) for distances in self._distances]
+
 
 CHECKPOINT: Final = "checkpoint.pt"
 _CONFIG: Final = "train.json"
@@ -41,7 +377,7 @@ _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of t
 def train_labeler(
     dataset: Dataset | str | Path,
     out: str | Path,
-    config: TrainConfig | None = None,
+    config: TrainSettings | None = None,
     *,
     threads: int | None = None,
     progress: Progress = no_progress,
@@ -69,7 +405,7 @@ def train_labeler(
         on_step: Called with what is done, such as "pose prior", when it begins; and after every step of
             training with the loss.
         save_every: Time between checkpoints [s].
-        settings: Settings of `TrainConfig` that differ from `config`: `samples=300_000`; `labeler="cnn"`
+        settings: Settings of `TrainSettings` that differ from `config`: `samples=300_000`; `labeler="cnn"`
             stands for the settings that the paper's network is trained with.
 
     Returns:
@@ -102,18 +438,18 @@ def train_labeler(
     return card
 
 
-def _chosen_config(config: TrainConfig | None, settings: dict[str, Any]) -> TrainConfig:
+def _chosen_config(config: TrainSettings | None, settings: dict[str, Any]) -> TrainSettings:
     """The settings, with those that were given by name."""
     if config is None:
         labeler = settings.get("labeler", "set")
-        config = default_config(labeler) if labeler in KINDS else TrainConfig(labeler=labeler)
-    check_type("config", config, TrainConfig, "a TrainConfig")
-    return make_settings(TrainConfig, "setting of a training", settings, default=config)
+        config = default_config(labeler) if labeler in KINDS else TrainSettings(labeler=labeler)
+    check_type("config", config, TrainSettings, "a TrainSettings")
+    return make_settings(TrainSettings, "setting of a training", settings, default=config)
 
 
 def _train(
     dataset: Dataset | str | Path,
-    config: TrainConfig,
+    config: TrainSettings,
     out: Path,
     *,
     threads: int | None,
@@ -168,7 +504,7 @@ def _do_steps(
     state.save(checkpoint)
 
 
-def _started(config: TrainConfig, out: Path, threads: int | None) -> Fabric:
+def _started(config: TrainSettings, out: Path, threads: int | None) -> Fabric:
     """The devices; of the processes on this machine the first tells mistakes, which all have."""
     try:
         check_threads(threads)
@@ -189,11 +525,11 @@ def _curves_closed(fabric: Fabric) -> Iterator[None]:
 
 
 def _prepare(
-    dataset: Dataset | str | Path, config: TrainConfig, out: Path, fabric: Fabric, ranks: Agreement
+    dataset: Dataset | str | Path, config: TrainSettings, out: Path, fabric: Fabric, ranks: Agreement
 ) -> _Run:
     """Open the set, claim the folder of the run and go on from its checkpoint."""
 
-    def claimed() -> tuple[Dataset, TrainConfig, MappedRows, MappedRows]:
+    def claimed() -> tuple[Dataset, TrainSettings, MappedRows, MappedRows]:
         opened = load_dataset(dataset)
         whole = _for_set(config, len(opened.marker_names), fabric.world_size)
         rows = opened.mapped_rows()
@@ -215,7 +551,7 @@ def _prepare(
     return run
 
 
-def _for_set(config: TrainConfig, num_labels: int, devices: int) -> TrainConfig:
+def _for_set(config: TrainSettings, num_labels: int, devices: int) -> TrainSettings:
     """The same settings for a layout of this many markers, on this many devices."""
     return dataclasses.replace(
         config,
@@ -225,7 +561,7 @@ def _for_set(config: TrainConfig, num_labels: int, devices: int) -> TrainConfig:
     )
 
 
-def _claim(out: Path, config: TrainConfig, dataset: Dataset) -> None:
+def _claim(out: Path, config: TrainSettings, dataset: Dataset) -> None:
     """Claim the folder of the run, or check that the run there is this one."""
     settings: dict[str, Any] = {"train": config.record(), "dataset": dataset.manifest.config}
     del settings["train"]["devices"]

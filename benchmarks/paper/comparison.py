@@ -23,8 +23,8 @@ from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
-from track.bodies.rigid_body import RigidTemplate
 from track.frames import FrameTracker
+from track.rigid_body import RigidTemplate
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

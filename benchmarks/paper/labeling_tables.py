@@ -21,20 +21,18 @@ from gloves.captures.formats import find_captures, read_markers
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
-from train.config import Kind, default_config
 from train.data.batches import Corruption, paper_corruption
 from train.data.shards import Dataset
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
-from train.labeler_evaluation import Report
+from train.evaluation import LabelingReport, evaluate_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import shipped_labelers
+from train.labelers.storage import load_labeler, shipped_labelers
 from train.loop import train_labeler
+from train.settings import Kind, default_config
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 
-# Median and p90 of real finger markers' gaps [frames]; docs/room_numbers.md.
+# Median and p90 of real finger markers' gaps [frames]; docs/room.md.
 PUBLISHED_GAPS: Final = "3-4", "24-43"
 FIGURES: Final = {
     "slot_accuracy": "Accuracy (slots)",
@@ -259,7 +257,7 @@ def _table3_figures(measures: Mapping[str, TakeMeasures]) -> Figures:
     return kept
 
 
-def _table2_figures(nets: Mapping[str, Mapping[str, Report]], title: str) -> Figures:
+def _table2_figures(nets: Mapping[str, Mapping[str, LabelingReport]], title: str) -> Figures:
     """The figures of Table 2: a row a test set, ours and the paper's of each network."""
     kept: Figures = {}
     for key, test in zip(("base", "o", "g", "og"), AUGMENTATIONS, strict=True):
@@ -270,7 +268,7 @@ def _table2_figures(nets: Mapping[str, Mapping[str, Report]], title: str) -> Fig
 
 
 def _tests_figures(
-    reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], title: str
+    reports: Mapping[str, LabelingReport], paper: Mapping[str, tuple[float, ...]], title: str
 ) -> Figures:
     """The figures of Tables 4 and 6: a row a figure, the paper's beside where it has one."""
     kept: Figures = {}
@@ -310,7 +308,7 @@ def augmentations(num_markers: int) -> dict[str, Corruption]:
 
 def measure_augmentations(
     labeler: Labeler, markers: Float[np.ndarray, "T M 3"], *, seed: int
-) -> dict[str, Report]:
+) -> dict[str, LabelingReport]:
     """Table 2's column of one network: the markers [m] as they are, with drops, with ghosts, with both."""
     return {
         name: evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(seed))
@@ -333,7 +331,7 @@ def measure_tests(
     takes: Mapping[str, Take],
     *,
     seed: int,
-) -> dict[str, Report]:
+) -> dict[str, LabelingReport]:
     """Tables 4 and 6 for one labeler.
 
     Args:
@@ -350,7 +348,7 @@ def measure_tests(
     return reports | {name: evaluate_labeler(labeler, [take]) for name, take in takes.items()}
 
 
-def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:
+def print_table2(nets: Mapping[str, Mapping[str, LabelingReport]], *, title: str) -> Table:
     """Slot accuracy of networks (columns) on test sets (rows), the paper's in brackets."""
     table = _table("test \\ net", nets, title=title)
     for test in AUGMENTATIONS:
@@ -363,7 +361,7 @@ def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Tab
 
 
 def print_tests(
-    reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], *, title: str
+    reports: Mapping[str, LabelingReport], paper: Mapping[str, tuple[float, ...]], *, title: str
 ) -> Table:
     """Figures (rows) by test set (columns), the paper's in brackets where it has one."""
     table = _table("[%]", reports, title=title)

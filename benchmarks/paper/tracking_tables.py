@@ -29,7 +29,7 @@ from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE
 from benchmarks.record import Figures, save_figures
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS
 from train.simulation.takes import SimulateSettings, simulate_take
 

@@ -26,9 +26,8 @@ from benchmarks.record import describe
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
-from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
-from handsim.files.outputs import check_outputs, shown_bytes
+from handsim.files.outputs import atomic_write, check_outputs, shown_bytes
 
 _TABLE: Final = ("frame_accuracy", "slot_accuracy", "mpjpe", "angle_error")
 _MOST_SHOWN: Final = 3  # files that differ

@@ -1,7 +1,7 @@
 """Scores of results: labels are counted as in the tables of labeling and tracking, joints against the truth.
 
 A slot is right when it holds the right point, or rightly none; a frame when all its slots and points are
-(`train.metrics`). Joint errors are over joints that were given; what was not given shows in
+(`train.evaluation`). Joint errors are over joints that were given; what was not given shows in
 `posed` and `within_5mm`, where it counts as wrong. A capture without results counts as zero.
 """
 
@@ -21,8 +21,8 @@ from benchmarks.public.answers import Answers
 from benchmarks.public.manifest import Benchmark, BenchmarkCapture, label_names
 from benchmarks.public.results import find_results, read_result
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import NUM_KEYPOINTS
-from train.metrics import LabelCounts
+from handsim.hand.shape import NUM_KEYPOINTS
+from train.evaluation import LabelCounts
 
 NEAR: Final = 0.005
 """Distance from the truth within which a joint counts as found [m]."""
@@ -36,7 +36,7 @@ class CaptureScore:
 
     capture: BenchmarkCapture
     figures: dict[str, float]
-    """Shares in [0, 1] of `train.metrics.LabelCounts`; `posed`, the share of joints that were
+    """Shares in [0, 1] of `train.evaluation.LabelCounts`; `posed`, the share of joints that were
     given; `within_5mm`, of those that are right to 5 mm; `mpjpe`, mean distance of joints from the truth [m];
     `angle_error`, mean absolute error of joint angles [rad]. NaN where nothing was counted."""
     joint_errors: Float[np.ndarray, "21"]

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
-from handsim.kernels.segments import segment_distance_squared
+from handsim.kernels import kernel, segment_distance_squared
 from handsim.settings import Limits, Settings
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 
 def reflect(

@@ -10,12 +10,11 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.names import as_text
-from handsim.files.outputs import check_ending, check_outputs
+from handsim.files.outputs import as_text, check_ending, check_outputs
 from handsim.space.objects import named_object
 
 if TYPE_CHECKING:
-    from track.bodies.rigid_body import RigidTemplate
+    from track.rigid_body import RigidTemplate
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
@@ -30,9 +29,8 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     """
     from gloves.captures.formats import read_capture
     from gloves.takes.take import SUFFIX
-    from track.bodies.body_file import SUFFIX as TOML
-    from track.bodies.body_file import save_body
-    from track.calibration.body_learning import learn_body
+    from track.rigid_body import SUFFIX as TOML
+    from track.rigid_body import learn_body, save_body
 
     check_ending(out, TOML)
     check_outputs([source], [out])
@@ -48,7 +46,7 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
 def _take_body(truth: Path) -> RigidTemplate:
     """The object of a simulated take."""
     from gloves.takes.take import load_take
-    from track.bodies.rigid_body import RigidTemplate
+    from track.rigid_body import RigidTemplate
 
     bodies = load_take(truth).bodies
     if not bodies:

@@ -19,20 +19,18 @@ from handsim import __version__
 from handsim.app.page import Section
 from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from poses.shapes import gesture
+from render.captions import contact_sheet, write_png
 from render.config import RenderConfig
-from render.drawing import draw
-from render.illustrations.captions import write_png
-from render.illustrations.contact_sheet import contact_sheet
-from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
-from render.illustrations.scene import PosedHand
+from render.illustrations import PosedHand, draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
+from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset
-from train.evaluate import CLEAN, evaluate_labeler
-from train.glove_labeler import load_labeler
+from train.evaluation import CLEAN, evaluate_labeler
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 from train.simulation.generation import generate_dataset
 from train.simulation.takes import simulate_take
 

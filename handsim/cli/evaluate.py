@@ -47,9 +47,8 @@ def evaluate(
     from handsim.files.json_files import save_json
     from handsim.files.outputs import check_outputs
     from train.data.batches import Corruption
-    from train.evaluate import evaluate_labeler
-    from train.glove_labeler import load_labeler
-    from train.metrics import print_figures
+    from train.evaluation import evaluate_labeler, print_figures
+    from train.labelers.storage import load_labeler
     from train.threads import label_on
 
     label_on(threads)

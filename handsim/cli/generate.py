@@ -13,8 +13,8 @@ from handsim.app.messages import print_line
 from handsim.app.output import place_of
 from handsim.app.progress import named_steps, print_above, progress_bar
 from handsim.app.workers import chosen_workers
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
+from handsim.hand.shape import SIDES
+from handsim.space.rig import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
 from train.data.shards import Dataset
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.generation import make_dataset

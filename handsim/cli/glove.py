@@ -23,8 +23,7 @@ from gloves.layout import (
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import LayoutError
-from handsim.files.names import as_text
-from handsim.files.outputs import check_ending, check_outputs, write_starter
+from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
@@ -54,8 +53,8 @@ def list_gloves(out: Path | None = None) -> None:
         "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
     )
     if out is not None:
-        from render.illustrations.captions import write_png
-        from render.illustrations.hands import draw_gloves
+        from render.captions import write_png
+        from render.illustrations import draw_gloves
 
         write_png(out, draw_gloves([_fitted(load_layout(name), "M") for name in list_layouts()]))
         print_line(f"{out}: the gloves on hands of size M")
@@ -135,8 +134,8 @@ def check_glove(
             f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps)}; "
             "move them apart"
         )
-    from render.illustrations.captions import write_png
-    from render.illustrations.hands import draw_glove
+    from render.captions import write_png
+    from render.illustrations import draw_glove
 
     write_png(picture, draw_glove(nominal_fit(layout, size, layout.sides[-1])))
     print_line(f"{picture}: the glove on a hand of size {size}")
@@ -204,7 +203,7 @@ def score_glove(
 
 def _tell(score: LayoutScore) -> None:
     """Print the figures of a score."""
-    from train.metrics import percent
+    from train.evaluation import percent
 
     joints = np.rad2deg(score.joints)
     for title, report in (

@@ -17,20 +17,17 @@ from handsim.app.progress import print_above, progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
-from render.cameras.viewpoints import Placement, ViewConfig
+from handsim.hand.shape import Side
+from render.color_sensor import ExposureConfig, ShutterConfig
 from render.config import RenderConfig
-from render.formats.merging import merge_renderings
+from render.depth_sensor import SENSORS, DepthSensor
+from render.formats.writer import merge_renderings
 from render.painting.painter import PainterChoice
-from render.pose_file import CSV
-from render.scenery.backgrounds import BackgroundKind, Backgrounds
-from render.scenery.photographs import photo_files
-from render.sensors.depth_noise import SENSORS, DepthSensor
-from render.sensors.exposure import ExposureConfig
-from render.sensors.shutter import ShutterConfig
+from render.scenery.backgrounds import BackgroundKind, Backgrounds, photo_files
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import ALL_TONES, named_tones
-from render.subject import PoseFile
+from render.subject import CSV, PoseFile
+from render.viewpoints import Placement, ViewConfig
 
 _NO_SENSOR: Final = "none"
 _AUTO_SENSOR: Final = "auto"

@@ -14,9 +14,8 @@ from rich.console import Console
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, HandSimWarning
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
+from handsim.files.outputs import check_outputs, written_together
+from handsim.hand.shape import Side
 from track.config import Size
 from track.frames import TrackedFrame
 

@@ -17,9 +17,9 @@ from handsim.cli.command_table import PresetCommand, given_option
 from handsim.cli.parsing import run_command
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.signals import Stopped
-from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
 from train.devices.world import world_of
-from train.metrics import print_figures
+from train.evaluation import print_figures
+from train.settings import KINDS, PRESETS, Kind, Preset, TrainSettings, default_config, preset_config
 
 _PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
 
@@ -27,7 +27,7 @@ _PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
 def _train(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")],
+    config: Annotated[TrainSettings, tyro.conf.arg(name="")],
     preset: Preset | None = None,
     threads: int | None = None,
 ) -> None:
@@ -66,7 +66,7 @@ def _train(
     print_line(f"report in {out / PAGE}")
 
 
-def _train_silently(dataset: Path, out: Path, config: TrainConfig, threads: int | None) -> None:
+def _train_silently(dataset: Path, out: Path, config: TrainSettings, threads: int | None) -> None:
     """Train in a process other than the first of several, which tells what there is to tell."""
     from train.loop import train_labeler
 
@@ -114,7 +114,7 @@ def _with_recipe_as_default(args: Sequence[str], prog: str) -> functools.partial
 def _dataset_of(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")],
+    config: Annotated[TrainSettings, tyro.conf.arg(name="")],
     preset: Preset | None = None,
     threads: int | None = None,
 ) -> Path:

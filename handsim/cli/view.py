@@ -14,7 +14,7 @@ from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.files.signals import InterruptFlag, interrupt_flag
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.config import Size
 from track.streams import LOOPBACK
 from track.viewer.server import address_of, opened_server
@@ -105,7 +105,7 @@ def _draw(name: str, content: Content, video: Path) -> None:
     from track.viewer.video import write_video
 
     check_outputs((name,), (video,))
-    from render.illustrations.clip import write_clip  # OpenCV and the painters
+    from render.illustrations import write_clip  # OpenCV and the painters
 
     recording = content.recording
     if recording is None:
@@ -125,7 +125,7 @@ def _view_live(
     url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
-    from handsim.space.cameras import load_rig
+    from handsim.space.rig import load_rig
     from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
     from track.settings import warm_up

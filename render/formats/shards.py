@@ -1,4 +1,8 @@
-"""Shards of pictures on disk: each a tar file or a folder, complete or absent."""
+"""Shards of pictures on disk: each a tar file or folders, complete or absent.
+
+Photographs lie in `images/shard-00000`, and nothing else that is a picture: programs train on whatever they
+find there. Depth, ids and normals have folders of the same names beside it, `depth/shard-00000`.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write, temporary_beside
-from render.formats.annotations.common import to_json
+from handsim.files.outputs import atomic_write, temporary_beside
+from render.formats.records import encode_pictures, to_json, without_colors
+from render.frames import RenderedFrame
 
 INDEX: Final = "index.json"
 """Index file of a shard's folder: a list of records of its pictures."""
@@ -147,3 +152,97 @@ def json_list(items: Iterable[Any]) -> Iterator[str]:
     for number, item in enumerate(items):
         yield (",\n" if number else "\n") + to_json(item)
     yield "\n]"
+
+
+_IMAGES: Final = "images"
+PICTURES: Final = ("depth", "depth_ideal", "normals", "ids")
+"""Kinds of pictures beside the photographs, each of which has a folder."""
+_LABELS: Final = "labels"
+BESIDE: Final = (*PICTURES, _LABELS)
+"""Folders that may stand beside that of the photographs."""
+
+
+class FolderWriter:
+    """For each shard a folder of pictures, which are named after frames, with an index of records.
+
+    Args:
+        folder: Where all is.
+        inside: The folder of photographs in it.
+        part: A folder in that one, and in those beside it, which holds the shards.
+    """
+
+    def __init__(self, folder: Path, *, inside: str = _IMAGES, part: str = ".") -> None:
+        self.folder, self.part = folder, part
+        self.pictures = folder / inside / part
+
+    def done(self) -> frozenset[int]:
+        """Shards that are complete."""
+        return shards_in(self.pictures)
+
+    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
+        """Write a shard, or write it anew.
+
+        Raises:
+            HandSimError: The format cannot hold these frames, or the disk takes no more.
+        """
+        with one_sentence(self.folder, f"writing shard {shard}"), self.new_shard(shard) as temporary:
+            save_index(temporary, list(self._add_all(temporary, frames, shard_name(shard))))
+
+    @contextmanager
+    def new_shard(self, shard: int) -> Iterator[Path]:
+        """A temporary folder that becomes a shard when the block ends well; those in it go beside it.
+
+        Photographs take their names last: a shard that is there is whole.
+        """
+        with new_folder(self.pictures / shard_name(shard)) as temporary:
+            yield temporary
+            for kind, place in self.beside(shard).items():
+                if place.exists():
+                    shutil.rmtree(place)
+                if (temporary / kind).is_dir():
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    (temporary / kind).replace(place)
+
+    def beside(self, shard: int) -> dict[str, Path]:
+        """Where a shard's depth, ids and so on are, if there are any."""
+        return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
+
+    def finish(self) -> None:
+        """Nothing to merge, unless a format overrides this."""
+
+    def _add_all(self, folder: Path, frames: Iterable[RenderedFrame], name: str) -> Iterator[dict[str, Any]]:
+        keys = set()
+        for frame in frames:
+            if frame.key in keys:
+                raise HandSimError(f"two frames of a shard are called '{frame.key}'; number them apart")
+            keys.add(frame.key)
+            yield self._add(folder, frame, name)
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        """Write one frame into a shard's folder of that name."""
+        raise NotImplementedError
+
+    def _add_pictures(
+        self, folder: Path, frame: RenderedFrame, name: str, *, lossless: bool = False
+    ) -> dict[str, str]:
+        """Write a frame's pictures and return where those beside the photograph will be, from `folder` on."""
+        files = {}
+        for suffix, content in encode_pictures(frame, lossless=lossless).items():
+            kind, _, ending = suffix.strip(".").rpartition(".")
+            _write(folder / kind / f"{frame.key}.{ending}", content)
+            if kind:
+                files[f"{kind}_file"] = (Path(kind) / self.part / name / f"{frame.key}.{ending}").as_posix()
+        return files
+
+    def _records(self) -> Iterator[dict[str, Any]]:
+        return load_indexes(self.pictures, sorted(self.done()))
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+
+
+def _need_colors(frame: RenderedFrame, name: str) -> None:
+    if frame.ideal.rgb is None and frame.noisy.rgb is None:
+        raise without_colors(name)

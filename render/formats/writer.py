@@ -1,28 +1,64 @@
-"""Writers of rendered frames, chosen by the name of a format.
+"""Writers of rendered frames by the name of their format, and renderings merged into one.
 
-Frames go out in shards, so that rendering can be killed and go on: a shard is written under a temporary name
-and renamed when it is complete. Several processes may write different shards into one folder; when all are
-done, one of them calls `finish`, which merges what the format stores in one file.
+Frames go out in shards, so that rendering can be killed and go on: a shard is written under a temporary
+name and renamed when it is complete. Several processes may write different shards into one folder; when all
+are done, one of them calls `finish`, which merges what the format stores in one file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import json
+import re
+import shutil
+import tarfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
-from handsim._checks import check_choice
-from handsim.errors import HandSimError
-from render.formats.clip_writer import WebdatasetWriter
-from render.formats.folder_writers import (
-    CocoWriter,
-    ExrWriter,
-    InterhandWriter,
-    PngWriter,
-    YoloWriter,
+from handsim._checks import check_choice, check_type
+from handsim.errors import DatasetError, HandSimError
+from handsim.files.json_files import load_json, save_json
+from handsim.files.outputs import check_free
+from render.formats.coco import CocoWriter, InterhandWriter, YoloWriter
+from render.formats.freihand import FreihandWriter
+from render.formats.records import to_json, write_exr
+from render.formats.shards import (
+    INDEX,
+    PICTURES,
+    FolderWriter,
+    load_index,
+    new_tar,
+    one_sentence,
+    save_index,
+    shard_name,
 )
-from render.formats.freihand_writer import FreihandWriter
+from render.formats.webdataset import TAR, WebdatasetWriter, frame_record
 from render.frames import RenderedFrame
+
+
+class PngWriter(FolderWriter):
+    """`images/shard-00000/KEY.png`, `depth/shard-00000/KEY.png` ..., and `KEY.json` beside the photograph.
+
+    The JSON has everything that is known of the frame.
+    """
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        files = self._add_pictures(folder, frame, name, lossless=True)
+        record = frame_record(frame) | files
+        (folder / f"{frame.key}.json").write_text(to_json(record) + "\n", "utf-8")
+        return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
+
+
+class ExrWriter(FolderWriter):
+    """`shard-00000/KEY.exr` with all pictures, and `KEY.json` with all that is known of the frame."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, inside=".")
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        write_exr(folder / f"{frame.key}.exr", frame)
+        (folder / f"{frame.key}.json").write_text(to_json(frame_record(frame)) + "\n", "utf-8")
+        return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
 
 
 class FrameWriter(Protocol):
@@ -77,3 +113,164 @@ def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """
     check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name](Path(folder))
+
+
+CONFIG: Final = "render.json"
+"""Settings of a rendering, in its folder."""
+_MERGEABLE: Final = ("webdataset", "coco", "yolo", "exr", "png")
+_LARGEST: Final = 1 << 30  # bytes of a picture's file
+_SAMPLE: Final = re.compile(r"(\d+)(\..+)")
+
+
+def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
+    """Copy the shards of several renderings into one folder.
+
+    Frames of the second rendering are numbered after those of the first, and so on, in keys, names of files
+    and records; COCO's ids are counted anew. Renderings of one format or of the same several can be merged.
+
+    Args:
+        folders: Folders that `render_take` or this function wrote; complete shards count.
+        out: A new folder.
+
+    Returns:
+        Number of shards of each format; pictures [px] and depth [m] are as they were.
+
+    Raises:
+        HandSimError: A folder holds no rendering, their formats differ or have no place for several
+            renderings, `out` is not new, or the disk is too small.
+        DatasetError: A shard is damaged.
+    """
+    check_type("folders", folders, (list, tuple), "paths of folders")
+    parts, out = [Path(folder) for folder in folders], Path(out)
+    settings = [_settings(folder) for folder in parts]
+    formats = settings[0]["formats"]
+    for folder, one in zip(parts, settings, strict=True):
+        if one["formats"] != formats:
+            raise HandSimError(
+                f"{folder} has the formats {', '.join(one['formats'])}, expected {', '.join(formats)} as in "
+                f"{parts[0]}"
+            )
+    for name in formats:
+        if name not in _MERGEABLE:
+            raise HandSimError(
+                f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
+            )
+    if len(parts) < 2 or len({folder.resolve() for folder in parts}) < len(parts):
+        raise HandSimError("expected two or more different folders to merge")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise HandSimError(f"{out} is not empty; name a new folder")
+    needed = sum(file.stat().st_size for one in parts for file in one.rglob("*") if file.is_file())
+    check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
+    count = 0
+    for name in formats:
+        count = _merge_format(name, parts, [one["frames"] for one in settings], formats, out)
+        open_writer(name, format_folder(out, formats, name)).finish()
+    frames = sum(one["frames"] for one in settings)
+    save_json(out / CONFIG, {"formats": formats, "frames": frames, "merged": settings})
+    return count
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    if not (folder / CONFIG).is_file():
+        raise HandSimError(f"{folder} holds no {CONFIG}, expected a folder that handsim render wrote")
+    settings = load_json(folder / CONFIG)
+    formats, frames = settings.get("formats"), settings.get("frames")
+    good = isinstance(formats, list) and formats and all(isinstance(name, str) for name in formats)
+    if not good or not isinstance(frames, int) or not 0 < frames < 1 << 40:
+        raise DatasetError(f"{folder / CONFIG} is damaged: formats or frames are missing")
+    return settings
+
+
+def _merge_format(
+    name: str, folders: Sequence[Path], frames: Sequence[int], formats: Sequence[str], out: Path
+) -> int:
+    """Copy all shards of one format, and return their number."""
+    number, offset = 0, 0
+    target = open_writer(name, format_folder(out, formats, name))
+    for folder, count in zip(folders, frames, strict=True):
+        source = open_writer(name, format_folder(folder, formats, name))
+        for shard in sorted(source.done()):
+            with one_sentence(out, f"copying shard {shard} of {folder}"):
+                if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
+                    _copy_folder(source, shard, target, number, offset)
+                else:
+                    start, end = (
+                        format_folder(one, formats, name) / f"{shard_name(which)}{TAR}"
+                        for one, which in ((folder, shard), (out, number))
+                    )
+                    _copy_tar(start, end, offset)
+            number += 1
+        offset += count
+    if not number:
+        raise HandSimError(f"{', '.join(map(str, folders))}: no finished shards of the format {name}")
+    return number
+
+
+def _copy_tar(start: Path, end: Path, offset: int) -> None:
+    try:
+        with tarfile.open(start, "r:") as source, new_tar(end) as target:
+            for entry in source:
+                file = source.extractfile(entry) if entry.isfile() and entry.size <= _LARGEST else None
+                if file is None:
+                    raise DatasetError(f"{start}: '{entry.name}' is not a file that handsim render writes")
+                target.add(*_renumbered(entry.name, file.read(), offset))
+    except (tarfile.TarError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise DatasetError(f"{start}: a damaged tar; delete it and render again") from error
+
+
+def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
+    sample = _SAMPLE.fullmatch(name)
+    if sample is None:  # the hand shapes of the shard
+        return name, content
+    if sample[2] == ".info.json":
+        info = json.loads(content)
+        content = to_json({**info, "number": info["number"] + offset}).encode()
+    return f"{int(sample[1]) + offset:06d}{sample[2]}", content
+
+
+def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number: int, offset: int) -> None:
+    """A shard of a format with folders: files that are named after keys, and an index of records."""
+    start, places = source.pictures / shard_name(shard), source.beside(shard)
+    records = []
+    with target.new_shard(number) as temporary:
+        for record, files in _keyed(start, places):
+            image = record.get("image", record)  # the formats with an image's record number frames in it
+            field = "frame" if "image" in record else "number"
+            frame = int(image[field]) + offset
+            key = f"{image['camera']}_{frame:06d}"
+            named = {
+                f"{kind}_file": f"{kind}/{shard_name(number)}/{key}{suffix}"
+                for kind, suffix in files
+                if kind in PICTURES
+            }
+            image[field] = frame
+            if "image" in record:
+                image |= {"file_name": f"{shard_name(number)}/{key}.jpg", **named}
+            else:
+                image["key"] = key
+            for (kind, suffix), file in files.items():
+                (temporary / kind).mkdir(exist_ok=True)
+                if suffix == ".json":
+                    content = load_json(file) | {"number": frame} | named
+                    (temporary / f"{key}.json").write_text(to_json(content) + "\n", "utf-8")
+                else:
+                    shutil.copyfile(file, temporary / kind / f"{key}{suffix}")
+            records.append(record)
+        save_index(temporary, records)
+
+
+def _keyed(
+    start: Path, places: Mapping[str, Path]
+) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], Path]]]:
+    """Records of a shard, and the files of each by the folder that they are in and their endings."""
+    files: dict[str, dict[tuple[str, str], Path]] = {}
+    for kind, place in {"": start, **places}.items():
+        for path in sorted(place.iterdir()) if place.is_dir() else ():
+            if path.is_file() and path.name != INDEX:
+                files.setdefault(path.stem, {})[kind, path.suffix] = path
+    for record in load_index(start):
+        try:
+            key = Path(record["image"]["file_name"]).stem if "image" in record else str(record["key"])
+            yield record, files[key]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(f"{start}: its index does not fit its files; render it again") from error

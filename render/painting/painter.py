@@ -1,22 +1,288 @@
-"""Colors and coverage of surfaces by either painter, and pictures over backgrounds."""
+"""Colors of surfaces before backgrounds, by our own compiled painter or by OpenGL.
+
+A software OpenGL shades triangles in blocks of pixels, most of which are discarded for a fine mesh. Our
+painter shades each pixel once, after its nearest face is known, and four times only where a surface ends.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
 from handsim.space.camera import Camera
-from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
-from render.painting.gl import opengl_has_hardware
-from render.painting.opengl_painter import paint_opengl
-from render.painting.rasterizer import NEAR
+from render.painting.opengl import opengl_has_hardware, paint_opengl
+from render.painting.rasterizer import NEAR, nearest_faces, project
+from render.painting.shading import (
+    BUMP,
+    COLOR,
+    NORMAL,
+    POSITION,
+    ROUGHEST,
+    SPOT,
+    TANGENT,
+    TINT,
+    TO_DISPLAY,
+    TO_LINEAR,
+    display,
+    shade,
+    shadow_map,
+)
 from render.scenery.lights import Lighting
+
+_SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
+_SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
+_BLOCK: Final = (
+    1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
+)
+
+_NO_TEXELS: Final = np.empty((0, 0, 2), dtype=np.uint32)
+
+
+class _Mesh(NamedTuple):
+    """One surface in the camera's axes, with its material."""
+
+    begin: int
+    """Number of its first face among those of all surfaces."""
+    faces: NDArray[np.int64]
+    corners: NDArray[np.float64]
+    """Of `rasterizer.project` (V, 3) at twice the picture's size."""
+    rows: NDArray[np.float32]
+    """Position [m], normal, tint and texture coordinates of each vertex (V, 11)."""
+    texels: NDArray[np.uint32]
+    """Two words a texel (h, w, 2); empty where there is no texture."""
+    finish: NDArray[np.float64]
+    """Color, roughness, glow and scatter."""
+
+
+def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
+    """See `render.painting.painter.paint`; the same bytes on every machine but for rounding."""
+    width, height = camera.size
+    meshes = _meshes(camera, drawn)
+    counts = np.cumsum([0, *(len(mesh.corners) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)])
+    corners = np.concatenate([mesh.corners for mesh in meshes])
+    nearness, first = nearest_faces(corners, faces, (2 * width, 2 * height), farthest=0.0)
+    lamps, around = _lamp_table(lighting), np.zeros((9, 3))
+    around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
+    casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
+    sides = 2.0 * np.array([width, height])
+    with np.errstate(invalid="ignore"):  # NaN behind the camera
+        inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
+    points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
+    shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
+    covered = _covered(first)
+    sums = np.zeros((len(covered), 4), dtype=np.float32)
+    for mesh in meshes:
+        _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
+    painted = np.zeros((height, width, 4), dtype=np.uint8)
+    _as_bytes(sums, covered, painted.reshape(-1, 4))
+    return painted
+
+
+@kernel
+def _as_bytes(sums: NDArray[np.float32], covered: NDArray[np.int32], painted: NDArray[np.uint8]) -> None:
+    """Write the bytes of covered pixels into a picture (P, 4), of their sums over four samples (N, 4)."""
+    for place, pixel in enumerate(covered):
+        for channel in range(4):
+            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[place, channel]))
+
+
+def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
+    rotation = camera.T_world_camera[:3, :3]
+    doubled = np.diag([2.0, 2.0, 1.0]) @ camera.K
+    meshes, begin = [], 0
+    for one in drawn:
+        triangles, material = one.triangles, one.material()
+        local = camera.local(triangles.vertices)
+        rows = np.zeros((len(local), 11), dtype=np.float32)
+        rows[:, :3], rows[:, 3:6] = local, triangles.normals @ rotation
+        rows[:, 6:9] = one.colors[:, :3]
+        if one.uv is not None:
+            rows[:, 9:] = one.uv
+        texels = _NO_TEXELS if material.texels is None else material.texels.view(np.uint32)
+        faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
+        finish = np.array([*material.color, material.roughness, material.glow, *material.scatter])
+        meshes.append(_Mesh(begin, faces, project(local, doubled), rows, texels, finish))
+        begin += len(faces)
+    return meshes
+
+
+def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
+    """Rows for `shading.shade`; lamps in one direction share a row."""
+    rows: dict[tuple[float, float, float], NDArray[np.float64]] = {}
+    for number, lamp in enumerate(lighting.lamps):
+        towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
+        row = rows.setdefault(lamp.direction, np.concatenate([towards, np.zeros(6)]))
+        row[3 if number == 0 else 6 :][:3] += np.pi * lamp.strength * np.array(lamp.color)
+    if not rows:
+        return np.array([[0.0, 0.0, -1.0, *[0.0] * 6]])
+    return np.stack(list(rows.values()))
+
+
+@kernel
+def _covered(first: NDArray[np.int32]) -> Any:
+    """Numbers (N,) of the pixels with a surface in one of their samples (2 H, 2 W), which are -1 for none."""
+    height, width = first.shape[0] // 2, first.shape[1] // 2
+    covered, count = np.empty(height * width, np.int32), 0
+    for row in range(height):
+        upper, lower = first[2 * row], first[2 * row + 1]
+        for column in range(width):
+            both = (upper[2 * column] & upper[2 * column + 1]) & (lower[2 * column] & lower[2 * column + 1])
+            covered[count] = row * width + column
+            count += both >= 0  # all bits of -1 are set: only four of them are negative
+    return covered[:count]
+
+
+# Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
+@kernel
+def _add_surface(
+    nearness: NDArray[np.float32],
+    first: NDArray[np.int32],
+    covered: NDArray[np.int32],
+    begin: int,
+    faces: NDArray[np.int64],
+    corners: NDArray[np.float64],
+    rows: NDArray[np.float32],
+    texels: NDArray[np.uint32],
+    finish: NDArray[np.float64],
+    to_linear: NDArray[np.float32],
+    lamps: NDArray[np.float64],
+    ambient: NDArray[np.float64],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
+    bias: float,
+    to_display: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Add one surface's colors, and how many of four samples per pixel it fills.
+
+    `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
+    all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9)
+    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (N, 4) of covered pixels is
+    added to.
+    """
+    width, end = first.shape[1] // 2, begin + len(faces)
+    block = np.empty((SPOT, _BLOCK), np.float32)
+    places, shares = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.float32)
+    spot = row = start = 0
+    for place in range(len(covered) + 1):
+        if spot > _BLOCK - 4 or place == len(covered):
+            spots = np.ascontiguousarray(block[:, :spot])
+            light = shade(spots, texels, finish, to_linear, lamps, ambient, to_map, nearest, bias)
+            for k in range(3):
+                display(light[k], spots[TINT + k], to_display)
+            for n in range(spot):
+                for k in range(3):
+                    sums[places[n], k] += shares[n] * light[k, n]
+                sums[places[n], 3] += shares[n]
+            spot = 0
+        if place == len(covered):
+            break
+        pixel = covered[place]
+        while pixel - start >= width:  # quicker than a division for each pixel
+            start += width
+            row += 1
+        column = pixel - start
+        count, smooth = _samples(nearness, first, begin, end, row, column)
+        if count == 0:
+            continue
+        for i in range(1 if smooth else 2):
+            for j in range(1 if smooth else 2):
+                face = first[2 * row + i, 2 * column + j] - begin
+                if not 0 <= face < len(faces):
+                    continue
+                x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
+                _write_spot(
+                    corners,
+                    rows,
+                    faces[face, 0],
+                    faces[face, 1],
+                    faces[face, 2],
+                    2 * column + x,
+                    2 * row + y,
+                    texels,
+                    finish,
+                    block,
+                    spot,
+                )
+                places[spot], shares[spot] = place, 4.0 if smooth else 1.0
+                spot += 1
+
+
+@kernel(inline=True)
+def _samples(
+    nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
+) -> Any:
+    """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths."""
+    count, most, least = 0, 0.0, np.inf
+    for i in range(2):
+        for j in range(2):
+            if begin <= first[2 * row + i, 2 * column + j] < end:
+                count += 1
+                most = max(most, nearness[2 * row + i, 2 * column + j])
+                least = min(least, nearness[2 * row + i, 2 * column + j])
+    return count, count == 4 and most - least < _SMOOTH * most
+
+
+@kernel(inline=True)
+def _write_spot(
+    corners: NDArray[np.float64],
+    rows: NDArray[np.float32],
+    a: int,
+    b: int,
+    c: int,
+    x: float,
+    y: float,
+    texels: NDArray[np.uint32],
+    finish: NDArray[np.float64],
+    spots: NDArray[np.float32],
+    spot: int,
+) -> None:
+    """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
+
+    The face has the vertices a, b and c; x and y are column and row in the doubled picture [px].
+    """
+    ax, ay = corners[a, 0], corners[a, 1]
+    bx, by = corners[b, 0] - ax, corners[b, 1] - ay
+    cx, cy = corners[c, 0] - ax, corners[c, 1] - ay
+    whole = by * cx - bx * cy  # positive, as of all faces that are drawn
+    second = max((y - ay) * cx - (x - ax) * cy, 0.0)
+    third = max((x - ax) * by - (y - ay) * bx, 0.0)
+    first = max(whole - second - third, 0.0) * corners[a, 2]
+    second, third = second * corners[b, 2], third * corners[c, 2]
+    scale = 1.0 / (first + second + third)
+    first, second, third = (
+        np.float32(first * scale),
+        np.float32(second * scale),
+        np.float32(third * scale),
+    )
+    px = first * rows[a, 0] + second * rows[b, 0] + third * rows[c, 0]
+    py = first * rows[a, 1] + second * rows[b, 1] + third * rows[c, 1]
+    pz = first * rows[a, 2] + second * rows[b, 2] + third * rows[c, 2]
+    spots[POSITION, spot], spots[POSITION + 1, spot], spots[POSITION + 2, spot] = px, py, pz
+    for i in range(3):
+        spots[NORMAL + i, spot] = first * rows[a, 3 + i] + second * rows[b, 3 + i] + third * rows[c, 3 + i]
+        spots[TINT + i, spot] = first * rows[a, 6 + i] + second * rows[b, 6 + i] + third * rows[c, 6 + i]
+    if len(texels):
+        for i in range(2):
+            spots[BUMP + i, spot] = first * rows[a, 9 + i] + second * rows[b, 9 + i] + third * rows[c, 9 + i]
+        bu, bv = rows[b, 9] - rows[a, 9], rows[b, 10] - rows[a, 10]
+        cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
+        sign = np.float32(1.0 if bu * cv - cu * bv >= 0.0 else -1.0)
+        for i in range(3):
+            spots[TANGENT + i, spot] = sign * (
+                cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
+            )
+    else:
+        for i in range(4):  # no mirror is perfect
+            spots[COLOR + i, spot] = np.float32(finish[i] if i < 3 else max(finish[i], ROUGHEST))
+
 
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]

@@ -1,12 +1,16 @@
-"""Backgrounds: plain, gradient, noise, clutter, room, photograph.
+"""Backgrounds: plain, gradient, noise, clutter, room or photograph; none of them looks like a hand.
 
-Nothing here looks like a hand. A background is a few plain values and a seed; drawing it again gives the same
-picture.
+A background is a few plain values and a seed, so that drawing it again gives the same picture. Several
+cameras see a background at a place in the world: a room with its furniture, or a box with a picture on each
+wall.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import itertools
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,15 +18,111 @@ from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, Int8, UInt8
 from numpy.typing import NDArray
+from PIL import Image
 
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
-from handsim.kernels.kernel import kernel
-from render.scenery.photographs import draw_photo, pick_photo
-from render.scenery.rooms import draw_room, paint_tints
-from render.sensors.random_images import normal_numbers
+from handsim.files.inputs import check_regular
+from handsim.files.outputs import plain_path
+from handsim.kernels import kernel
+from handsim.space.camera import Camera, Lens
+from render.fields import normal_numbers
+from render.frames import Pictures
+from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
+
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
+_MOST_PIXELS: Final = 100_000_000  # of a photograph
+
+
+@functools.lru_cache(maxsize=2)
+def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Photographs in a folder and its subfolders: those with the first bytes of a picture, and the others."""
+    if not folder.is_dir():
+        raise HandSimError(f"{folder}: no such folder of photographs")
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
+    good = tuple(filter(_begins_as_picture, files))
+    if not good:
+        raise _no_photo(folder)
+    return good, tuple(file for file in files if file not in set(good))
+
+
+def _begins_as_picture(file: Path) -> bool:
+    with plain_path(file) as plain:
+        return bool(cv2.haveImageReader(str(plain)))
+
+
+def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
+    """A random photograph that can be read whole."""
+    files, _ = photo_files(folder)
+    for index in rng.permutation(len(files))[:_TRIES]:
+        if _read(files[index]) is not None:
+            readable: Path = files[index]
+            return readable
+    raise _no_photo(folder)
+
+
+def photos_beside(file: Path, count: int) -> list[Path]:
+    """A photograph and others of its folder, so many together; they come again where there are fewer."""
+    files, _ = photo_files(file.parent)
+    start = files.index(file) + 1 if file in files else 0
+    others = (one for one in (*files[start:], *files[:start]) if one != file and _read(one) is not None)
+    chosen = [file, *itertools.islice(others, count - 1)]
+    return list(itertools.islice(itertools.cycle(chosen), count))
+
+
+def _no_photo(folder: Path) -> HandSimError:
+    endings = ", ".join(PHOTO_SUFFIXES)
+    return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
+
+
+def _read(file: Path) -> NDArray[np.uint8] | None:
+    try:
+        check_regular(file, error=HandSimError)
+        if _num_pixels(file) > _MOST_PIXELS:
+            return None
+        data = np.fromfile(file, dtype=np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except (OSError, cv2.error, HandSimError):
+        return None
+    return None if picture is None else np.asarray(picture)
+
+
+def _num_pixels(file: Path) -> int:
+    """Pixels that a file states; OpenCV would allocate them all before it finds that they are not there.
+
+    The same holds for the parts of a PNG, which are checked.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of decompression bombs
+            with Image.open(file) as picture:
+                pixels = int(picture.width * picture.height)
+                picture.verify()
+                return pixels
+    except Exception as error:  # headers are damaged in many ways
+        raise HandSimError(f"{file}: not a readable photograph") from error
+
+
+def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A random part of a photograph in the picture's proportions, which fills it: half of it or more."""
+    photo = _read(file)
+    if photo is None:
+        raise HandSimError(f"{file}: not a readable photograph")
+    height, width = photo.shape[:2]
+    scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
+    part = np.maximum(np.array(size) * scale, 1.0).astype(int)
+    left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
+    cut = photo[top : top + part[1], left : left + part[0], ::-1]
+    shrinks = part[0] > size[0]
+    scaled = cv2.resize(
+        np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+    light: NDArray[np.float32] = (scaled.astype(np.float32) / 255.0) ** _GAMMA
+    return light
+
 
 SHARE: Final = 0.6
 """Of backgrounds that could have a backdrop, those that do; the others are too far away for a shadow."""
@@ -306,3 +406,158 @@ def _lay_over(
                 for channel in range(3):
                     value = part[row, column, channel] * light
                     part[row, column, channel] = value + share * (color[channel] - value)
+
+
+Corner = tuple[float, float, float]
+_MARGIN: Final = (0.8, 2.2)  # [m] between the outermost camera or hand and a wall
+_FREE: Final = 0.5  # [m] around hands and cameras without furniture
+_TEXTURE: Final = 512  # [px] of a wall each way
+_SHORTEST: Final = 1e-6  # component of a ray, so that it meets each pair of walls
+
+
+@dataclass(frozen=True, slots=True)
+class Enclosure:
+    """A box that holds everything, in the world's axes, z up."""
+
+    low: Corner
+    """[m]."""
+    high: Corner
+    free: tuple[Corner, Corner]
+    """Low and high corner of the box that hands and cameras stay in [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What one camera sees behind hands and objects."""
+
+    rgb: UInt8[np.ndarray, "H W 3"]
+    """sRGB; 0 where the lens sees nothing."""
+    depth: Float32[np.ndarray, "H W"]
+    """Along the camera's axis [m]; 0 for what is not ahead."""
+    axes: Int8[np.ndarray, "H W"]
+    """Axis of the world that the surface's normal has."""
+    signs: Int8[np.ndarray, "H W"]
+    """Whether it points along that axis (1) or against it (-1)."""
+
+    def put_behind(self, pictures: Pictures, camera: Camera) -> Pictures:
+        """Pictures of hands and objects with depth and normals behind them, too.
+
+        Args:
+            pictures: Depth, normals if any, and instances.
+            camera: The camera of both.
+        """
+        assert pictures.depth is not None and pictures.instances is not None
+        bare = (pictures.instances == 0) & (self.depth > 0.0)
+        normals = pictures.normals
+        if normals is not None:
+            normals = normals.copy()
+            normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
+        return dataclasses.replace(
+            pictures, depth=np.where(bare, self.depth, pictures.depth), normals=normals
+        )
+
+
+def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
+    """A random box around cameras and hands.
+
+    Args:
+        positions: Where they are [m].
+        seed: Seed of the distances of the walls.
+    """
+    below, above = np.random.default_rng([seed, 0]).uniform(*_MARGIN, (2, 3))
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return Enclosure(
+        _corner(low - below), _corner(high + above), (_corner(low - _FREE), _corner(high + _FREE))
+    )
+
+
+def _corner(point: NDArray[np.float64]) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def draw_surroundings(background: Background, enclosure: Enclosure, camera: Camera) -> Surroundings:
+    """What a camera inside the box, with any lens, sees of it; what stands still is drawn once.
+
+    Raises:
+        HandSimError: The photograph cannot be read.
+    """
+    focal = tuple(camera.K.ravel().tolist())
+    lens = camera.lens
+    return _drawn(background, enclosure, camera.size, focal, lens, camera.T_world_camera.tobytes())
+
+
+@functools.lru_cache(maxsize=16)
+def _drawn(
+    background: Background,
+    enclosure: Enclosure,
+    size: tuple[int, int],
+    focal: tuple[float, ...],
+    lens: Lens,
+    pose: bytes,
+) -> Surroundings:
+    T_world_camera = np.frombuffer(pose).reshape(4, 4)
+    rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
+    known = np.isfinite(rays).all(axis=-1)
+    world = (np.where(known[..., None], rays, 1.0) @ T_world_camera[:3, :3].T).reshape(-1, 3)
+    world[np.abs(world) < _SHORTEST] = _SHORTEST
+    low, high = np.array(enclosure.low), np.array(enclosure.high)
+    eye, rng = T_world_camera[:3, 3] - low, np.random.default_rng([background.seed, 1])
+    if background.kind == "room":
+        free = np.array(enclosure.free) - low
+        met = cast_room(world.astype(np.float32), eye, high - low, free, rng=rng)
+    else:
+        met = _meet_walls(world, eye, high - low, _wall_pictures(background, enclosure))
+    shape = size[::-1]
+    light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3) * known[..., None]
+    if background.blur * shape[0] > 0.3:
+        light = cv2.GaussianBlur(light, (0, 0), background.blur * shape[0])
+    rgb = np.rint(255.0 * cv2.pow(light.astype(np.float32), 1.0 / _GAMMA)).astype(np.uint8)
+    depth = met.distances.reshape(shape) * np.where(known, rays[..., 2], 0.0)
+    along = np.take_along_axis(world, met.axes.reshape(-1, 1).astype(np.int64), axis=1)
+    signs = -np.sign(along).astype(np.int8).reshape(shape)
+    return Surroundings(rgb, np.maximum(depth, 0.0).astype(np.float32), met.axes.reshape(shape), signs)
+
+
+@functools.lru_cache(maxsize=2)
+def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.ndarray, "R S 3"]:
+    """Linear pictures of the six walls, one below the other; a photograph of its own fills each."""
+    walls = [
+        dataclasses.replace(background, seed=(background.seed + wall) % 2**31, blur=0.0) for wall in range(6)
+    ]
+    if background.photo is None:
+        return np.concatenate([draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls])
+    room = np.array(enclosure.high) - np.array(enclosure.low)
+    pictures = []
+    for number, (wall, photo) in enumerate(zip(walls, photos_beside(Path(background.photo), 6), strict=True)):
+        sides = np.delete(room, number // 2)  # across and up
+        width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
+        picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
+        pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))
+    return np.concatenate(pictures)
+
+
+def _meet_walls(
+    rays: NDArray[np.float64],
+    eye: NDArray[np.float64],
+    room: NDArray[np.float64],
+    pictures: NDArray[np.float32],
+) -> RoomLight:
+    """Where rays (N, 3) from the eye (3,) meet the walls of an empty room (3,), and the pictures there."""
+    far = rays > 0.0
+    ways = (np.where(far, room, 0.0) - eye) / rays
+    axes = ways.argmin(axis=1)
+    row = np.arange(len(rays))
+    distances = ways[row, axes]
+    share = np.clip((eye + distances[:, None] * rays) / room, 0.0, 1.0)
+    across, up = share[row, np.where(axes == 0, 1, 0)], share[row, np.where(axes == 2, 1, 2)]
+    inner = _TEXTURE - 1.0
+    wall = 2 * axes + far[row, axes]
+    columns = (across * inner).astype(np.float32)
+    rows = (wall * _TEXTURE + (1.0 - up) * inner).astype(np.float32)
+    strip = 2**14  # pictures of `remap` have at most 32767 rows
+    light = np.empty((len(rays), 3), dtype=np.float32)
+    for begin in range(0, len(rays), strip):
+        part = slice(begin, begin + strip)
+        light[part] = cv2.remap(pictures, columns[part], rows[part], cv2.INTER_LINEAR).reshape(-1, 3)
+    return RoomLight(light, distances.astype(np.float32), axes.astype(np.int8))

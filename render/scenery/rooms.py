@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
-from render.sensors.random_images import normal_numbers
+from handsim.kernels import kernel
+from render.fields import normal_numbers
 
 _FURNITURE: Final = (4, 14)
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls

@@ -1,9 +1,14 @@
-"""`SkinLook`, a person's skin in plain values, and its distribution.
+"""`SkinLook` and `Forearm`: a person's skin and arm in plain values, and their distributions.
 
 Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, and its six classes (Chardon,
 Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are our own
-choice: chroma is highest in the middle and falls towards both ends. All palms hold little pigment,
-so that dark hands have palms much lighter than their backs.
+choice: chroma is highest in the middle and falls towards both ends. All palms hold little pigment, so that
+dark hands have palms much lighter than their backs.
+
+Girths of arms are shares of the hand's breadth: ANSUR II (2012) has wrists of 176 and 154 mm and flexed
+forearms of 309 and 263 mm around for hands of 88.3 and 78.2 mm (men's and women's means); a forearm at rest
+is about a tenth thinner. Elbows, 1.4 hand lengths behind the wrist, are a little thinner, and upper arms
+thicker again (flexed biceps 358 and 305 mm, about a tenth less at rest).
 """
 
 from __future__ import annotations
@@ -13,9 +18,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError, HandSimError
+from handsim.hand.shape import HandShape
+from handsim.space.camera import Camera
+from handsim.space.transforms import MIRROR
+from render.fields import smooth
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -179,3 +191,255 @@ def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
             return float(low + along)
         along -= width
     return float(lows[-1] + along)
+
+
+_LONGEST: Final = 1.0  # [m]
+_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
+"""Places behind the wrist [hand lengths]; the fifth is the elbow."""
+_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
+"""Girths there [hand breadths]."""
+CUFF: Final = 0.0004
+"""Length of the arm along which a sleeve becomes wider than it: a step, between two rings [m]."""
+_HEM: Final = 0.004  # [m] between the rings of the step and the next ones, so that shading does not round it
+_SQUARE: Final = 0.8
+"""Power of the cosine and sine of an arm's section: wrists are squarer than an ellipse, of power 1,"""
+_LONGER: Final = 1.04  # and longer around at the same width
+_BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
+_BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
+ELBOW: Final = _PLACES[4]
+"""Place of the elbow behind the wrist [hand lengths]."""
+_ELBOW_BEND: Final = 0.07  # [m] on either side of the elbow that bend with it
+REACH: Final = 1.8
+"""Where arms that leave a picture end, behind the elbow [m]."""
+_TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
+_TILTS: Final = (0.0, 0.4)  # of an upper arm towards the cameras that are tried
+_DOWN: Final = np.array([0.0, 0.0, -0.5])  # of the way to a body, beside the forearms' level way
+_MOST_BENT: Final = np.cos(np.deg2rad(130.0))
+_CLEAR: Final = 0.12  # [m] between an upper arm and a camera, at least
+_MARGIN: Final = 0.1  # of a picture around it where no arm ends
+
+
+@dataclass(frozen=True, slots=True)
+class Forearm:
+    """A forearm in plain values.
+
+    Raises:
+        HandSimError: It is shorter than 2 cm or longer than half a meter, or its girth is not positive.
+    """
+
+    length: float = 0.22
+    """Length behind the wrist [m]."""
+    flexion: float = 0.0
+    """Flexion of the wrist towards the palm [rad]."""
+    deviation: float = 0.0
+    """Deviation of the wrist towards the thumb [rad]."""
+    girth: float = 1.0
+    """Factor on the mean girth for the hand's breadth."""
+    sleeve: float = 1.0
+    """Start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm."""
+    sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)
+    """sRGB in [0, 1]."""
+    looseness: float = 1.2
+    """Girth of the sleeve over the arm's in it."""
+
+    def __post_init__(self) -> None:
+        if not 0.02 <= self.length <= _LONGEST:
+            raise HandSimError(f"a forearm of {self.length:g} m, expected 0.02 to {_LONGEST:g}")
+        if not self.girth > 0.0:
+            raise HandSimError(f"a forearm's girth is {self.girth:g}, expected a positive factor")
+
+
+def sample_forearm(*, rng: np.random.Generator) -> Forearm:
+    """A random forearm: wrists within half their range, a sleeve on one in three.
+
+    The arm reaches beyond the elbow, where `bent_rings` makes it leave the picture.
+    """
+    length = rng.uniform(0.62, 0.75)
+    flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
+    girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
+    sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
+    red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.08, 3), 0.02, 0.95)
+    return Forearm(
+        float(length),
+        float(flexion),
+        float(deviation),
+        girth,
+        float(sleeve),
+        (float(red), float(green), float(blue)),
+        float(rng.uniform(1.1, 1.45)),
+    )
+
+
+def forearm_rings(
+    shape: HandShape, forearm: Forearm, wrist: Float[np.ndarray, "R 3"], rings: int
+) -> Float[np.ndarray, "rings R 3"]:
+    """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m].
+
+    Args:
+        wrist: The wrist's ring, which the arm continues [m].
+        rings: Number of rings.
+    """
+    mirror = MIRROR if shape.side == "left" else np.eye(3)
+    right = wrist @ mirror
+    center = right.mean(axis=0)
+    section = (right - center)[:, 1:]
+    lean = right[:, 0] - center[0]  # the wrist's ring is not quite planar
+    behind = arm_places(forearm, rings)[1:]
+    width, depth = _half_axes(shape, forearm, behind)
+    extent = np.abs(section).max(axis=0)
+    angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
+    axes_of = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if forearm.sleeve < forearm.length:
+        loose = np.where(behind > forearm.sleeve + 0.5 * CUFF, forearm.looseness, 1.0)
+        width, depth = loose * width, loose * depth
+    round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
+    share = smooth(behind, 0.0, _BLEND * shape.length)[:, None, None]
+    sections = (1.0 - share) * section + share * round_section
+    axes, middles = _course(shape, forearm, behind)
+    local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
+    points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
+    return points @ mirror
+
+
+def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
+    """Places of the wrist's ring and those behind it along the arm [m].
+
+    Rings lie closer together near the wrist, where all the bending is, and two pairs at the edge of a sleeve.
+    """
+    places: NDArray[np.float64] = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
+    if forearm.sleeve < forearm.length:
+        edge = forearm.sleeve + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
+        first = int(np.clip(np.abs(places - forearm.sleeve).argmin() - 1, 1, rings - 4))
+        places[: first + 1] *= edge[0] / places[first]
+        last = first + len(edge) - 1
+        places[last:] = np.interp(
+            places[last:], [places[last], forearm.length], [edge[-1], max(forearm.length, edge[-1] + _HEM)]
+        )
+        places[first : last + 1] = edge
+    return places
+
+
+def bent_rings(
+    rings: Float[np.ndarray, "K R 3"], elbow: float, towards: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "K R 3"]:
+    """Rings of an arm that bends at its elbow and ends `REACH` behind it [m].
+
+    Args:
+        rings: Of a straight arm, outwards from the hand [m].
+        elbow: Place of the elbow along it, behind the first ring [m].
+        towards: Unit direction of the upper arm.
+    """
+    middles = rings.mean(axis=1)
+    ahead = middles[-1] - middles[-2]
+    ahead /= np.linalg.norm(ahead)
+    steps = np.linalg.norm(np.diff(middles, axis=0), axis=1)
+    beyond = np.concatenate([[0.0], np.cumsum(steps)]) - elbow
+    turned = np.flatnonzero(beyond > -_ELBOW_BEND)
+    start = middles[turned[0]] - (beyond[turned[0]] + _ELBOW_BEND) * ahead
+    beyond[-1] = REACH
+    axis = np.cross(ahead, towards)
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-6 else np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    most, aside = np.arctan2(sine, ahead @ towards), np.cross(axis, ahead)
+    fine = np.concatenate([np.linspace(-_ELBOW_BEND, _ELBOW_BEND, 33), [REACH]])
+    angles = most * smooth(fine, -_ELBOW_BEND, _ELBOW_BEND)
+    ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
+    course = np.zeros((len(fine), 3))
+    course[1:] = np.cumsum(0.5 * (ways[1:] + ways[:-1]) * np.diff(fine)[:, None], axis=0)
+    angle = np.interp(beyond[turned], fine, angles)[:, None]
+    places = start + np.stack([np.interp(beyond[turned], fine, course[:, i]) for i in range(3)], axis=1)
+    offsets = rings[turned] - middles[turned, None]
+    across, along = (offsets @ aside)[..., None], (offsets @ ahead)[..., None]
+    offsets += across * ((np.cos(angle) - 1.0) * aside - np.sin(angle) * ahead)[:, None]
+    offsets += along * ((np.cos(angle) - 1.0) * ahead + np.sin(angle) * aside)[:, None]
+    bent = rings.copy()
+    bent[turned] = places[:, None] + offsets
+    return bent
+
+
+def upper_arms(
+    elbows: Float[np.ndarray, "H 3"], forearms: Float[np.ndarray, "H 3"], cameras: Sequence[Camera]
+) -> Float[np.ndarray, "H 3"]:
+    """Unit directions from elbows in which arms leave the pictures of all cameras, where that is possible.
+
+    Args:
+        elbows: In the world [m].
+        forearms: Unit directions of the forearms, from wrist to elbow.
+        cameras: All that see the arms.
+    """
+    axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
+    if np.linalg.norm(axis) < 0.2:  # they look at the arms from all around
+        axis = cameras[0].T_world_camera[:3, 2]
+    axis = axis / np.linalg.norm(axis)
+    body = forearms.mean(axis=0) * [1.0, 1.0, 0.0] + _DOWN
+    body -= (body @ axis) * axis
+    body /= max(float(np.linalg.norm(body)), 1e-6)
+    found = []
+    for elbow, forearm in zip(elbows, forearms, strict=True):
+        flat = forearm - (forearm @ axis) * axis
+        level = float(np.linalg.norm(flat))
+        back = min(0.0, float(body @ flat)) / max(level, 1e-6) ** 2 * min(1.0, 5.0 * level)
+        way = flat + (1.0 - level) * (body - back * flat)
+        if np.linalg.norm(way) < 1e-3:
+            way = cameras[0].T_world_camera[:3, 1]
+        found.append(_out_of_pictures(elbow, forearm, way / np.linalg.norm(way), axis, cameras))
+    return np.array(found)
+
+
+def _out_of_pictures(
+    elbow: NDArray[np.float64],
+    forearm: NDArray[np.float64],
+    way: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    cameras: Sequence[Camera],
+) -> NDArray[np.float64]:
+    """The direction nearest to `way`, turned about `axis`, in which an arm ends in no picture."""
+    aside = np.cross(axis, way)
+    flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
+    tried = np.concatenate([flat - tilt * axis for tilt in _TILTS])
+    tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+    bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
+    bad += 3.0 * (tried @ forearm < _MOST_BENT)
+    ends = elbow + REACH * tried
+    for camera in cameras:
+        size = np.array(camera.size, dtype=np.float64)
+        with np.errstate(invalid="ignore"):
+            pixels = camera.project(ends) / size
+        inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=1)
+        bad += 10.0 * (inside & (camera.local(ends)[:, 2] > 0.0))
+        to_camera = camera.T_world_camera[:3, 3] - elbow
+        nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
+        bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
+    best: NDArray[np.float64] = tried[int(bad.argmin())]
+    return best
+
+
+def _half_axes(
+    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
+    girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
+    flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
+    # Ramanujan's ellipse: its girth over its half width
+    h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
+    around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
+    around *= _LONGER
+    return girth / around, flatness * girth / around
+
+
+def _course(
+    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
+    fine = np.linspace(0.0, behind[-1], 200)
+    share = smooth(fine, 0.0, _BEND * shape.length)
+    # A hand that bends towards its palm (-z) or thumb (y) has its arm go there too, seen from the hand.
+    up, aside = forearm.flexion * share, forearm.deviation * share
+    ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(-ahead[:-1] * np.diff(fine)[:, None], axis=0)])
+    middles = np.stack([np.interp(behind, fine, way[:, i]) for i in range(3)], axis=-1)
+    x = np.stack([np.interp(behind, fine, ahead[:, i]) for i in range(3)], axis=-1)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    z = np.array([0.0, 0.0, 1.0]) - x[:, 2:] * x
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1), middles

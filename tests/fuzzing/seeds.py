@@ -15,15 +15,14 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, starter_layout
-from gloves.takes import columns as table
+from gloves.takes import points as table
+from gloves.takes.archives import GrowingArchive, growing_path
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.growing import GrowingArchive, growing_path
 from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take, take_header, worn_arrays
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
-from track.bodies.body_file import save_body
-from track.bodies.rigid_body import RigidTemplate
+from track.rigid_body import RigidTemplate, save_body
 from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
 from track.user import User
 
@@ -274,9 +273,9 @@ def photos(folder: Path) -> list[Path]:
 def weights(folder: Path) -> list[Path]:
     import torch
 
-    from train.config import SetLabelerConfig
-    from train.labelers.kinds import new_network
+    from train.labelers.networks import new_network
     from train.labelers.storage import CARD, WEIGHTS, save_network
+    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
@@ -287,9 +286,9 @@ def weights(folder: Path) -> list[Path]:
 def onnx(folder: Path) -> list[Path]:
     import torch
 
-    from train.config import SetLabelerConfig
-    from train.labelers.kinds import new_network
-    from train.labelers.onnx_labeler import export_onnx
+    from train.labelers.networks import new_network
+    from train.labelers.storage import export_onnx
+    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))

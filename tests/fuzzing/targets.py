@@ -20,15 +20,15 @@ from gloves.takes.corrections import applied_corrections, load_corrections
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import import_cameras, load_cameras
-from render.scenery.photographs import draw_photo, photo_files
+from handsim.space.rig import CameraRig, load_rig
+from handsim.space.rig_formats import import_cameras, load_cameras
+from render.scenery.backgrounds import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
-from track.bodies.body_file import load_body
+from track.rigid_body import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 
@@ -88,13 +88,13 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.glove_labeler import load_labeler
+    from train.labelers.storage import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 

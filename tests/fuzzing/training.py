@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import row_dtype
 from train.devices.fabric_start import start_fabric
-from train.training_state import TrainingState
+from train.loop import TrainingState
+from train.settings import SetLabelerConfig, TrainSettings
 
 
 @cache
 def state(folder: Path) -> TrainingState:
     """The state of a run before its first step; one for each folder of its curves."""
     network = SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4)
-    config = TrainConfig(network=network, batch=1, samples=4)
+    config = TrainSettings(network=network, batch=1, samples=4)
     return TrainingState(config, start_fabric(config, folder), np.zeros(2, dtype=row_dtype(4)))

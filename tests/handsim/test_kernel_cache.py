@@ -49,7 +49,7 @@ def test_a_folder_that_others_can_write_is_not_trusted(nowhere):
 def test_a_kernel_compiles_where_only_the_temporary_folder_is(tmp_path):
     program = (
         "import os; from handsim import _kernel_cache as k; k._is_writable = lambda folder: False; "
-        "k.ensure_kernel_cache(); import numpy as np; from handsim.kernels.rotations import __name__ as n; "
+        "k.ensure_kernel_cache(); import numpy as np; from handsim.kernels import __name__ as n; "
         "print(os.environ[k.VARIABLE])"
     )
     environment = {**os.environ, "TMPDIR": str(tmp_path)}

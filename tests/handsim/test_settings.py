@@ -82,5 +82,5 @@ def test_settings_come_back_from_their_record():
 
 def test_options_change_settings():
     assert Options.of(Options(num_frames=7), {"kind": "two"}) == Options(num_frames=7, kind="two")
-    with pytest.raises(ArgumentError, match="settings is {.num_frames.: 7}"):
+    with pytest.raises(ArgumentError, match=r"settings is {.num_frames.: 7}"):
         Options.of({"num_frames": 7})

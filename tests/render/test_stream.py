@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from render import PictureStream, RenderConfig, render_take
-from render.sensors.shutter import ShutterConfig
+from render.color_sensor import ShutterConfig
 from train.simulation.takes import simulate_take
 
 BARE = RenderConfig(passes=("depth", "ids"), depth_sensor=None)

@@ -7,8 +7,8 @@ import pytest
 
 from gloves.captures.capture import Capture
 from track.captures import label_capture, track_capture
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
+from train.evaluation import evaluate_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES, RATE = 120, 120.0

@@ -14,7 +14,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import (
     LOST,
     STATUSES,
@@ -25,15 +25,15 @@ from gloves.takes.take import (
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
-from track.bodies.rigid_body import RigidTemplate
 from track.captures import track_capture
 from track.config import TrackerConfig
 from track.recorder import TakeRecorder
+from track.rigid_body import RigidTemplate
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 60
@@ -197,7 +197,7 @@ from track.captures import track_capture
 from track.label_confidence import label_confidence
 from track.settings import warm_up
 from track.streams.frame_source import checked_frames
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 def ready():

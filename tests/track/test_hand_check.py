@@ -15,7 +15,7 @@ from track.hand_check import check_scale
 from track.hand_size import sample_frames
 from track.streams.frame_source import checked_frames
 from track.user import nominal_user
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 90

@@ -11,8 +11,7 @@ from scipy.optimize import minimize_scalar
 from gloves.fit import attach
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import ADULTS, DIGITS, SIZES, sample_shape, shape_from_measures
 from poses.motion import sample_motion
 from track.hand_size import (
     _PRECISION,
@@ -24,7 +23,7 @@ from track.hand_size import (
     usual_breadth,
 )
 from track.streams.frame_source import StreamedFrame, checked_frames
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 RATE = 120.0

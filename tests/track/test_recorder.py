@@ -19,13 +19,13 @@ from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
 from track import recorder as module
-from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
+from track.rigid_body import RigidTemplate
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 24

@@ -10,8 +10,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.take import LOST, Take
-from handsim.errors import HandSimWarning
-from track.calibration.frames import CalibrationError
+from handsim.errors import CalibrationError, HandSimWarning
 from track.captures import track_capture
 from track.kinematics.pose_solver import PoseSolver
 from track.take_calibration import calibrate_take, kept_user

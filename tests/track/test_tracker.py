@@ -9,13 +9,13 @@ import pytest
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from track.frames import TrackedFrame
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

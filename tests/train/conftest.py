@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from train.any_layout.layout_labeler import LayoutLabeler
-from train.any_layout.learned_gloves import fine_tuned_labeler
+from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler
 
 
 @pytest.fixture(scope="module", autouse=True)

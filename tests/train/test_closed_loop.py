@@ -11,9 +11,9 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.cli.main import main
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from render import RenderConfig, draw
-from render.cameras.viewpoints import ViewConfig
+from render.viewpoints import ViewConfig
 from track.captures import track_capture
 from train.data.shards import Dataset
 from train.simulation.takes import simulate_take
@@ -108,10 +108,10 @@ def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
 def test_training_goes_on_to_the_same_weights(run, tmp_path):
     from safetensors.numpy import load_file
 
-    from train.config import SetLabelerConfig, TrainConfig
     from train.loop import train_labeler
+    from train.settings import SetLabelerConfig, TrainSettings
 
-    config = TrainConfig(samples=2560, network=SetLabelerConfig(width=16, gates=4, depth=1))
+    config = TrainSettings(samples=2560, network=SetLabelerConfig(width=16, gates=4, depth=1))
     dataset = Dataset(run / "set")
 
     class Killed(Exception):

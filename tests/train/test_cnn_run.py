@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from train.config import CNNConfig, default_config
 from train.data.batches import Corruption
 from train.data.shards import Dataset
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
-from train.labelers.storage import CARD, WEIGHTS, load_network
+from train.evaluation import evaluate_labeler
+from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
 from train.loop import train_labeler
+from train.settings import CNNConfig, default_config
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
 

@@ -13,17 +13,15 @@ import torch
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
-from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
-from train.glove_labeler import load_labeler
-from train.labelers.storage import WEIGHTS
-from train.loop import CHECKPOINT, train_labeler
+from train.labelers.storage import WEIGHTS, load_labeler
+from train.loop import CHECKPOINT, TrainingError, train_labeler
+from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
-from train.training_state import TrainingError
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
-CONFIG = TrainConfig(samples=640, batch=32, network=SMALL)
+CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)
 OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--network.depth", "1"]
 
 
@@ -44,7 +42,7 @@ def test_a_signal_keeps_the_last_step_and_the_run_ends_the_same(dataset, tmp_pat
         return main(["train", str(dataset.path), "--out", str(out), "--samples", "640", *OPTIONS])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("train.training_state.TrainingState._average", sending(number))
+        patch.setattr("train.loop.TrainingState._average", sending(number))
         assert command(tmp_path / "stopped") == 128 + number
     said = capsys.readouterr().err
     assert f"320 of 640 samples are kept in {tmp_path / 'stopped' / CHECKPOINT}, and the same command" in said
@@ -57,7 +55,7 @@ def test_a_signal_keeps_the_last_step_and_the_run_ends_the_same(dataset, tmp_pat
 
 def sending(number):
     """A step that is hit by a signal in its middle, at 320 samples."""
-    from train.training_state import TrainingState
+    from train.loop import TrainingState
 
     average = TrainingState._average
 
@@ -87,7 +85,7 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("train.training_state.TrainingState.evaluate", cut)
+        patch.setattr("train.loop.TrainingState.evaluate", cut)
         with pytest.raises(Stopped):
             train_labeler(dataset, tmp_path / "cut", CONFIG)
     done = done_in(tmp_path / "cut")
@@ -101,7 +99,7 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
 
 def test_a_loss_that_is_no_number_ends_the_run(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "train.training_state.batch_loss",
+        "train.loop.batch_loss",
         lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True),
     )
     with pytest.raises(TrainingError, match=r"the loss is nan after 32 samples; .* below 0.002"):

@@ -19,23 +19,23 @@ import torch
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.signals import Stopped
-from train.config import SetLabelerConfig, TrainConfig, batch_recipe, default_config
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
 from train.devices.world import World
 from train.labelers.cnn_network import DeepLabelCNN
-from train.labelers.kinds import batch_loss, new_network, prepare_network
+from train.labelers.networks import batch_loss, new_network, prepare_network
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE
+from train.settings import SetLabelerConfig, TrainSettings, batch_recipe, default_config
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
 
 pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
-ONE = TrainConfig(samples=640, batch=32, network=SMALL)
+ONE = TrainSettings(samples=640, batch=32, network=SMALL)
 TWO = dataclasses.replace(ONE, devices=2)
 OPTIONS = ["--samples", "640", "--batch", "32", "--network.width", "8", "--network.gates", "2"]
 OPTIONS += ["--network.depth", "1"]
@@ -181,7 +181,7 @@ def test_other_devices_than_there_are_processes_are_told(tmp_path, monkeypatch):
     for name, value in World(0, 0, 2, 2).variables().items():
         monkeypatch.setenv(name, value)
     with pytest.raises(ArgumentError, match="devices is 3, but torchrun started 2 processes on this machine"):
-        start_fabric(TrainConfig(devices=3), tmp_path)
+        start_fabric(TrainSettings(devices=3), tmp_path)
 
 
 def test_more_devices_than_clouds_are_told(dataset, tmp_path):
@@ -207,7 +207,7 @@ def test_parts_of_a_batch_give_the_papers_network_the_loss_of_the_whole(dataset,
     """Each cloud keeps its own view; batch normalization is off, which sees the part alone."""
     config = default_config("cnn")
     config = dataclasses.replace(config, batch=7, cnn=dataclasses.replace(config.cnn, views=views))
-    fabric = start_fabric(TrainConfig(precision="32"), tmp_path)
+    fabric = start_fabric(TrainSettings(precision="32"), tmp_path)
     network = new_network(config.cnn)
     assert isinstance(network, DeepLabelCNN)
     prepare_network(network, dataset.mapped_rows())

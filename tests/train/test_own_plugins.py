@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, HandSimError
 from poses.shapes import load_sampler
 from train.data.batches import own_cloud
 from train.data.shards import Dataset
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 
 SOURCE = '''
 import numpy as np

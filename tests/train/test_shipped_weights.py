@@ -12,9 +12,8 @@ from gloves.captures.formats import read_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, WeightsError
 from train.data.batches import Corruption
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
-from train.labelers.storage import shipped_labelers
+from train.evaluation import evaluate_labeler
+from train.labelers.storage import load_labeler, shipped_labelers
 
 
 def test_cards_say_where_the_weights_come_from():

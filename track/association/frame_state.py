@@ -6,13 +6,16 @@ rigid body. Only `Numbering` knows where a hand begins.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
+from handsim.kernels import kernel
+from handsim.space.transforms import rigid_fit
+from train.labelers.matching import assign
 
 
 class Numbering:
@@ -143,3 +146,213 @@ def _with_markers(
         elif first <= labels[point] < last:
             changed[point] = -1
     return changed
+
+
+_LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
+# Distance of a point from its prediction [m], before hands are aligned and after each alignment.
+_DISTANCES: Final = (0.04, 0.025, 0.015)
+_FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
+_NEIGHBORS: Final = 0.06  # [m] between markers whose distance hardly changes from frame to frame
+_FEWEST_NEIGHBORS: Final = 3  # pairs of these that tell something
+_BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
+
+
+class PointHistory:
+    """What is known of the points of a stream from the frames before: label, evidence and age.
+
+    Args:
+        numbering: What labels mean.
+        silence: Time without a frame that labels do not outlive [s]; IDs may have changed by then.
+    """
+
+    def __init__(self, numbering: Numbering, silence: float) -> None:
+        self._numbering = numbering
+        self._silence = silence
+        self._linker = PointLinker(numbering.owners)
+        self._labels: dict[int, int] = {}  # of each number
+        self._evidence: dict[int, float] = {}  # for these labels (log-odds)
+        self._first_seen: dict[int, float] = {}  # [s] of each number
+        self._last_time = -np.inf  # [s] of the last frame
+
+    def carry(
+        self,
+        points: Float[np.ndarray, "P 3"],
+        ids: Int[np.ndarray, "P"],
+        time: float,
+        expected: Float[np.ndarray, "K 3"],
+    ) -> FrameState:
+        """The next frame with the labels and the evidence that its points carry over.
+
+        Args:
+            ids: The stream's IDs, -1 for none.
+            expected: Predicted position of the marker of each label [m]; NaN where there is none.
+        """
+        if time - self._last_time > self._silence:
+            self._labels = {}
+        self._last_time = time
+        numbers = self._linker.number(points, ids, self._labels, expected)
+        known = numbers.tolist()
+        self._first_seen = {number: self._first_seen.get(number, time) for number in known}
+        labels = np.array([self._labels.get(number, -1) for number in known], dtype=np.int64)
+        evidence = np.array([self._evidence[n] if n in self._labels else 0.0 for n in known])
+        confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
+        first_seen = np.array(list(self._first_seen.values()))
+        return FrameState(points, numbers, labels, evidence, confidence, first_seen, time, self._numbering)
+
+    def keep(self, frame: FrameState) -> None:
+        """Keep what the next frame can use of this one."""
+        rows = np.flatnonzero(frame.labels >= 0)
+        numbers = frame.ids[rows].tolist()
+        self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
+        self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
+
+
+class PointLinker:
+    """Numbers the points of a stream.
+
+    Args:
+        owners: Hand of each label.
+    """
+
+    def __init__(self, owners: Int[np.ndarray, "K"]) -> None:
+        self._owners = owners
+        self._numbers: dict[int, int] = {}  # of the stream's IDs in the last frame
+        self._last = np.zeros(0, dtype=np.int64)  # numbers (Q,) of the last frame's points
+        self._points = np.zeros((0, 3))  # those points [m]
+        self._next = 0
+
+    def number(
+        self,
+        points: Float[np.ndarray, "P 3"],
+        ids: Int[np.ndarray, "P"],
+        labels: Mapping[int, int],
+        expected: Float[np.ndarray, "K 3"],
+    ) -> Int[np.ndarray, "P"]:
+        """Number the points of the next frame, as the stream does where most of its IDs last.
+
+        Where numbers had labels in the last frame, the IDs of these count: ghosts have short lives. A point
+        without an ID in a stream that has them gets a new one.
+        """
+        again = [self._numbers.get(number, -1) for number in ids.tolist()]
+        known = np.array(again, dtype=np.int64)
+        before = labels.keys() if labels else set(self._last.tolist())
+        if len(before & set(again)) < _LASTING_SHARE * min(len(before), len(ids)):
+            known = self._link(points, labels, expected)
+        new = np.flatnonzero(known < 0)
+        known[new] = self._next + np.arange(len(new))
+        self._next += len(new)
+        self._numbers = {one: n for one, n in zip(ids.tolist(), known.tolist(), strict=True) if one >= 0}
+        self._last, self._points = known, points
+        return known
+
+    def _link(
+        self, points: NDArray[np.float64], labels: Mapping[int, int], expected: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Numbers of the last frame's points for the points of this one, -1 where there is none."""
+        predicted, hands = self._points.copy(), np.full(len(self._last), -1)
+        for row, number in enumerate(self._last.tolist()):
+            label = labels.get(number, -1)
+            if label >= 0 and np.isfinite(expected[label, 0]):
+                hands[row], predicted[row] = self._owners[label], expected[label]
+        beside = self._beside(hands)
+        moved, found = predicted.copy(), np.full(len(points), -1)
+        for distance in _DISTANCES:
+            rows, columns = _assign(points, moved, distance)
+            for hand in np.unique(hands[hands >= 0]):
+                own = hands[columns] == hand
+                if own.sum() >= _FEWEST_ALIGNED:
+                    rotation, shift = rigid_fit(predicted[columns[own]], points[rows[own]])
+                    moved[hands == hand] = predicted[hands == hand] @ rotation.T + shift
+                    rotation, shift = rigid_fit(self._points[columns[own]], points[rows[own]])
+                    moved[beside == hand] = self._points[beside == hand] @ rotation.T + shift
+        found[rows] = self._last[columns]
+        return found
+
+    def _beside(self, hands: NDArray[np.int64]) -> Int[np.ndarray, "Q"]:
+        """The hand that each point of the last frame without one is beside, and moves with; -1 for none."""
+        beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
+        if len(loose) and len(held):
+            distances = np.linalg.norm(self._points[loose, None] - self._points[held], axis=-1)
+            near = distances.min(axis=1) < _BESIDE_DISTANCE
+            beside[loose[near]] = hands[held[distances.argmin(axis=1)[near]]]
+        return beside
+
+
+def _assign(
+    points: NDArray[np.float64], predicted: NDArray[np.float64], distance: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points and predicted points, one to one, within a distance [m]."""
+    squares = ((points[:, None] - predicted) ** 2).sum(axis=-1)
+    _, labels = assign(squares, np.full(len(points), distance**2))
+    near = np.flatnonzero(labels >= 0)
+    return near, labels[near]
+
+
+def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:
+    """Median change of the distances of neighboring points from a frame to the next [m].
+
+    About 2 mm where one frame follows from the other, also of fast hands, and 8 mm and more of hands in poses
+    that have nothing to do with each other; infinite where points cannot be linked.
+    """
+    rows, columns = _assign(points, before, _DISTANCES[0])
+    first, second = np.triu_indices(len(rows), 1)
+    was = np.linalg.norm(before[columns[first]] - before[columns[second]], axis=-1)
+    now = np.linalg.norm(points[rows[first]] - points[rows[second]], axis=-1)
+    near = was < _NEIGHBORS
+    return float(np.median(np.abs(now - was)[near])) if near.sum() >= _FEWEST_NEIGHBORS else np.inf
+
+
+def match_log_odds(
+    points: Float[np.ndarray, "P 3"],
+    positions: Float[np.ndarray, "K 3"],
+    covariances: Float[np.ndarray, "K 3 3"],
+    stray_density: float,
+) -> Float[np.ndarray, "P K"]:
+    """Log-odds of each point being a marker rather than a stray.
+
+    Args:
+        stray_density: Density of points that are no marker [1/m^3].
+    """
+    innovation = points[:, None] - positions
+    precision = np.linalg.inv(covariances)
+    square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
+    log_odds: np.ndarray = (
+        0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _stray_log_density(stray_density)
+    )
+    return log_odds
+
+
+def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:
+    """Log-odds of a point exactly at the predicted position of a marker.
+
+    Args:
+        variances: Variance of each marker in each direction [m^2].
+        stray_density: Density of points that are no marker [1/m^3].
+    """
+    log_odds: np.ndarray = -1.5 * np.log(variances) - _stray_log_density(stray_density)
+    return log_odds
+
+
+def match_points(
+    log_odds: Float[np.ndarray, "P K"],
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """The most likely assignment of points to markers, one to one; either may stay alone.
+
+    Returns the marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the
+    alternatives of both.
+    """
+    _, labels = assign(-log_odds, np.zeros(len(log_odds)))
+    if 0 in log_odds.shape:
+        return labels, np.ones(len(log_odds))
+    weights = np.exp(np.minimum(log_odds, 50.0))
+    alternatives = 1.0 + weights.sum(axis=1, keepdims=True) + weights.sum(axis=0) - weights
+    share = weights / alternatives
+    confidence = 1.0 - (weights / (1.0 + weights.sum(axis=1, keepdims=True))).sum(axis=1)
+    matched = np.flatnonzero(labels >= 0)
+    confidence[matched] = share[matched, labels[matched]]
+    return labels, confidence
+
+
+def _stray_log_density(stray_density: float) -> float:
+    """Log density of strays, less the constant of a normal density."""
+    return float(np.log(stray_density * (2.0 * np.pi) ** 1.5))

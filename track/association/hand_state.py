@@ -16,18 +16,21 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
-from handsim.kernels.integration import move, velocity_of
-from handsim.kernels.kernel import kernel
-from track.association.assignment import peak_log_odds
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
+from handsim.kernels import kernel, move, velocity_of
 from track.association.digit_hypotheses import DigitModel, digit_ranges
+from track.association.frame_state import peak_log_odds
 from track.config import HandOrigin, TrackerConfig
 from track.frames import Spreads
-from track.kinematics.frame_fits import FEWEST_MARKERS
-from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
-from track.kinematics.marker_prediction import MarkerPrediction
-from track.kinematics.pose_solver import PoseSolver
-from track.kinematics.pose_spread import SpreadModel
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.kinematics.pose_spread import (
+    JointPrior,
+    MarkerPrediction,
+    SpreadModel,
+    predict_joints,
+    resting_covariance,
+    resting_prior,
+)
 
 # Process model.
 _LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand

@@ -7,9 +7,9 @@ were. Whether a hand is left or right follows from the fit: a mirrored hand does
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
+from handsim.kernels import kernel, squared_distance
 from poses.shapes import LIBRARIES, gestures_of
-from track.association.assignment import match_log_odds, match_points, peak_log_odds
-from track.association.frame_state import targets_of
+from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
-from track.association.point_groups import distances_to_nearest, linked_groups, longest_links
 from track.config import TrackerConfig
-from track.kinematics.joint_prior import resting_prior
 from track.kinematics.pose_solver import PoseFit, PoseSolver
-from train.labelers.protocol import Labeler
+from track.kinematics.pose_spread import resting_prior
+from train.labelers.protocol import MAX_POINTS, Labeler
 
 MOST_POINTS: Final = 100
 """Largest number of points of a group that may be a hand."""
@@ -444,3 +443,132 @@ def _link_distance(hand: GloveFit) -> float:
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
     return float(np.quantile(longest_links(markers), _LINKED))
+
+
+_NEAR: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
+_USUAL: Final = 0.5  # share of a capture's frames with a hand, from which on the others hold one too
+
+
+class FrameLabels(NamedTuple):
+    """Labels of a frame's points."""
+
+    labels: Int[np.ndarray, "N"]
+    """Marker of each point, counted through the hands in their order; -1 for none."""
+    confidence: Float[np.ndarray, "N"]
+    """Confidence in each label, 0 to 1."""
+
+
+def label_alone(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    hands: Sequence[GloveFit],
+    labeler: Labeler,
+    told: Callable[[int], None] = lambda count: None,
+) -> list[FrameLabels]:
+    """Label every frame by itself.
+
+    A hand is there where a pose fits. In a capture that shows hands in most frames, a frame with enough
+    points holds one also where none fits: the labeler can be right where too many labels are wrong for a fit.
+    """
+    finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
+    found = []
+    for points in frames:
+        found.append(finder.initialize(points, range(len(hands))))
+        told(len(found))
+    clouds = _clouds(frames, found, hands[0].layout.num_markers)
+    labelings = labeler.label_frames([frames[number][cloud] for number, _, cloud in clouds])
+    labels = [np.full(len(points), -1) for points in frames]
+    confidence = [np.ones(len(points)) for points in frames]
+    for (number, hand, cloud), one in zip(clouds, labelings, strict=True):
+        labels[number][cloud] = np.where(one.labels >= 0, hand * hands[0].layout.num_markers + one.labels, -1)
+        confidence[number][cloud] = one.confidence
+    return [FrameLabels(*row) for row in zip(labels, confidence, strict=True)]
+
+
+def _clouds(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    found: Sequence[Sequence[InitializedHand]],
+    num_markers: int,
+) -> list[tuple[int, int, Int[np.ndarray, "C"]]]:
+    """The points that the labeler is shown as one hand: number of the frame, the hand, and which points."""
+    most = num_markers + SPARE_POINTS
+    full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_POINTS]
+    sides = [hand.index for hands in found for hand in hands]
+    usual = np.bincount(sides).argmax() if sides and np.mean(full) >= _USUAL else None
+    clouds = []
+    for number, (points, hands) in enumerate(zip(frames, found, strict=True)):
+        small = FEWEST_POINTS <= len(points) <= most
+        if small and len(hands) < 2 and (hands or usual is not None):
+            clouds.append((number, hands[0].index if hands else int(usual), np.arange(len(points))))  # type: ignore[arg-type]
+            continue
+        for hand in hands:
+            near = distances_to_nearest(points, points[hand.labels >= 0]) < _NEAR
+            for other in hands:
+                near &= (other.labels < 0) | (other is hand)
+            clouds.append((number, hand.index, np.flatnonzero(near)[:MAX_POINTS]))
+    return clouds
+
+
+def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
+    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first.
+
+    Args:
+        distance: Longest step [m].
+    """
+    number = _single_linkage(points, distance)
+    groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
+    return sorted(groups, key=len, reverse=True)
+
+
+def distances_to_nearest(
+    points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "K 3"]
+) -> Float[np.ndarray, "N"]:
+    """Distance of each point from the nearest of some others [m], of which there is one at least."""
+    distances: NDArray[np.float64] = np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
+    return distances
+
+
+@kernel
+def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np.ndarray, "N"]:
+    """Number of the group of each point."""
+    number = np.full(len(points), -1)
+    stack = np.zeros(len(points), dtype=np.int64)
+    groups = 0
+    for first in range(len(points)):
+        if number[first] >= 0:
+            continue
+        number[first], stack[0], height = groups, first, 1
+        while height > 0:
+            height -= 1
+            here = stack[height]
+            for other in range(len(points)):
+                if number[other] >= 0:
+                    continue
+                if squared_distance(points[here], points[other]) <= distance**2:
+                    number[other] = groups
+                    stack[height] = other
+                    height += 1
+        groups += 1
+    return number
+
+
+@kernel
+def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
+    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
+    longest = np.zeros(len(points))
+    for frame in range(len(points)):
+        nearest = np.full(points.shape[1], np.inf)
+        added = 0
+        for _ in range(1, points.shape[1]):
+            nearest[added] = -1.0  # is in the tree
+            least, following = np.inf, added
+            for other in range(points.shape[1]):
+                if nearest[other] < 0.0:
+                    continue
+                square = squared_distance(points[frame, other], points[frame, added])
+                nearest[other] = min(nearest[other], square)
+                if nearest[other] < least:
+                    least, following = nearest[other], other
+            longest[frame] = max(longest[frame], least)
+            added = following
+        longest[frame] = np.sqrt(longest[frame])
+    return longest

@@ -12,14 +12,13 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim.hand.topology import DIGITS
-from track.association.assignment import assign_jointly, match_log_odds, match_points
-from track.association.candidates import MAX_CANDIDATES, DigitCandidates, MarkerTable, find_candidates
-from track.association.digit_hypotheses import DigitHypotheses, empty_hypotheses, evaluate_digit
-from track.association.frame_state import FrameState, Numbering
+from handsim.hand.shape import DIGITS
+from handsim.kernels import kernel, point_distance
+from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses, empty_hypotheses, evaluate_digit
+from track.association.frame_state import FrameState, Numbering, match_log_odds, match_points
 from track.association.hand_state import HandState, HandTrack
 
 _NOWHERE: Final = 1e6  # [m] of the markers of a hand without a pose, which no point is near
@@ -133,3 +132,285 @@ def _evaluate_hand(
             log_odds,
             *(values[digit] for values in hypotheses),
         )
+
+
+MAX_CANDIDATES: Final = 7
+"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
+SETTLED_EVIDENCE: Final = 4.0
+"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
+_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
+_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
+
+
+class MarkerTable(NamedTuple):
+    """The K markers of all hands by their labels, and the label of each of N points."""
+
+    positions: Float[np.ndarray, "K 3"]
+    """Predicted positions [m]."""
+    digits: Int[np.ndarray, "K"]
+    """Digit of each marker, counted through the hands; -1 on a palm."""
+    assigned: Int[np.ndarray, "N"]
+    """Label of each point, -1 for none."""
+
+
+class DigitCandidates(NamedTuple):
+    """Candidate points of D digits, those with their labels among them."""
+
+    candidates: Int[np.ndarray, "D 7"]
+    """Points of each digit: first those labeled as its markers, then others, the nearest first."""
+    counts: Int[np.ndarray, "D"]
+    """How many there are; zero where there is nothing to decide."""
+    labeled: Int[np.ndarray, "D"]
+    """How many of them are labeled as the digit's markers."""
+
+
+def find_candidates(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    num_digits: int,
+) -> DigitCandidates:
+    """The candidates of each digit."""
+    found = DigitCandidates(
+        np.full((num_digits, MAX_CANDIDATES), -1),
+        np.zeros(num_digits, dtype=np.int64),
+        np.zeros(num_digits, dtype=np.int64),
+    )
+    _find_candidates(points, evidence, table, found)
+    return found
+
+
+@kernel
+def _find_candidates(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    found: DigitCandidates,
+) -> None:
+    """Fill `found`; the other arguments are those of `find_candidates`."""
+    positions, digits, assigned = table
+    missing = np.ones(len(positions), dtype=np.bool_)
+    for owner in assigned:
+        if owner >= 0:
+            missing[owner] = False
+    contested = _find_contested(points, evidence, table, missing)
+    distances = np.full((len(found.counts), len(points)), np.inf)
+    for digit in range(len(found.counts)):
+        incomplete, undecided = False, False
+        rivals = np.zeros(len(points), dtype=np.bool_)
+        for marker in range(len(positions)):
+            if digits[marker] != digit:
+                continue
+            incomplete = incomplete or missing[marker]
+            for point in range(len(points)):
+                distance = point_distance(points[point], positions[marker])
+                distances[digit, point] = min(distances[digit, point], distance)
+                if assigned[point] < 0:
+                    rivals[point] |= distance < (_MISSING_RADIUS if missing[marker] else _SEEN_RADIUS)
+                elif contested[point] and missing[marker]:
+                    rivals[point] |= distance < _MISSING_RADIUS
+        count = 0
+        for point in range(len(points)):
+            if assigned[point] >= 0 and digits[assigned[point]] == digit:
+                rivals[point] = False
+                undecided = (
+                    undecided or contested[point] or (incomplete and evidence[point] < SETTLED_EVIDENCE)
+                )
+                found.candidates[digit, count] = point
+                count += 1
+        if not (undecided or rivals.any()):
+            continue
+        found.labeled[digit] = count
+        found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
+
+
+@kernel
+def _find_contested(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    missing: Bool[np.ndarray, "K"],
+) -> Bool[np.ndarray, "N"]:
+    """Points with an unsettled label and a missing marker of another digit nearby."""
+    contested = np.zeros(len(points), dtype=np.bool_)
+    for point in range(len(points)):
+        owner = table.assigned[point]
+        if owner < 0 or table.digits[owner] < 0 or evidence[point] >= SETTLED_EVIDENCE:
+            continue
+        for marker in range(len(missing)):
+            other = missing[marker] and table.digits[marker] not in (-1, table.digits[owner])
+            if other and point_distance(points[point], table.positions[marker]) < _MISSING_RADIUS:
+                contested[point] = True
+    return contested
+
+
+@kernel
+def _add_nearest(
+    distances: Float[np.ndarray, "N"],
+    rivals: Bool[np.ndarray, "N"],
+    candidates: Int[np.ndarray, "7"],
+    count: int,
+) -> int:
+    """Append the nearest rivals to a digit's candidates while there is room; return their number."""
+    while count < len(candidates):
+        nearest = -1
+        for point in range(len(rivals)):
+            if rivals[point] and (nearest < 0 or distances[point] < distances[nearest]):
+                nearest = point
+        if nearest < 0:
+            break
+        rivals[nearest] = False
+        candidates[count] = nearest
+        count += 1
+    return count
+
+
+@kernel
+def assign_jointly(
+    candidates: DigitCandidates,
+    hypotheses: DigitHypotheses,
+    markers: Int[np.ndarray, "D K"],
+    assigned: Int[np.ndarray, "N"],
+    margins: Float[np.ndarray, "N"],
+) -> None:
+    """Assign points to digits: the best combination of hypotheses of all digits that share points.
+
+    Args:
+        hypotheses: The best assignment of every set of them, digit by digit.
+        markers: Markers of each digit, counted through the hands; -1 where there are fewer.
+        assigned: Marker of each point, -1 for none; overwritten.
+        margins: Log-odds by which the next best combination is worse in which a point has another label;
+            written for candidate points.
+    """
+    pending = candidates.counts > 0
+    group = np.empty(len(pending), dtype=np.int64)
+    for first in range(len(pending)):
+        if not pending[first]:
+            continue
+        group[0], size, index = first, 1, 0
+        pending[first] = False
+        while index < size:
+            for other in range(len(pending)):
+                if pending[other] and _share_points(candidates, group[index], other):
+                    pending[other] = False
+                    group[size] = other
+                    size += 1
+            index += 1
+        _assign_group(group[:size], candidates, hypotheses, markers, assigned, margins)
+
+
+@kernel
+def _share_points(candidates: DigitCandidates, one: int, other: int) -> bool:
+    """Whether two digits have a candidate in common."""
+    for index in range(candidates.counts[one]):
+        for second in range(candidates.counts[other]):
+            if candidates.candidates[one, index] == candidates.candidates[other, second]:
+                return True
+    return False
+
+
+@kernel
+def _assign_group(
+    group: Int[np.ndarray, "G"],
+    candidates: DigitCandidates,
+    hypotheses: DigitHypotheses,
+    markers: Int[np.ndarray, "D K"],
+    assigned: Int[np.ndarray, "N"],
+    margins: Float[np.ndarray, "N"],
+) -> None:
+    """`assign_jointly` for a group of digits that share points, directly or through others."""
+    most = hypotheses.scores.shape[1]
+    rows, counts = np.zeros((len(group), most), dtype=np.int64), np.zeros(len(group), dtype=np.int64)
+    scores, sets = np.full((len(group), most), -IMPOSSIBLE), np.zeros((len(group), most), dtype=np.int64)
+    bits = np.full(len(assigned), -1)
+    num_bits = 0  # 61 at most for ten digits with seven candidates, as each shares one with another
+    for index, digit in enumerate(group):
+        for point in candidates.candidates[digit, : candidates.counts[digit]]:
+            assigned[point], margins[point] = -1, np.inf
+            if bits[point] < 0:
+                bits[point] = num_bits
+                num_bits += 1
+        counts[index] = _sort_rows(hypotheses.scores[digit], rows[index])
+        for rank in range(counts[index]):
+            row = rows[index, rank]
+            scores[index, rank] = hypotheses.scores[digit, row]
+            for number in range(candidates.counts[digit]):
+                if row >> number & 1:
+                    sets[index, rank] |= 1 << bits[candidates.candidates[digit, number]]
+    banned, other = np.full(len(group), -1), np.zeros(len(group), dtype=np.int64)
+    best = np.zeros(len(group), dtype=np.int64)
+    total = best_combination(scores, sets, counts, banned, best)
+    for index, digit in enumerate(group):
+        row = rows[index, best[index]]
+        for number in range(markers.shape[1]):
+            if hypotheses.assignments[digit, row, number] >= 0:
+                assigned[candidates.candidates[digit, hypotheses.assignments[digit, row, number]]] = markers[
+                    digit, number
+                ]
+        banned[index] = best[index]
+        alternative = best_combination(scores, sets, counts, banned, other)
+        banned[index] = -1
+        alternative = max(alternative, total - scores[index, best[index]] + hypotheses.runners_up[digit, row])
+        for point in candidates.candidates[digit, : candidates.counts[digit]]:
+            margins[point] = min(margins[point], total - alternative)
+
+
+@kernel
+def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> int:
+    """Write the rows that are possible to `rows`, the best first, and return how many there are."""
+    count = 0
+    for row in range(len(scores)):
+        if scores[row] <= -IMPOSSIBLE:
+            continue
+        index = count
+        while index > 0 and scores[rows[index - 1]] < scores[row]:
+            rows[index] = rows[index - 1]
+            index -= 1
+        rows[index] = row
+        count += 1
+    return count
+
+
+@kernel
+def best_combination(
+    scores: Float[np.ndarray, "D S"],
+    sets: Int[np.ndarray, "D S"],
+    counts: Int[np.ndarray, "D"],
+    banned: Int[np.ndarray, "D"],
+    best: Int[np.ndarray, "D"],
+) -> float:
+    """The best choice of one row per digit such that no point is used twice, by branch and bound.
+
+    Args:
+        scores: Scores of each digit's rows (log-odds), the best first.
+        sets: Points that each row uses, one bit per point.
+        counts: Rows of each digit; the last must use no point.
+        banned: A row of each digit that must not be chosen; -1 for none.
+        best: The chosen rows, overwritten.
+
+    Returns:
+        The sum of their scores; `-IMPOSSIBLE` if there is no choice.
+    """
+    digits = len(scores)
+    bound = np.zeros(digits + 1)
+    for digit in range(digits - 1, -1, -1):
+        bound[digit] = bound[digit + 1] + scores[digit, 0]
+    row, total, used = np.full(digits, -1), np.zeros(digits + 1), np.zeros(digits + 1, dtype=np.int64)
+    most, digit = -IMPOSSIBLE, 0
+    while digit >= 0:
+        row[digit] += 1
+        chosen = row[digit]
+        if chosen >= counts[digit] or total[digit] + scores[digit, chosen] + bound[digit + 1] <= most:
+            row[digit] = -1
+            digit -= 1
+            continue
+        if chosen == banned[digit] or used[digit] & sets[digit, chosen]:
+            continue
+        total[digit + 1] = total[digit] + scores[digit, chosen]
+        used[digit + 1] = used[digit] | sets[digit, chosen]
+        if digit + 1 < digits:
+            digit += 1
+        elif total[digits] > most:
+            most = total[digits]
+            best[:] = row
+    return most

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Final
+from functools import cache
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from scipy import sparse
 
-from handsim.hand.model import HandModel
-from handsim.hand.shape import ADULTS, HandShape
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.topology import DIGITS, NUM_BONES
-from handsim.kernels.kernel import kernel
+from gloves.fit import Attachment
+from gloves.layout import MarkerLayout
+from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
+from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
+from handsim.kernels import kernel
 
 LENGTH, BREADTH = 0, 1  # log factors
 BONE_LENGTHS: Final = slice(2, 17)  # log factors, three per digit
@@ -243,3 +246,255 @@ def skinning_terms(
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
     by_bone += motion[:, None, ..., 3]
     return rotations, by_bone
+
+
+_MOST_STEPS: Final = 40
+_OUTSIDE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
+_CLOSE: Final = 1e-8  # [m] from the target, at which a projection ends
+
+
+class SkinTopology(NamedTuple):
+    """Topology and weights, the same for the skins of all hands."""
+
+    subdivide: sparse.csr_array
+    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these."""
+    faces: Int[np.ndarray, "F 3"]
+    """Triangles, counter-clockwise from outside."""
+    adjacent: Int[np.ndarray, "F 3"]
+    """The triangle beyond the edge opposite to each corner."""
+    vertex_faces: Int[np.ndarray, "V A"]
+    """Triangles at each vertex, the last one repeated."""
+    weights: Float[np.ndarray, "V 16"]
+    """Skinning weights of all bones."""
+
+
+class SkinCoordinates(NamedTuple):
+    """Coordinates of P points on or above the skin."""
+
+    faces: Int[np.ndarray, "P"]
+    """Triangles of `skin_mesh`."""
+    bary: Float[np.ndarray, "P 3"]
+    """Barycentric coordinates of the foot points."""
+    heights: Float[np.ndarray, "P"]
+    """Above the skin, along the normal [m]."""
+
+
+class Corners(NamedTuple):
+    """Corners of some triangles on one hand's skin."""
+
+    points: Float[np.ndarray, "P 3 3"]
+    """In the wrist's frame [m]."""
+    normals: Float[np.ndarray, "P 3 3"]
+    """Unit vertex normals."""
+
+
+class Skin(NamedTuple):
+    """One hand's subdivided skin in the wrist's frame."""
+
+    points: Float[np.ndarray, "V 3"]
+    """[m]"""
+    normals: Float[np.ndarray, "V 3"]
+
+    def corners(self, faces: Int[np.ndarray, "P"]) -> Corners:
+        """Corners of some triangles of `skin_mesh`."""
+        vertices = skin_mesh().faces[faces]
+        return Corners(self.points[vertices], self.normals[vertices])
+
+
+@cache
+def skin_mesh() -> SkinTopology:
+    """Triangles and weights of the skin, subdivided once (cached)."""
+    coarse = build_surface(named_shape("M"))
+    half = len(coarse.faces) // 2
+    step, quads = catmull_clark(
+        np.column_stack([coarse.faces[:half], coarse.faces[half:, 2]]), len(coarse.vertices)
+    )
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    weights = np.zeros((len(coarse.vertices), NUM_BONES))
+    np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
+    return SkinTopology(
+        step, faces, _adjacent_faces(faces), _vertex_faces(faces, step.shape[0]), step @ weights
+    )
+
+
+def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Neighbors (F, 3) of each triangle of a closed mesh, opposite to its corners."""
+    ends = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).reshape(-1, 2)
+    count = int(faces.max()) + 1
+    there, back = ends[:, 0] * count + ends[:, 1], ends[:, 1] * count + ends[:, 0]
+    order = np.argsort(there)
+    neighbors: NDArray[np.int64] = order[np.searchsorted(there[order], back)] // 3
+    return neighbors.reshape(faces.shape)
+
+
+def _vertex_faces(faces: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Triangles (V, A) at each of `count` vertices, the last one repeated."""
+    vertex, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(vertex, kind="stable")
+    number = np.bincount(vertex, minlength=count)
+    first = np.cumsum(number) - number
+    slots = np.minimum(np.arange(number.max()), number[:, None] - 1)
+    vertex_faces: NDArray[np.int64] = face[order][first[:, None] + slots]
+    return vertex_faces
+
+
+class SkinPatch:
+    """The part of the skin that determines some triangles and their normals, for any shape.
+
+    Args:
+        faces: Triangles of `skin_mesh`.
+    """
+
+    def __init__(self, faces: Int[np.ndarray, "P"]) -> None:
+        mesh = skin_mesh()
+        needed = np.unique(mesh.vertex_faces[mesh.faces[faces]])
+        vertices, local = np.unique(mesh.faces[needed], return_inverse=True)
+        self._rows = mesh.subdivide[vertices]
+        self._faces = local.reshape(-1, 3)
+        self._corners = np.searchsorted(vertices, mesh.faces[faces])
+
+    def corners(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
+        """Corners of the triangles.
+
+        Args:
+            vertices: Vertices of a hand's `HandSurface` [m].
+        """
+        points = self._rows @ vertices
+        return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
+
+
+def build_skin(shape: HandShape) -> Skin:
+    """The subdivided skin of a right hand of this shape."""
+    mesh = skin_mesh()
+    points = mesh.subdivide @ build_surface(shape).vertices
+    return Skin(points, vertex_normals(points, mesh.faces))
+
+
+def skin_points(
+    coordinates: SkinCoordinates, corners: Corners
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+    """Points [m] at these coordinates in the wrist's frame, and the unit normals there."""
+    normals = np.einsum("pc,pci->pi", coordinates.bary, corners.normals)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    foot = np.einsum("pc,pci->pi", coordinates.bary, corners.points)
+    return foot + coordinates.heights[:, None] * normals, normals
+
+
+def skin_weights(coordinates: SkinCoordinates) -> Float[np.ndarray, "P 16"]:
+    """Shares of all bones at these coordinates."""
+    mesh = skin_mesh()
+    weights: NDArray[np.float64] = np.einsum(
+        "pc,pcb->pb", coordinates.bary, mesh.weights[mesh.faces[coordinates.faces]]
+    )
+    return weights
+
+
+def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: HandShape) -> Attachment:
+    """A glove with markers at these coordinates of a right hand, each on the four bones of largest weight."""
+    points, normals = skin_points(coordinates, build_skin(shape).corners(coordinates.faces))
+    weights = skin_weights(coordinates)
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    shares = np.clip(np.take_along_axis(weights, bones, axis=1), 0.0, None)
+    return Attachment(layout, points, normals, bones, shares / shares.sum(axis=1, keepdims=True))
+
+
+def displace_markers(
+    worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
+) -> Attachment:
+    """A glove on a right hand with every marker displaced along the skin, as on a real glove.
+
+    Args:
+        worn: The glove as designed.
+        distance: Length of each marker's displacement, in a random direction [m].
+        lift: Standard deviation of its height above the skin [m].
+    """
+    steps = rng.normal(size=worn.points.shape)
+    steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
+    steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)
+    coordinates = project_onto_skin(
+        nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
+    )
+    heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
+    return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)
+
+
+def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Float[np.ndarray, "P 16 3"]:
+    """Derivative of the skinning weights by the point's position in the wrist's frame [1/m]."""
+    mesh = skin_mesh()
+    shares = mesh.weights[mesh.faces[coordinates.faces]]
+    jacobian = np.linalg.inv(_point_jacobian(coordinates, corners))[:, :2]
+    change: NDArray[np.float64] = np.einsum("pcb,pci->pbi", shares[:, 1:] - shares[:, :1], jacobian)
+    return change
+
+
+def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[np.float64]:
+    """Derivatives (P, 3, 3) of each point by second and third barycentric coordinate and height [m]."""
+    blended = np.einsum("pc,pci->pi", coordinates.bary, corners.normals)
+    length = np.linalg.norm(blended, axis=1)[:, None]
+    normal = blended / length
+    columns = []
+    for corner in (1, 2):
+        change = corners.normals[:, corner] - corners.normals[:, 0]
+        change = (change - (change * normal).sum(axis=1, keepdims=True) * normal) / length
+        columns.append(
+            corners.points[:, corner] - corners.points[:, 0] + coordinates.heights[:, None] * change
+        )
+    return np.stack([*columns, normal], axis=-1)
+
+
+def project_onto_skin(
+    coordinates: SkinCoordinates, targets: Float[np.ndarray, "P 3"], skin: Skin
+) -> SkinCoordinates:
+    """Coordinates of points, by Newton steps that walk from triangle to adjacent triangle.
+
+    The height of a point is its signed distance along the normal. Where the skin folds and the walk does not
+    converge, the foot point stays on the last edge. Targets are in the wrist's frame [m].
+    """
+    mesh = skin_mesh()
+    faces, bary, heights = (values.copy() for values in coordinates)
+    active = np.arange(len(faces))
+    for _ in range(_MOST_STEPS):
+        here = SkinCoordinates(faces[active], bary[active], heights[active])
+        corners = skin.corners(here.faces)
+        residual = targets[active] - skin_points(here, corners)[0]
+        step = np.linalg.solve(_point_jacobian(here, corners), residual[..., None])[..., 0]
+        moved = here.bary + np.column_stack([-step[:, 0] - step[:, 1], step[:, :2]])
+        heights[active] = here.heights + step[:, 2]
+        lowest = moved.argmin(axis=1)
+        out = moved[np.arange(len(active)), lowest] < _OUTSIDE
+        # What left its triangle is clipped to its border.
+        inside = np.clip(moved, 0.0, None)
+        edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
+        bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
+        done = ~out & (np.linalg.norm(residual, axis=1) < _CLOSE)
+        _cross_edges(mesh, faces, bary, active[out], lowest[out])
+        active = active[~done]
+        if not len(active):
+            break
+    return SkinCoordinates(faces, bary, heights)
+
+
+def _cross_edges(
+    mesh: SkinTopology,
+    faces: NDArray[np.int64],
+    bary: NDArray[np.float64],
+    crossing: NDArray[np.int64],
+    corner: NDArray[np.int64],
+) -> None:
+    """Move the points `crossing` over the edges opposite to `corner`; `faces` and `bary` are written."""
+    old = faces[crossing]
+    new = mesh.adjacent[old, corner]
+    same = mesh.faces[new][:, :, None] == mesh.faces[old][:, None, :]
+    shares = np.where(np.arange(3) == corner[:, None], 0.0, bary[crossing])
+    carried = (same * shares[:, None, :]).sum(axis=2)
+    faces[crossing], bary[crossing] = new, carried / np.maximum(carried.sum(axis=1, keepdims=True), 1e-12)
+
+
+def nearest_coordinates(points: Float[np.ndarray, "P 3"], shape: HandShape) -> SkinCoordinates:
+    """Coordinates of points [m] in the wrist's frame, starting from the nearest of all triangles."""
+    skin = build_skin(shape)
+    middles = skin.points[skin_mesh().faces].mean(axis=1)
+    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ points.T  # half the squares, less the points'
+    faces = off.argmin(axis=0)
+    start = SkinCoordinates(faces, np.full((len(faces), 3), 1 / 3), np.zeros(len(faces)))
+    return project_onto_skin(start, points, skin)

@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
 from track.glove_advice.trials import Trial
 from train.data.batches import Corruption, corrupt, paper_corruption
-from train.evaluate import evaluate_labeler
-from train.labeler_evaluation import Report, evaluate_clouds
+from train.evaluation import LabelingReport, evaluate_clouds, evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 
@@ -31,11 +30,11 @@ class LayoutScore:
     """How well a layout can be labeled, and what it tells of each joint."""
 
     layout: MarkerLayout
-    observed: Report
+    observed: LabelingReport
     """Labels of the frames as the rig sees them, on average over both hands."""
-    clean: Report
+    clean: LabelingReport
     """Labels where every marker is seen."""
-    corrupted: Report
+    corrupted: LabelingReport
     """Labels with the drops and ghosts of the paper's recipe."""
     seen: Float[np.ndarray, "M"]
     """Share of the frames in which each marker is seen by two cameras and becomes a point."""
@@ -63,7 +62,7 @@ def score_layout(
     """Label and count what a rig sees of gloved hands.
 
     Args:
-        labeler: A labeler of this layout; `train.any_layout.layout_labeler.LayoutLabeler` needs no training.
+        labeler: A labeler of this layout; `train.labelers.layout_labeler.LayoutLabeler` needs no training.
         rng: Order of points, and the random parts of the paper's recipe.
     """
     observed = np.concatenate([hand.frames.observed for hand in hands])

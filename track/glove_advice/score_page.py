@@ -13,11 +13,11 @@ from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.app.page import Section, write_page
-from handsim.hand.topology import DIGITS, JOINTS
+from handsim.hand.shape import DIGITS, JOINTS
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
 from track.glove_advice.trials import METHODS, Trial
-from train.metrics import percent
+from train.evaluation import percent
 from train.reports import hand_plot
 from train.reports.flat_hand import FlatHand, flat_hand
 from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture

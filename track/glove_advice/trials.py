@@ -17,15 +17,15 @@ from jaxtyping import Float
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import Side
+from handsim.space.rig import CameraRig
 from track.captures import label_capture, track_capture
 from track.config import BOTH
 from track.hand_size import sample_frames
 from track.settings import measured_user
 from track.streams.frame_source import checked_frames
+from train.evaluation import LabelCounts
 from train.labelers.protocol import Labeler
-from train.metrics import LabelCounts
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 

@@ -8,7 +8,7 @@ than three: weakly towards the resting angles, and towards predicted angles wher
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,18 +17,26 @@ from numpy.typing import ArrayLike, NDArray
 from gloves.fit import GloveFit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_QPOS
-from track.kinematics.frame_fits import FEWEST_MARKERS, fit_frames
-from track.kinematics.joint_prior import JointPrior
-from track.kinematics.levenberg_marquardt import MARKER_NOISE
-from track.kinematics.marker_kinematics import HandArrays, hand_arrays
-from track.kinematics.marker_prediction import (
+from handsim.hand.model import join_qpos
+from handsim.hand.shape import DIGITS, NUM_JOINTS, NUM_QPOS
+from handsim.kernels import align_rigid, kernel, write_quaternion_matrix
+from track.kinematics.marker_kinematics import (
+    MARKER_NOISE,
+    NUM_UNKNOWNS,
+    HandArrays,
+    Workspace,
+    hand_arrays,
+    levenberg_marquardt,
+    marker_residuals,
+    workspace,
+)
+from track.kinematics.pose_spread import (
+    JointPrior,
     MarkerPrediction,
     empty_prediction,
     predict_markers,
     world_markers,
 )
-from track.kinematics.starting_poses import StartingShapes, starting_shapes
 
 _MOST_STEPS: Final = 30  # from each start
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
@@ -250,3 +258,285 @@ def _rows(prior: AnglePrior | None, frames: int) -> tuple[NDArray[np.float64], N
             f"prior has angles of shape {angles.shape} and spread of shape {spread.shape}, "
             f"expected shapes that broadcast to ({frames}, {NUM_JOINTS})"
         ) from None
+
+
+FEWEST_MARKERS: Final = 4
+"""Least number of markers of a frame for a pose to be solved."""
+_EASING: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
+_EASING_STEPS: Final = 8  # at most at each widened scale
+_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
+_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
+_FEWEST_ON_PART: Final = 3  # markers that determine a digit's hinges, also when straight, or a palm's pose
+_GOOD_RMS: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
+
+
+@kernel
+def fit_frames(
+    hand: HandArrays,
+    shapes: StartingShapes,
+    on_part: Int[np.ndarray, "6"],
+    targets: Float[np.ndarray, "T M 3"],
+    initial: Float[np.ndarray, "S 27"],
+    predicted: Float[np.ndarray, "P 20"],
+    predicted_precision: Float[np.ndarray, "P 20"],
+    wrist: Float[np.ndarray, "9"],
+    robust_scale: float,
+    iterations: int,
+    small_gain: float,
+) -> tuple[
+    int,
+    Float[np.ndarray, "T 27"],
+    Float[np.ndarray, "T"],
+    Float[np.ndarray, "T M 3"],
+    Int[np.ndarray, "T"],
+]:
+    """Solve frames one by one.
+
+    Args:
+        shapes: Shapes to start from where there are no initial poses.
+        on_part: Markers on each digit, and on the palm (last).
+        targets: Labeled markers [m]; NaN where missing.
+        initial: Poses to start from, one row per frame or none.
+        predicted: Mean of the hinges [rad], one row per frame or none.
+        predicted_precision: Their precision [1/rad^2].
+        wrist: Predicted position [m] and orientation of the wrist, then the precisions of both.
+        robust_scale: See `levenberg_marquardt`.
+        iterations: Steps at most from each start.
+        small_gain: See `levenberg_marquardt`.
+
+    Returns:
+        Index of the first frame that cannot be solved (or -1), and the arrays of a `PoseFit`.
+    """
+    frames, count = targets.shape[:2]
+    qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
+    rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
+    prior_mean, precision, seen = (
+        np.empty(NUM_QPOS),
+        np.empty(NUM_UNKNOWNS),
+        np.empty(len(on_part), dtype=np.int64),
+    )
+    work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
+    for frame in range(frames):
+        present = _read_markers(hand.digits, targets[frame], target, seen)
+        if present < FEWEST_MARKERS:
+            return frame, qpos, rms, residuals, steps
+        _set_prior(
+            seen,
+            on_part,
+            predicted[frame:],
+            predicted_precision[frame:],
+            wrist,
+            prior_mean,
+            precision,
+        )
+        if len(initial) > 0:
+            starts = initial[frame : frame + 1].copy()
+            length = np.sqrt((starts[0, 3:7] ** 2).sum())
+            if not length > 0.0:
+                return frame, qpos, rms, residuals, steps
+            starts[0, 3:7] /= length
+        else:
+            starts = initial_poses(shapes, hand.digits, target)
+        least = np.inf
+        qpos[frame] = starts[0]
+        for number in range(len(starts)):
+            pose[:] = starts[number]
+            cost = np.inf
+            for part in _EASING:
+                if robust_scale == 0.0 and part < 1.0:
+                    continue
+                most = iterations if part == 1.0 else min(iterations, _EASING_STEPS)
+                cost, tried = levenberg_marquardt(
+                    hand, target, pose, prior_mean, precision, part * robust_scale, most, small_gain, work
+                )
+                steps[frame] += tried
+            if cost < least:
+                least = cost
+                qpos[frame] = pose
+            if least < present * (_GOOD_RMS / MARKER_NOISE) ** 2:
+                break
+        rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
+    return -1, qpos, rms, residuals, steps
+
+
+@kernel
+def _read_markers(
+    digits: Int[np.ndarray, "M"],
+    given: Float[np.ndarray, "M 3"],
+    target: Float[np.ndarray, "M 3"],
+    seen: Int[np.ndarray, "6"],
+) -> int:
+    """Copy the markers of one frame to `target`, each complete or NaN, and return how many are present.
+
+    `seen` is filled with how many are present on each digit and on the palm (last).
+    """
+    seen[:] = 0
+    present = 0
+    for marker in range(len(given)):
+        if np.isfinite(given[marker, 0] + given[marker, 1] + given[marker, 2]):
+            target[marker] = given[marker]
+            present += 1
+            seen[digits[marker]] += 1
+        else:
+            target[marker] = np.nan
+    return present
+
+
+@kernel
+def _set_prior(
+    seen: Int[np.ndarray, "6"],
+    on_part: Int[np.ndarray, "6"],
+    predicted: Float[np.ndarray, "P 20"],
+    predicted_precision: Float[np.ndarray, "P 20"],
+    wrist: Float[np.ndarray, "9"],
+    prior_mean: Float[np.ndarray, "27"],
+    precision: Float[np.ndarray, "26"],
+) -> None:
+    """Mean and precision of the prior of one frame, both filled; see `levenberg_marquardt`.
+
+    The frame's rows of `predicted` and `predicted_precision` come first, if there are any.
+    """
+    prior_mean[:7] = wrist[:7]
+    incomplete = seen[-1] < max(on_part[-1], _FEWEST_ON_PART)
+    precision[NUM_JOINTS : NUM_JOINTS + 3] = wrist[7] if incomplete else 0.0
+    precision[NUM_JOINTS + 3 :] = wrist[8] if incomplete else 0.0
+    for hinge in range(NUM_JOINTS):
+        digit = hinge // 4
+        complete = seen[digit] == on_part[digit] and seen[digit] >= _FEWEST_ON_PART
+        rest, weight = (
+            RESTING[hinge],
+            _REST_PRECISION * (_COMPLETE_DIGIT if complete else 1.0),
+        )
+        if len(predicted) > 0 and not complete:
+            both = weight + predicted_precision[0, hinge]
+            rest += (predicted[0, hinge] - rest) * predicted_precision[0, hinge] / both
+            weight = both
+        prior_mean[7 + hinge], precision[hinge] = rest, weight
+
+
+@kernel
+def _write_residuals(
+    hand: HandArrays,
+    target: Float[np.ndarray, "M 3"],
+    pose: Float[np.ndarray, "27"],
+    work: Workspace,
+    residuals: Float[np.ndarray, "M 3"],
+) -> float:
+    """Fill the residuals in the world [m], NaN where a marker is missing, and return their RMS [m]."""
+    marker_residuals(hand, target, pose, work)
+    w, x, y, z = pose[3:7]
+    total, present = 0.0, 0
+    for marker in range(len(target)):
+        a, b, c = work.residuals[marker]
+        i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
+        residuals[marker, 0] = a + 2.0 * (w * i + y * k - z * j)
+        residuals[marker, 1] = b + 2.0 * (w * j + z * i - x * k)
+        residuals[marker, 2] = c + 2.0 * (w * k + x * j - y * i)
+        if not np.isnan(a):
+            present += 1
+            total += a * a + b * b + c * c
+    return np.sqrt(total / present)  # type: ignore[no-any-return]
+
+
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+"""Hinge angles of a relaxed hand [rad]."""
+# Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
+# knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
+# finger, opposed, opposed and bent, across the palm.
+_FINGER: Final = (
+    (0, 25, 35, 20),
+    (0, 0, 5, 5),
+    (0, 45, 60, 35),
+    (0, 75, 10, 10),
+    (0, 10, 95, 55),
+    (0, 80, 100, 55),
+)
+_THUMB: Final = (
+    (0, 25, 35, 20),
+    (25, -25, 0, 0),
+    (-20, -20, 10, 10),
+    (25, 20, 10, 10),
+    (20, 25, 45, 60),
+    (-20, 35, 50, 40),
+)
+_ROUNDS: Final = 3  # of choosing digits and aligning again; the choice is settled after these
+_STEADY: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
+
+
+class StartingShapes(NamedTuple):
+    """K hand shapes with the wrist at the origin, and the positions of their markers."""
+
+    angles: Float[np.ndarray, "K 20"]
+    """Hinge angles [rad]."""
+    markers: Float[np.ndarray, "K M 3"]
+    """Markers in the wrist's frame [m]."""
+    weights: Float[np.ndarray, "M"]
+    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
+
+
+def starting_shapes(fit: GloveFit) -> StartingShapes:
+    """The shapes that a fit of this hand in its glove may start from."""
+    angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
+    markers = fit.markers(join_qpos(angles))[0]
+    return StartingShapes(angles, markers, 1.0 / (_STEADY**2 + markers.var(axis=0).sum(axis=1)))
+
+
+@kernel
+def initial_poses(
+    shapes: StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "S 27"]:
+    """Poses to start from (K + 1, 27) for the markers of one frame, the most likely one first.
+
+    The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
+    aligned with the markers first.
+    """
+    count = len(shapes.angles)
+    aligned, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
+    squares = np.empty(count)
+    for number in range(count):
+        aligned[number, 7:] = shapes.angles[number]
+        squares[number] = align_rigid(shapes.markers[number], target, shapes.weights, aligned[number])
+    for number in range(count):
+        better = 0
+        for other in range(count):
+            if squares[other] < squares[number] or (squares[other] == squares[number] and other < number):
+                better += 1
+        poses[1 + better] = aligned[number]
+    markers = np.empty_like(target)
+    poses[0] = poses[1]
+    for _ in range(_ROUNDS):
+        _choose_digits(shapes, digits, target, poses[0], markers)
+        align_rigid(markers, target, shapes.weights, poses[0])
+    return poses
+
+
+@kernel
+def _choose_digits(
+    shapes: StartingShapes,
+    digits: Int[np.ndarray, "M"],
+    target: Float[np.ndarray, "M 3"],
+    pose: Float[np.ndarray, "27"],
+    markers: Float[np.ndarray, "M 3"],
+) -> None:
+    """Take each digit from the shape whose markers are nearest, the wrist held."""
+    rotation = np.empty((3, 3))
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
+    squares = np.zeros((5, len(shapes.angles)))
+    for marker in range(len(target)):
+        if digits[marker] < 0 or np.isnan(target[marker, 0]):
+            continue
+        for i in range(3):
+            local = 0.0
+            for j in range(3):
+                local += rotation[j, i] * (target[marker, j] - pose[j])
+            for number in range(len(shapes.angles)):
+                squares[digits[marker], number] += (shapes.markers[number, marker, i] - local) ** 2
+    for digit in range(5):
+        nearest = squares[digit].argmin()
+        pose[7 + 4 * digit : 11 + 4 * digit] = shapes.angles[nearest, 4 * digit : 4 * digit + 4]
+        for marker in range(len(target)):
+            if digits[marker] == digit:
+                markers[marker] = shapes.markers[nearest, marker]
+    for marker in range(len(target)):
+        if digits[marker] < 0:
+            markers[marker] = shapes.markers[0, marker]

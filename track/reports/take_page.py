@@ -13,16 +13,15 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.page import Section, write_page
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_ending
-from handsim.hand.topology import JOINTS
+from handsim.files.outputs import check_ending, written_together
+from handsim.hand.shape import JOINTS
 from track.config import Size
 from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
 from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
-from train.metrics import percent
+from train.evaluation import percent
 from train.reports.plot_style import picture
 
 _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by line

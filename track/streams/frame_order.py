@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.frame_times import HIGHEST_RATE
+from gloves.captures.text import HIGHEST_RATE
 from track.frames import LATEST_TIME
 from track.streams.frame_source import StreamedFrame
 

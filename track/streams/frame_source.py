@@ -10,8 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from gloves.captures.capture import Capture
-from gloves.captures.plausibility import check_place, check_unit
+from gloves.captures.capture import Capture, check_place, check_unit
 from gloves.optics.reconstruction import number_runs
 from track.frames import FARTHEST
 

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.frames import FARTHEST, LATEST_TIME
 from track.streams.frame_order import FrameOrder

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from gloves.captures.capture import Capture
 from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import CaptureError, choices
 from track.inputs import read_points
 from track.streams import LOOPBACK, natnet

@@ -14,7 +14,7 @@ from collections import deque
 from typing import Final, NamedTuple
 from urllib.parse import urlsplit
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import CaptureError
 from track.streams import natnet
 from track.streams.frame_source import StreamedFrame

@@ -29,7 +29,7 @@ def write_video(
     Args:
         path: The file, .mp4.
         shown: Points [m] that the view holds.
-        write_clip: What draws and encodes the pictures, `render.illustrations.clip.write_clip`.
+        write_clip: What draws and encodes the pictures, `render.illustrations.write_clip`.
         progress: Called after each picture with the number of pictures and of all.
 
     Returns:

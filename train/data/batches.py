@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_callable, check_rng, check_type, shown_value
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES
 from handsim.settings import Limits, Settings
 from train.data.shards import MappedRows
 

@@ -19,14 +19,14 @@ from lightning_fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 
 from handsim.errors import ArgumentError
-from train.config import TrainConfig
 from train.devices.world import RENDEZVOUS, World, world_of
+from train.settings import TrainSettings
 
 _LOOPBACK: Final = {"linux": "lo", "darwin": "lo0"}
 _SRUN_TASKS: Final = "SLURM_NTASKS_PER_NODE"
 
 
-def start_fabric(config: TrainConfig, out: Path) -> Fabric:
+def start_fabric(config: TrainSettings, out: Path) -> Fabric:
     """The device of this process, a GPU where there is one, and the writer of the curves.
 
     Waits for the other processes of the run, if there are any.
@@ -63,7 +63,7 @@ def _leave() -> None:
         torch.distributed.destroy_process_group()
 
 
-def check_devices(config: TrainConfig, size: int, local_size: int) -> None:
+def check_devices(config: TrainSettings, size: int, local_size: int) -> None:
     """Refuse more processes than there are clouds in a batch, or than there are GPUs.
 
     Args:

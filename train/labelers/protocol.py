@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
-from gloves.captures.plausibility import check_unit
+from gloves.captures.capture import check_unit
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError, WeightsError
-from train.matching.pose_prior import PosePrior
-from train.matching.verification import match_scores
+from train.labelers.matching import match_scores
+from train.labelers.pose_prior import PosePrior
 
 LABELERS: Final = "handsim.labelers"
 """Group of entry points of labelers."""
@@ -128,7 +128,7 @@ def label_by_scores(
     label_scores: Float[np.ndarray, "B M N+1"],
     prior: PosePrior | None,
 ) -> list[Labeling]:
-    """Labelings from the log-probabilities of padded clouds, see `train.matching.verification`."""
+    """Labelings from the log-probabilities of padded clouds, see `train.labelers.matching`."""
     longest = point_scores.shape[1]
     labelings = []
     for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):

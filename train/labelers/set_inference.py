@@ -1,7 +1,7 @@
 """The set labeler with weights, one cloud at a time: compiled, and without torch.
 
 For so few points torch's time goes to its calls. Operations in their order are those of
-`train.labelers.set_network`.
+`train.labelers.networks`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
-from handsim.kernels.kernel import kernel
-from train.config import SetLabelerConfig
+from handsim.kernels import kernel
+from train.labelers.matching import match_scores
+from train.labelers.pose_prior import PosePrior
 from train.labelers.protocol import Labeling, check_clouds, check_output
-from train.matching.pose_prior import PosePrior
-from train.matching.verification import match_scores
+from train.settings import SetLabelerConfig
 
 Floats = NDArray[np.float32]
 Weights = Mapping[str, Floats]
-"""Weights of the network by their names in `train.labelers.set_network`."""
+"""Weights of the network by their names in `train.labelers.networks`."""
 
 _EPSILON: Final = np.float32(1e-5)  # of torch's LayerNorm
 _NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
@@ -143,7 +143,7 @@ class CloudScorer:
     def score(
         self, points: Float[np.ndarray, "N 3"]
     ) -> tuple[Float32[np.ndarray, "N M+1"], Float32[np.ndarray, "M N+1"]]:
-        """Log-probabilities as in `train.labelers.set_network.LabelScores`.
+        """Log-probabilities as in `train.labelers.networks.LabelScores`.
 
         Args:
             points: One point or more [m].

@@ -1,35 +1,59 @@
-"""Trained labelers on disk: safetensors for weights and JSON for the model card, or one ONNX file.
+"""Labelers by their names and files: of a glove, for any layout, trained, exported, or your own object.
 
-The weights' own metadata repeat what others ask of a file that they find alone: what it is, of which layout,
-who wrote it, from what data, under which license. Nothing here reads it back: the card is what counts.
+A trained labeler is safetensors for the weights and JSON for the model card, or one ONNX file, written with
+torch and run by onnxruntime without it. The metadata of the weights repeat what others ask of a file that
+they find alone: what it is, of which layout, who wrote it, from what data, under which license. Nothing here
+reads it back: the card is what counts.
 """
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import functools
+import hashlib
+import io
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import platformdirs
+from jaxtyping import Float
 from numpy.typing import NDArray
 
+from gloves.layout import MarkerLayout, list_layouts, load_layout
+from handsim import __version__
+from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
-from handsim.errors import HandSimError, WeightsError, choices
-from handsim.files.atomic import atomic_write, written_together
+from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
-from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
-from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
+from handsim.files.outputs import atomic_write, plain_path, written_together
+from train.labelers.cnn_labeler import CNNLabeler, MeanHand
+from train.labelers.matching import matching_constants
+from train.labelers.pose_prior import PosePrior
+from train.labelers.protocol import (
+    LABELERS,
+    Labeler,
+    Labeling,
+    OwnLabeler,
+    checked_names,
+    label_by_scores,
+    label_in_batches,
+    pad_clouds,
+)
 from train.labelers.set_inference import TrainedSetLabeler, weight_shapes
-from train.matching.pose_prior import PosePrior
+from train.settings import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 
 if TYPE_CHECKING:
+    import onnx
     from torch import nn
+
 
 LEARNED: Final = ".safetensors"
 """How the files in `learned_folder` end."""
@@ -46,7 +70,7 @@ _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 
 
 def learned_folder() -> Path:
-    """Where labelers of learned gloves are kept, see `train.any_layout`; `XDG_CACHE_HOME` moves it."""
+    """Where labelers of learned gloves are kept; `XDG_CACHE_HOME` moves it."""
     return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
 
 
@@ -76,8 +100,6 @@ def load_stored_labeler(name_or_path: str | Path) -> Labeler:
         WeightsError: Unknown, damaged, or not a labeler's weights.
     """
     if Path(name_or_path).suffix.lower() == ".onnx":
-        from train.labelers.onnx_labeler import OnnxLabeler
-
         return OnnxLabeler(Path(name_or_path))
     name = str(name_or_path)
     if not Path(name).exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
@@ -85,7 +107,7 @@ def load_stored_labeler(name_or_path: str | Path) -> Labeler:
     stored = _read(*_files(name_or_path))
     if isinstance(stored.config, SetLabelerConfig):
         return TrainedSetLabeler(stored.config, stored.weights, stored.prior, stored.marker_names)
-    from train.labelers.kinds import labeler_of  # torch
+    from train.labelers.networks import labeler_of  # torch
 
     return labeler_of(stored.network(), stored.marker_names)
 
@@ -133,7 +155,7 @@ class _Stored:
         """The network in torch."""
         import torch
 
-        from train.labelers.kinds import new_network
+        from train.labelers.networks import new_network
 
         network = new_network(self.config)
         network.load_state_dict({name: torch.from_numpy(one) for name, one in self.weights.items()})
@@ -178,7 +200,7 @@ def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
         return weight_shapes(config)
     import torch
 
-    from train.labelers.kinds import new_network
+    from train.labelers.networks import new_network
 
     with torch.device("meta"):
         return {name: tuple(one.shape) for name, one in new_network(config).state_dict().items()}
@@ -254,3 +276,321 @@ def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
     header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
     header += b" " * (-len(header) % _LENGTH)  # tensors begin at multiples of eight bytes
     return len(header).to_bytes(_LENGTH, "little") + header + content[end:]
+
+
+_NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
+_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
+_CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
+_ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
+_MATCHING: Final = "handsim.matching"  # key of the constants that labels are chosen by, for other programs
+_IMAGES: Final = "images"  # its input
+_INPUTS: Final = "points", "present"
+_OUTPUTS: Final = "point_scores", "label_scores"
+_PAIRED: Final = "pairs", "costs"  # outputs for other programs
+_OPSET: Final = 17
+_DESCRIPTION: Final = (
+    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
+    "bfloat16 by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
+)
+_MEANINGS: Final = {
+    "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
+    "none.",
+    "present": "Whether a row of points is one.",
+    "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
+    "the last column is a ghost.",
+    "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
+    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
+    "ghost.",
+    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
+    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
+    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
+    "there is none.",
+    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
+    "image's width.",
+}
+"""What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
+_HINT: Final = "install it with: pip install 'handsim[onnx]'"
+
+
+class OnnxLabeler:
+    """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it.
+
+    Raises:
+        HandSimError: onnxruntime is not installed.
+        WeightsError: The file is missing, damaged, or not a labeler.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise HandSimError(f"an .onnx labeler needs onnxruntime; {_HINT}") from error
+        if not path.is_file():
+            raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a frame is too small to share
+        options.log_severity_level = 4
+        options.add_session_config_entry("session.set_denormal_as_zero", "1")  # distance bumps underflow
+        try:
+            content = path.read_bytes()
+            if sign_model(content) != content:  # onnxruntime crashes on some damaged files
+                raise ValueError("the SHA-256 is another one")
+            # Without its fallback, which prints on standard output.
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
+            metadata = self._session.get_modelmeta().custom_metadata_map
+            self._scores_alone = onnxruntime.RunOptions()  # not what other programs need beside them
+            self._scores_alone.only_execute_path_to_fetches = True
+            self.marker_names = checked_names(json.loads(metadata[_NAMES]))
+            self.prior = _unpacked(metadata[_ONNX_PRIOR]) if _ONNX_PRIOR in metadata else None
+            self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
+            self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
+        except Exception as error:  # onnxruntime's errors have no common class of their own
+            raise WeightsError(
+                f"{path} is damaged or not a labeler's: expected what handsim export wrote"
+            ) from error
+
+    def _try(self, given: str) -> None:
+        """Raise a ValueError unless the network gives finite numbers of the right shapes."""
+        count = len(self.marker_names)
+        if given == _IMAGES:
+            found = self._session.run(None, {_IMAGES: np.zeros((1, 1, 52, 52), np.float32)})[:1]
+            shapes = [(1, count, 3)]
+        else:
+            points = np.linspace(0.0, 0.1, 15, dtype=np.float32).reshape(1, 5, 3)
+            found = self._session.run(
+                _OUTPUTS, dict(zip(_INPUTS, (points, np.ones((1, 5), bool)), strict=True))
+            )
+            shapes = [(1, 5, count + 1), (1, count, 6)]
+        if [output.shape for output in found] != shapes or not all(np.isfinite(one).all() for one in found):
+            raise ValueError("the outputs are not those of a labeler")
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return label_in_batches(frames, self._label)
+
+    def _label_by_scores(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        """The set labeler."""
+        given = dict(zip(_INPUTS, pad_clouds(clouds), strict=True))
+        by_point, by_label = self._session.run(_OUTPUTS, given, self._scores_alone)
+        return label_by_scores(clouds, by_point, by_label, self.prior)
+
+    def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
+        """The paper's network, with what its metadata tells of its use."""
+        content = json.loads(settings)
+        hand = MeanHand(*(np.array(content["mean_hand"][field.name]) for field in fields(MeanHand)))
+        config = CNNConfig(**content["config"])
+
+        def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
+            predicted: NDArray[np.float32] = self._session.run(None, {_IMAGES: images})[0]
+            return predicted
+
+        return CNNLabeler(positions, hand, config, self.marker_names).label_batch
+
+
+def _unpacked(text: str) -> PosePrior:
+    """The pose prior in a file's metadata."""
+    with np.load(io.BytesIO(base64.b64decode(text, validate=True))) as tables:  # unpickles nothing
+        return PosePrior.of_tensors(dict(tables))
+
+
+def _packed(prior: PosePrior) -> str:
+    """The pose prior as text."""
+    file = io.BytesIO()
+    np.savez(file, **prior.tensors())  # type: ignore[arg-type]
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def sign_model(content: bytes) -> bytes:
+    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before."""
+    key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
+    if content.count(key) != 1:
+        raise ValueError("the file has no SHA-256")
+    first = content.index(key) + len(key)
+    place = slice(first, first + 64)
+    blank = content[: place.start] + b"0" * 64 + content[place.stop :]
+    return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
+
+
+def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
+    """Write a trained labeler as an ONNX file for any number of clouds of any size."""
+    import torch
+
+    from train.labelers.cnn_network import DeepLabelCNN
+    from train.labelers.networks import PairedScores
+
+    try:
+        import onnx
+    except ImportError as error:
+        raise HandSimError(f"exporting needs onnx; {_HINT}") from error
+    properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64, "handsim.version": __version__}
+    example: tuple[torch.Tensor, ...]
+    if isinstance(network, DeepLabelCNN):
+        example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]
+        axes = {name: {0: "images"} for name in (*inputs, *outputs)}
+        hand = {name: value.tolist() for name, value in asdict(network.mean_hand.get()).items()}
+        properties[_CNN] = json.dumps({"config": asdict(network.config), "mean_hand": hand})
+    else:
+        example = torch.randn(2, 5, 3), torch.tensor([[True] * 5, [True] * 4 + [False]])
+        inputs, outputs = list(_INPUTS), list(_OUTPUTS)
+        axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
+        axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
+        prior = getattr(network, "prior", None)
+        if isinstance(prior, PosePrior):
+            properties[_ONNX_PRIOR] = _packed(prior)
+            properties[_MATCHING] = json.dumps(matching_constants())
+            network, outputs = PairedScores(network), [*outputs, *_PAIRED]
+            axes |= {name: {0: "frames", 1: "points"} for name in _PAIRED}
+            axes[_PAIRED[1]][2] = "markers_and_points"
+    with atomic_write(path) as temporary, plain_path(temporary) as plain, warnings.catch_warnings():
+        # The newer exporter needs another package and fixes the sizes of expanded arrays.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network.eval(),
+            example,
+            str(plain),
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes=axes,
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+        model = onnx.load(str(plain))
+        _describe(model, properties)
+        onnx.checker.check_model(model, full_check=True)
+        temporary.write_bytes(sign_model(model.SerializeToString()))
+
+
+def _describe(model: onnx.ModelProto, properties: dict[str, str]) -> None:
+    """Say who wrote a model and what goes in and out, and add these properties."""
+    import onnx.helper
+
+    model.producer_name, model.producer_version = "handsim", __version__
+    model.doc_string = model.graph.doc_string = _DESCRIPTION
+    for value in (*model.graph.input, *model.graph.output):
+        value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
+    onnx.helper.set_model_props(model, properties)
+
+
+ANY_LAYOUT: Final = "any-layout"
+"""Name of the labeler that needs no training."""
+_FEW_POSES: Final = 6000  # from which a layout is known that nobody asked for
+_EXPECTED: Final = (
+    "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
+    "module:name"
+)
+
+
+def load_labeler(
+    glove: MarkerLayout | Labeler | str | Path, labeler: Labeler | str | Path | None = None
+) -> Labeler:
+    """The labeler of a glove, or a labeler by its name, path or object.
+
+    A glove without a labeler of its own gets the one for any layout, which learns the layout within a minute.
+    Only shipped labelers, folders and the one for any layout need torch.
+
+    Args:
+        glove: A marker layout, or its name or path, whose labeler is wanted. Or, where `labeler` is not
+            given, a labeler: a folder that `handsim train` wrote, an .onnx file, `module:name` of a `Labeler`
+            or of a class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
+        labeler: A labeler like these, or `any-layout`, to be used with this glove; it is checked against the
+            glove's markers.
+
+    Returns:
+        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
+
+    Raises:
+        ArgumentError: An argument is none of these, or `any-layout` is given without a glove.
+        LayoutError: The glove is unknown.
+        WeightsError: The labeler is unknown, damaged, or knows other markers.
+
+    Warns:
+        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout; or such a
+            glove is nearly its own mirror image.
+    """
+    if labeler is None:
+        return _of_layout(load_layout(glove), glove) if _is_layout(glove) else _of(glove)  # type: ignore[arg-type]
+    layout = load_layout(glove)  # type: ignore[arg-type]
+    if labeler == ANY_LAYOUT:
+        from train.labelers.layout_labeler import learned_labeler  # torch
+
+        return learned_labeler(layout)
+    found = _of(labeler)
+    if found.marker_names != layout.names:
+        raise WeightsError(
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{layout.name}' has "
+            f"{', '.join(layout.names)}; name the glove that it was trained on (--glove)"
+        )
+    return found
+
+
+@functools.lru_cache(maxsize=32)
+def labeler_at_once(layout: MarkerLayout) -> Labeler:
+    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    for name in shipped_labelers():
+        if load_layout(name) == layout:
+            return load_stored_labeler(name)
+    from train.labelers.layout_labeler import (
+        LayoutLabeler,  # torch
+        is_learned,
+        learned_labeler,
+    )
+
+    return (
+        learned_labeler(layout) if is_learned(layout) else LayoutLabeler.at_once(layout, num_poses=_FEW_POSES)
+    )
+
+
+def _is_layout(glove: Any) -> bool:
+    return (
+        isinstance(glove, MarkerLayout)
+        or str(glove) in list_layouts()
+        or (isinstance(glove, str | Path) and Path(glove).suffix.lower() == ".toml")
+    )
+
+
+def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
+    """The labeler that was trained on a layout, or the one for any."""
+    for name in shipped_labelers():
+        if load_layout(name) == layout:
+            return load_stored_labeler(name)
+    from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
+    from train.labelers.side import is_mirror_like  # kernels
+
+    own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
+    name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
+    how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
+    warnings.warn(
+        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
+        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
+        "train SET --out RUN, and --labeler RUN",
+        HandSimWarning,
+        stacklevel=3,
+    )
+    if is_mirror_like(layout):
+        warnings.warn(
+            f"glove '{name}' is nearly its own mirror image, so that right and left may be exchanged for a "
+            "whole capture; put a marker on the thumb, or move those on the back away from any symmetry",
+            HandSimWarning,
+            stacklevel=3,
+        )
+    return learned_labeler(layout)
+
+
+def _of(labeler: Any) -> Labeler:
+    """A labeler by its name, path or object."""
+    if labeler == ANY_LAYOUT:
+        raise ArgumentError(
+            f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
+            "MarkerLayout, or the name or path of one"
+        )
+    if hasattr(labeler, "label_frames") and not isinstance(labeler, type):
+        ours = type(labeler).__module__.startswith("train.")
+        return labeler if ours else OwnLabeler(labeler)
+    check_type("labeler", labeler, (str, Path), _EXPECTED, list_layouts())
+    return load_stored_labeler(labeler)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.files.atomic import atomic_write
-from train.metrics import percent
+from handsim.files.outputs import atomic_write
+from train.evaluation import percent
 
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"

@@ -11,9 +11,7 @@ import numpy as np
 
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.app.page import Section, write_page
-from train.history import History
-from train.labeler_evaluation import Report
-from train.metrics import LEAST_SURE, percent, reliability
+from train.evaluation import LEAST_SURE, History, LabelingReport, percent, reliability
 from train.reports import hand_plot as _hand_plot
 from train.reports import run_plots as _run_plots
 from train.reports.flat_hand import flat_hand
@@ -23,7 +21,7 @@ PAGE: Final = "report.html"
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
 
 
-def write_run_page(out: Path, card: dict[str, Any], history: History, report: Report) -> Path:
+def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
     """Write the page of a run: one HTML file with its pictures inside, complete or not at all; its path.
 
     The report is of held-out frames with the paper's corruption.
@@ -65,7 +63,7 @@ def _columns(card: dict[str, Any]) -> tuple[dict[str, float], tuple[str, dict[st
     return clean, (recipe, corrupted)
 
 
-def _figures_section(card: dict[str, Any], report: Report) -> Section:
+def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     clean, (recipe, corrupted) = _columns(card)
     table = [["figure [%]", "clean", recipe]]
     table += [[name.replace("_", " "), percent(clean[name]), percent(corrupted[name])] for name in corrupted]
@@ -91,7 +89,7 @@ def _curves_section(history: History) -> Section:
     )
 
 
-def _confusion_section(layout: MarkerLayout, report: Report) -> Section:
+def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     draw = partial(_run_plots.draw_confusion, names=layout.names, confusion=report.confusion)
     drawn = picture(_run_plots.confusion_size(layout.num_markers + 1), draw)
     caption = (
@@ -103,7 +101,7 @@ def _confusion_section(layout: MarkerLayout, report: Report) -> Section:
     return Section("What is taken for what", text, pictures=[(drawn, caption)])
 
 
-def _hand_section(layout: MarkerLayout, report: Report) -> Section:
+def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     arrows = _hand_plot.mistakes(report.confusion)
     draw = partial(
         _hand_plot.draw_hand, hand=flat_hand(layout), names=layout.names,
@@ -128,7 +126,7 @@ def _hand_section(layout: MarkerLayout, report: Report) -> Section:
     return Section("On the hand", _hand_text(layout, report), pictures=[(drawn, caption)], table=table)
 
 
-def _hand_text(layout: MarkerLayout, report: Report) -> str:
+def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
     """The markers most often wrong, and what became of hidden markers and ghosts; HTML."""
     order = np.argsort(report.slot_accuracy_by_marker, kind="stable")[:3]
     worst = ", ".join(
@@ -147,7 +145,7 @@ def _hand_text(layout: MarkerLayout, report: Report) -> str:
     )
 
 
-def _reliability_section(report: Report) -> Section:
+def _reliability_section(report: LabelingReport) -> Section:
     bins = reliability(report.confidences, report.right)
     error = report.figures["calibration_error"]
     drawn = picture((6.4, 6.0), partial(_run_plots.draw_reliability, bins=bins, error=error))

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Int
 
-from train.history import History
-from train.metrics import BINS, Reliability
+from train.evaluation import BINS, History, Reliability
 from train.reports.plot_style import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, LayoutError, PoseError
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
+from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MOST_OTHERS,

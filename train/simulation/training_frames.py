@@ -20,11 +20,10 @@ from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Population
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, SIDES, Population
 from handsim.settings import Expected, Limits, Mixture, Settings
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
 from handsim.space.transforms import random_quaternions
 from poses.grasps import sample_held_poses, settle_hold, wrist_poses
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, sample_valid_angles

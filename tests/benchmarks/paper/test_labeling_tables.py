@@ -11,8 +11,8 @@ from benchmarks.paper import labeling_tables
 from benchmarks.paper.labeling_tables import FIGURES, LABELING_TABLES, augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from handsim.cli.main import main
-from train.evaluate import evaluate_labeler
-from train.glove_labeler import load_labeler
+from train.evaluation import evaluate_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take

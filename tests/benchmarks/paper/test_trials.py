@@ -12,12 +12,12 @@ from benchmarks.paper.trials import (
     initialization_times,
     recovery_times,
 )
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.frames import TrackedFrame, TrackedHand
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

@@ -13,9 +13,9 @@ from handsim.cli import render as command
 from handsim.cli.render import RenderOptions
 from handsim.errors import HandSimError
 from render.config import RenderConfig
+from render.depth_sensor import DepthSensor
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import Backgrounds
-from render.sensors.depth_noise import DepthSensor
 from render.skin.look import TONES
 
 

@@ -8,11 +8,11 @@ import pytest
 
 import train.loop
 from handsim.cli.main import main
-from train.config import EPOCHS, CNNConfig, TrainConfig, default_config, preset_config
 from train.data.batches import Corruption, paper_corruption
+from train.loop import _rate
+from train.settings import EPOCHS, CNNConfig, TrainSettings, default_config, preset_config
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
-from train.training_state import _rate
 
 FRAMES = 16
 
@@ -28,7 +28,7 @@ def dataset(tmp_path_factory):
 def config_of(dataset, tmp_path, monkeypatch):
     """The settings that `handsim train` hands to the training loop."""
 
-    def config_of(*options: str) -> TrainConfig:
+    def config_of(*options: str) -> TrainSettings:
         configs = []
 
         def keep(rows, out, config, *, threads, progress, on_step):
@@ -43,7 +43,7 @@ def config_of(dataset, tmp_path, monkeypatch):
 
 
 def test_a_preset_replaces_the_defaults(config_of):
-    assert config_of() == TrainConfig()
+    assert config_of() == TrainSettings()
     config = config_of("--preset", "han2018")
     assert config == config_of("--preset=han2018") == preset_config("han2018", FRAMES)
     assert config.optimizer == "sgd" and config.samples == EPOCHS * FRAMES
@@ -67,7 +67,7 @@ def test_the_preset_is_section_3_3_of_the_paper(config_of):
 
 
 def test_each_kind_has_defaults_of_its_own(config_of):
-    assert config_of("--labeler", "set") == config_of() == TrainConfig()
+    assert config_of("--labeler", "set") == config_of() == TrainSettings()
     assert config_of("--labeler", "cnn") == config_of("--labeler=cnn") == default_config("cnn")
     config = config_of("--labeler", "cnn", "--batch", "256", "--cnn.views", "random")
     assert config == dataclasses.replace(default_config("cnn"), batch=256, cnn=CNNConfig(views="random"))
@@ -85,12 +85,12 @@ PRESET, OPTIMIZER = ["--preset", "han2018"], ["--optimizer", "adamw"]
 @pytest.mark.parametrize("options", [PRESET + OPTIMIZER, OPTIMIZER + PRESET])
 def test_an_option_beside_a_preset_holds_although_it_is_the_usual_default(config_of, options):
     config = config_of(*options)
-    assert config.optimizer == "adamw" == TrainConfig().optimizer
+    assert config.optimizer == "adamw" == TrainSettings().optimizer
     assert config.learning_rate == 0.6 and config.labeler == "cnn"
 
 
 def test_every_usual_default_holds_when_given(config_of):
-    usual = TrainConfig()
+    usual = TrainSettings()
     options = [
         f"--{name.replace('_', '-')}={getattr(usual, name)}"
         for name in ("labeler", "samples", "learning_rate", "schedule", "weight_decay", "average")

@@ -13,14 +13,12 @@ from scipy.spatial.transform import Rotation
 from gloves.fit import attach
 from gloves.hand_files import write_hand
 from gloves.takes.take import Take
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.osim import coordinate_names, hand_osim
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import BONE_NAMES
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim.hand.model_files import coordinate_names, hand_osim
+from handsim.hand.shape import BONE_NAMES, sample_shape
 
 FRAMES = 12
-PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "opensim.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "other_programs.md"
 
 
 @pytest.fixture(params=["right", "left"])
@@ -165,7 +163,7 @@ def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_pat
 
 
 def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, tmp_path, monkeypatch):
-    """The program of docs/how_to/opensim.md, as it stands there."""
+    """The program of docs/how_to/other_programs.md, as it stands there."""
     opensim = pytest.importorskip("opensim")
     monkeypatch.chdir(tmp_path)
     take = Take.of_poses([fit], qpos[:, None], rate=60.0)

@@ -1,5 +1,3 @@
-"""Depth, normals and ids of the z-buffer against embree's rays, and where the answer is known."""
-
 from __future__ import annotations
 
 import importlib.util
@@ -10,10 +8,11 @@ import trimesh
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.skin.surface import vertex_normals
-from handsim.space.camera import Camera, look_at, pinhole, preset
+from handsim.hand.skin import vertex_normals
+from handsim.space.camera import Camera, Lens, look_at, pinhole, preset
+from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
-from render.painting.rasterizer import Triangles, join, rasterize
+from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
 
@@ -94,3 +93,177 @@ def test_a_hand_is_where_embree_finds_it(seed):
     off = np.abs(theirs - mine)[both]
     assert np.median(off) <= 1e-6 and np.quantile(off, 0.999) <= 1e-5
     assert (part.reshape(480, 640) == pictures.parts)[both].mean() >= 0.999
+
+
+SPHERES = (
+    ((0.0, 0.0, 0.6), 0.1),
+    ((0.35, 0.1, 0.3), 0.12),
+    ((-0.5, 0.05, 0.05), 0.15),
+    ((0.1, -0.4, 0.2), 0.1),
+)
+WALL = 1.5
+POSE = np.eye(4)
+POSE[:3, :3] = euler_matrix(np.array([0.3, -0.2, 0.1]))
+POSE[:3, 3] = 0.02, -0.01, 0.03
+K = np.array([[200.0, 0.0, 163.0], [0.0, 204.0, 116.0], [0.0, 0.0, 1.0]])
+WIDE = np.array([[110.0, 0.0, 161.5], [0.0, 112.0, 118.0], [0.0, 0.0, 1.0]])  # corners see past 90 degrees
+CAMERAS = {
+    "brown": Camera("brown", (320, 240), K, POSE, Lens("brown", (-0.30, 0.11, -0.001, 0.0015, -0.02))),
+    "pincushion": Camera("pincushion", (320, 240), K, POSE, Lens("brown", (0.2, 0.05, 0.0, 0.0, 0.0))),
+    "fisheye": Camera("fisheye", (320, 240), WIDE, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))),
+    "narrow fisheye": Camera(
+        "narrow fisheye", (320, 240), K, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))
+    ),
+}
+
+
+def cast(camera: Camera) -> dict[str, np.ndarray]:
+    """Depth, normals, ids and colors of a camera's pixels, without any of what is tested."""
+    rays = camera.rays()
+    known = np.isfinite(rays).all(axis=-1)
+    rotation, origin = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
+    world = np.where(known[..., None], rays, 1.0) @ rotation.T
+    range_ = np.full(known.shape, np.inf)
+    normals, ids = np.zeros((*known.shape, 3)), np.zeros(known.shape, np.uint8)
+    for axis in range(3):  # the inside of a box
+        with np.errstate(divide="ignore"):
+            away = (np.sign(world[..., axis]) * WALL - origin[axis]) / world[..., axis]
+        first = (away > 0) & (away < range_)
+        range_[first], ids[first] = away[first], 10 + axis
+        normals[first] = 0.0
+        normals[first, axis] = -np.sign(world[..., axis])[first]
+    for number, (center, radius) in enumerate(SPHERES):
+        offset = origin - center
+        along = world @ offset
+        root = along**2 - offset @ offset + radius**2
+        away = -along - np.sqrt(np.maximum(root, 0.0))
+        first = (root > 0) & (away > 0) & (away < range_)
+        range_[first], ids[first] = away[first], 1 + number
+        normals[first] = (origin + away[..., None] * world - center)[first] / radius
+    points = origin + range_[..., None] * world
+    checker = 0.5 + 0.4 * np.prod(np.cos(6.0 * points), axis=-1)
+    ahead = range_ * np.where(known, rays[..., 2], 0.0)
+    empty = ~known
+    ids[empty], checker[empty], ahead[empty] = 0, 0.0, 0.0
+    normals[empty] = 0.0
+    return {
+        "depth": np.where(ahead > 0, ahead, 0.0).astype(np.float32),
+        "normals": (normals @ rotation).astype(np.float32),
+        "ids": ids,
+        "rgb": np.rint(255 * np.stack([checker, 1 - checker, checker**2], axis=-1)).astype(np.uint8),
+    }
+
+
+@pytest.fixture(scope="module", params=CAMERAS)
+def scene(request):
+    camera = CAMERAS[request.param]
+    return camera, cast(camera), [cast(face) for face in faces_for(camera)]
+
+
+def test_faces_are_where_the_camera_is_and_as_fine(scene):
+    camera, _, _ = scene
+    rays = camera.rays()
+    world = rays @ camera.T_world_camera[:3, :3].T
+    faces = faces_for(camera)
+    assert len(faces) == (5 if camera.name == "fisheye" else 1)
+    covered = np.zeros(rays.shape[:2], bool)
+    for face in faces:
+        assert face.lens.kind == "pinhole"
+        np.testing.assert_array_equal(face.T_world_camera[:3, 3], POSE[:3, 3])
+        pixels = face.project(world + POSE[:3, 3])
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 1.0) & (pixels <= np.array(face.size) - 1.0)).all(axis=-1)
+        covered |= inside
+        local = world @ face.T_world_camera[:3, :3]
+        owned = inside & (local[..., 2] >= 0.999 * np.abs(local).max(axis=-1)) if len(faces) > 1 else inside
+        for axis in (0, 1):
+            step = np.linalg.norm(np.diff(pixels, axis=axis), axis=-1)
+            mine = owned[1:] & owned[:-1] if axis == 0 else owned[:, 1:] & owned[:, :-1]
+            assert step[mine].min() >= 0.99  # no step of the lens's is less than a pixel of the face
+    assert covered[np.isfinite(rays).all(axis=-1)].all()
+
+
+def test_ids_are_those_of_rays(scene):
+    camera, truth, faces = scene
+    ids = warp(camera, [face["ids"] for face in faces], "nearest")
+    assert ids.dtype == np.uint8
+    assert (ids != truth["ids"]).mean() < 0.01  # silhouettes, by less than a pixel
+    inside = np.ones_like(ids, bool)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            inside &= np.roll(truth["ids"], (down, right), axis=(0, 1)) == truth["ids"]
+    inside[[0, -1]] = inside[:, [0, -1]] = False
+    assert (ids == truth["ids"])[inside].all()
+
+
+def test_colors_are_those_of_rays(scene):
+    camera, truth, faces = scene
+    rgb = warp(camera, [face["rgb"] for face in faces], "linear")
+    error = np.abs(rgb.astype(int) - truth["rgb"].astype(int)).max(axis=-1)
+    assert np.median(error) <= 1 and (error > 4).mean() < 0.02  # edges
+
+
+def test_depth_is_along_the_cameras_own_axis(scene):
+    camera, truth, faces = scene
+    depth = warp_depth(camera, [face["depth"] for face in faces])
+    assert depth.dtype == np.float32
+    both = (depth > 0) & (truth["depth"] > 0)
+    assert (both | ((depth == 0) & (truth["depth"] < 2e-3))).mean() > 0.998
+    error = np.abs(depth - truth["depth"])[both]
+    assert np.median(error) < 2e-5 and (error > 5e-3).mean() < 0.01
+    # No value is made up between a sphere and what is behind it.
+    close = np.min([np.abs(depth - np.roll(truth["depth"], move, axis=(0, 1))) for move in
+                    ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0))], axis=0)  # fmt: skip
+    assert (close[both] < 0.02).mean() > 0.999
+
+
+def test_normals_are_in_the_cameras_axes(scene):
+    camera, truth, faces = scene
+    normals = warp_normals(camera, [face["normals"] for face in faces])
+    seen = (np.abs(normals).sum(axis=-1) > 0) & (np.abs(truth["normals"]).sum(axis=-1) > 0)
+    np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=-1), 1.0, atol=1e-5)
+    cosine = (normals * truth["normals"]).sum(axis=-1)[seen]
+    assert np.quantile(cosine, 0.02) > 0.99 and np.median(cosine) > 0.9999
+
+
+def test_a_pinhole_is_its_own_face():
+    camera = preset("vga")
+    (face,) = faces_for(camera)
+    assert face is camera
+    picture = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    assert (warp(camera, [picture], "linear") == picture).all()
+    depth = picture[..., 0].astype(np.float32)
+    assert (warp_depth(camera, [depth]) == depth).all()
+
+
+def test_places_that_no_ray_meets_stay_empty():
+    folds = Camera("folds", (320, 240), K, lens=Lens("brown", (-0.45, 0.0, 0.0, 0.0, 0.0)))
+    faces = faces_for(folds)
+    white = [np.full(face.size[::-1], 255, np.uint8) for face in faces]
+    picture = warp(folds, white, "nearest")
+    known = np.isfinite(folds.rays()).all(axis=-1)
+    assert 0.05 < (~known).mean() < 0.6
+    assert (picture[known] == 255).all() and (picture[~known] == 0).all()
+
+
+def test_a_moved_camera_shares_its_lookups(monkeypatch):
+    import render.painting.rasterizer
+
+    camera = CAMERAS["fisheye"]
+    faces_for(camera)
+    monkeypatch.setattr(
+        render.painting.rasterizer, "_face", None
+    )  # were anything planned anew, this would fail
+    moved = camera.at(np.eye(4))
+    np.testing.assert_array_equal(faces_for(moved)[0].T_world_camera, np.eye(4))
+
+
+def test_mistakes_are_told():
+    camera = CAMERAS["brown"]
+    with pytest.raises(ArgumentError, match="expected camera 'brown' faces'"):
+        warp(camera, [np.zeros((10, 10), np.uint8)], "nearest")
+    narrow = np.diag([5000.0, 5000.0, 1.0])
+    narrow[:2, 2] = 1e6
+    blind = Camera("blind", (320, 240), narrow, lens=Lens("brown", (-0.45, 0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(ArgumentError, match="its lens sees nothing"):
+        faces_for(blind)

@@ -1,11 +1,19 @@
-"""What textures and display curves give surface points, against numpy."""
-
 from __future__ import annotations
 
 import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import binary_dilation
 
+from handsim.space.camera import pinhole
 from render.painting import shading
-from render.painting.shading import BUMP, COLOR, ROUGH, SPOT, TO_DISPLAY, TO_LINEAR
+from render.painting.figures import Drawn, Material
+from render.painting.rasterizer import Triangles
+from render.painting.shading import BUMP, COLOR, ROUGH, SPOT, TO_DISPLAY, TO_LINEAR, light_behind
+from render.scenery.backgrounds import SHARE, Backdrop, sample_backdrop
+from render.scenery.lights import Lamp, Lighting
 
 
 def test_texels_are_mixed_from_the_four_around_a_point(rng):
@@ -36,3 +44,94 @@ def test_display_values_follow_the_curve_and_are_clipped():
     shown = light.copy()
     shading.display(shown, tint, TO_DISPLAY)
     np.testing.assert_allclose(shown, np.clip(0.8 * light, 0.0, 1.0) ** (1.0 / shading.GAMMA), atol=1e-4)
+
+
+CAMERA = pinhole("small", (160, 120), 150.0)
+CENTER, RADIUS = (0.0, 0.0, 1.0), 0.15
+SHARP = 1e-3
+
+
+def ball(place: tuple[float, float, float] = CENTER) -> tuple[trimesh.Trimesh, Drawn]:
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(place)
+    ids = np.ones(len(mesh.faces), dtype=np.uint8)
+    triangles = Triangles(np.array(mesh.vertices), np.array(mesh.faces), mesh.vertex_normals, ids, ids, ids)
+    colors = np.ones((len(mesh.vertices), 4), dtype=np.float32)
+    return mesh, Drawn(triangles, colors, None, lambda: Material(np.full(3, 0.5), 1.0))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(-0.6, 0.6),
+    st.floats(-0.6, 0.6),
+    st.floats(-0.4, 0.4),
+    st.floats(-0.4, 0.4),
+    st.floats(0.0, 0.3),
+)
+def test_it_falls_where_the_lamp_is_hidden(
+    aside: float, above: float, right: float, down: float, gap: float
+) -> None:
+    mesh, drawn = ball()
+    towards = np.array([aside, above, -1.0])
+    lighting = Lighting((Lamp((aside, above, -1.0), 1.0),), (0.0, 0.0, 0.0))
+    light = light_behind(CAMERA, [drawn], lighting, Backdrop(gap, (right, down), SHARP))
+    assert light is not None
+    normal = np.array([right, down, -1.0]) / np.linalg.norm([right, down, 1.0])
+    level = gap - (np.array(mesh.vertices) @ normal).min()  # of the plane: points @ normal = -level
+    rays = CAMERA.rays().reshape(-1, 3)
+    places = rays * (-level / (rays @ normal))[:, None]
+    to_center = CENTER - places
+    off = np.linalg.norm(np.cross(to_center, towards / np.linalg.norm(towards)), axis=1)
+    hidden = (off < RADIUS).reshape(light.shape)
+    around = binary_dilation(hidden, iterations=9) & ~hidden
+    inside = ~binary_dilation(~hidden, iterations=9)
+    outside = ~hidden & ~around
+    assert (light[outside] > 0.98).all()
+    assert (light[inside] < 0.2).all()
+
+
+def test_it_is_as_dark_as_the_share_of_the_lamp() -> None:
+    _, drawn = ball()
+    key, fill = Lamp((0.0, 0.0, -2.0), 0.6), Lamp((0.0, -1.0, -1.0), 0.4)
+    for lamps, ambient, share in (
+        ((key,), 0.0, 1.0),
+        ((key,), 0.6, 0.5),
+        ((key, fill), 0.0, 0.6 / (0.6 + 0.4 / np.sqrt(2.0))),
+        ((key, Lamp((0.0, 0.0, 1.0), 5.0)), 0.0, 1.0),
+    ):
+        light = light_behind(CAMERA, [drawn], Lighting(lamps, (ambient,) * 3), Backdrop(0.0, softness=SHARP))
+        assert light is not None
+        assert light.min() == pytest.approx(1.0 - 0.9 * share, abs=1e-5)
+
+
+def test_wide_lamps_and_wide_gaps_soften_it() -> None:
+    _, drawn = ball()
+    lighting = Lighting((Lamp((0.3, 0.0, -1.0), 1.0),), (0.2, 0.2, 0.2))
+
+    def steepest(gap: float, softness: float) -> float:
+        light = light_behind(CAMERA, [drawn], lighting, Backdrop(gap, softness=softness))
+        assert light is not None
+        return float(np.abs(np.diff(light, axis=1)).max())
+
+    assert steepest(0.3, 0.05) > 1.5 * steepest(0.3, 0.2)
+    assert steepest(0.05, 0.2) > 1.5 * steepest(0.6, 0.2)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
+def test_lamps_behind_the_backdrop_cast_none(direction: tuple[float, float, float]) -> None:
+    _, drawn = ball()
+    assert light_behind(CAMERA, [drawn], Lighting((Lamp(direction, 1.0),), (0.1,) * 3), Backdrop(0.1)) is None
+
+
+def test_without_hands_or_lamps_there_is_none() -> None:
+    _, drawn = ball()
+    _, far = ball((3.0, 0.0, 1.0))
+    lit = Lighting((Lamp((0.0, 0.0, -1.0), 1.0),), (0.1, 0.1, 0.1))
+    assert light_behind(CAMERA, [], lit, Backdrop(0.1)) is None
+    assert light_behind(CAMERA, [far], lit, Backdrop(0.1)) is None
+    assert light_behind(CAMERA, [drawn], Lighting((), (0.1, 0.1, 0.1)), Backdrop(0.1)) is None
+
+
+def test_backdrops_come_as_often_as_they_should(rng: np.random.Generator) -> None:
+    drawn = [sample_backdrop(rng=rng) for _ in range(500)]
+    assert sum(one is not None for one in drawn) / 500 == pytest.approx(SHARE, abs=0.08)
+    assert all(0.0 < one.gap < 0.5 for one in drawn if one is not None)

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
-from render.skin.atlas import skin_atlas
-from render.skin.forearm import Forearm, sample_forearm
-from render.skin.look import ALL_TONES, TONES, SkinLook, sample_skin_look
-from render.skin.texels import skin_texels
-from render.skin.texture import SkinTexture, skin_texture
+from render.skin.look import ALL_TONES, TONES, Forearm, SkinLook, sample_forearm, sample_skin_look
+from render.skin.mesh import skin_atlas
+from render.skin.texture import SkinTexture, skin_texels, skin_texture
 
 
 def lab_of(texture: SkinTexture, texels: np.ndarray) -> np.ndarray:

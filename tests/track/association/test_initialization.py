@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.cluster.hierarchy import fclusterdata
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import cdist
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from track.association.hand_state import HandState
-from track.association.initialization import MOST_POINTS, HandInitializer
+from track.association.initialization import (
+    MOST_POINTS,
+    HandInitializer,
+    distances_to_nearest,
+    linked_groups,
+    longest_links,
+)
 from train import load_labeler
 
 SIDES: tuple[Side, Side] = ("right", "left")
@@ -138,3 +147,28 @@ def test_a_search_goes_on_from_call_to_call_and_no_call_labels_many_clouds(state
         assert initializer.initialize(points, (0, 1)) == []
         assert initializer.is_searching((0, 1)) == (call < 3) and not initializer.is_searching((0,))
     assert sizes[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.1, 0.3])
+def test_groups_are_those_of_single_linkage(rng, distance):
+    points = rng.uniform(0.0, 1.0, size=(60, 3))
+    number = fclusterdata(points, distance, criterion="distance", method="single")
+    expected = {frozenset(np.flatnonzero(number == one)) for one in np.unique(number)}
+    groups = linked_groups(points, distance)
+    assert {frozenset(group) for group in groups} == expected
+    assert [len(group) for group in groups] == sorted(map(len, expected), reverse=True)
+
+
+def test_no_points_are_no_groups():
+    assert linked_groups(np.empty((0, 3)), 0.1) == []
+
+
+def test_the_longest_link_is_that_of_the_spanning_tree(rng):
+    frames = rng.uniform(0.0, 0.2, size=(20, 13, 3))
+    expected = [minimum_spanning_tree(cdist(points, points)).max() for points in frames]
+    np.testing.assert_allclose(longest_links(frames), expected)
+
+
+def test_distances_to_the_nearest_of_others(rng):
+    points, others = rng.normal(size=(7, 3)), rng.normal(size=(4, 3))
+    np.testing.assert_allclose(distances_to_nearest(points, others), cdist(points, others).min(axis=1))

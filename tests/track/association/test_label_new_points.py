@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
+from track.association.digit_hypotheses import IMPOSSIBLE
 from track.association.frame_state import Numbering
 from track.association.hand_state import HandState, HandTrack
 from track.association.label_consistency import fit_labels
-from track.association.label_new_points import digit_table, label_new_points
+from track.association.label_new_points import (
+    MAX_CANDIDATES,
+    MarkerTable,
+    best_combination,
+    digit_table,
+    find_candidates,
+    label_new_points,
+)
 
 RATE, SETTLED = 120.0, 12.0
 PALM, KNUCKLE, MIDDLE, TIP, OTHER_TIP = 17, 4, 5, 6, 9
@@ -120,3 +132,113 @@ def test_a_hand_without_a_pose_gets_no_labels(followed, frame_of):
     after = label_new_points(frame, [HandTrack(0, right, prediction, estimate)], table)
     np.testing.assert_array_equal(after.labels, [*range(19), *[-1] * 19])
     assert label_new_points(frame, [], table) is frame
+
+
+# Two digits of three markers each and a palm of one; the digits lie 30 mm apart.
+PLACES = np.array(
+    [*[[0.03 * n, 0.0, 0.0] for n in range(3)], *[[0.03 * n, 0.03, 0.0] for n in range(3)], [-0.1, 0, 0]]
+)
+PARTS = np.array([0, 0, 0, 1, 1, 1, -1])
+
+
+def candidates_of(points, assigned, evidence=12.0):
+    evidences = np.broadcast_to(np.asarray(evidence, dtype=float), (len(points),)).copy()
+    return find_candidates(
+        np.asarray(points, dtype=float),
+        evidences,
+        MarkerTable(PLACES, PARTS, np.array(assigned)),
+        2,
+    )
+
+
+def test_a_whole_hand_has_nothing_to_decide():
+    assert candidates_of(PLACES, range(7)).counts.tolist() == [0, 0]
+
+
+def test_a_stray_is_tried_near_a_marker_that_is_seen_and_farther_around_one_that_is_not():
+    stray = [0.06, -0.02, 0.0]
+    assert candidates_of([*PLACES, stray], [*range(7), -1]).counts.tolist() == [0, 0]
+    assert candidates_of([*PLACES, [0.06, -0.01, 0.0]], [*range(7), -1]).counts.tolist() == [4, 0]
+    without_tip = [0, 1, 3, 4, 5, 6]
+    found = candidates_of([*PLACES[without_tip], stray], [*without_tip, -1])
+    assert found.counts.tolist() == [3, 0]
+    assert found.candidates[0, :3].tolist() == [0, 1, 6] and found.labeled[0] == 2
+
+
+def test_unsettled_labels_of_a_neighbor_are_contested_and_settled_ones_are_not():
+    without = [0, 1, 3, 4, 5, 6]
+    points = PLACES[without].copy()
+    settled = candidates_of(points, without)
+    assert settled.counts.tolist() == [0, 0]
+    unsettled = candidates_of(points, without, [12.0, 12.0, 12.0, 12.0, 0.0, 12.0])  # the neighbor's tip
+    assert unsettled.counts.tolist() == [3, 3]
+    assert 4 in unsettled.candidates[0, :3]
+
+
+def test_the_nearest_are_tried_first_and_not_too_many():
+    strays = [[0.06, -0.001 * n, 0.002] for n in range(9, 0, -1)]
+    found = candidates_of([*PLACES[:2], *PLACES[3:], *strays], [0, 1, 3, 4, 5, 6, *[-1] * 9])
+    assert found.counts[0] == MAX_CANDIDATES
+    assert found.candidates[0].tolist() == [0, 1, 14, 13, 12, 11, 10]
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Scores, sets, counts and bans of up to five digits with up to ten candidate points."""
+    digits, points = draw(st.integers(1, 5)), draw(st.integers(1, 10))
+    counts = np.array(draw(st.lists(st.integers(1, 6), min_size=digits, max_size=digits)))
+    scores, sets = (
+        np.full((digits, counts.max()), -IMPOSSIBLE),
+        np.zeros((digits, counts.max()), dtype=np.int64),
+    )
+    for digit, count in enumerate(counts.tolist()):
+        row = draw(st.lists(st.integers(-20, 40), min_size=count, max_size=count))
+        scores[digit, :count] = sorted(row, reverse=True)
+        sets[digit, : count - 1] = draw(
+            st.lists(st.integers(0, 2**points - 1), min_size=count - 1, max_size=count - 1)
+        )
+    banned = np.array([draw(st.integers(-1, count - 1)) for count in counts.tolist()])
+    return scores, sets, counts, banned
+
+
+def best_of_all(scores: np.ndarray, sets: np.ndarray, counts: np.ndarray, banned: np.ndarray) -> float | None:
+    """The most that any choice reaches that uses no point twice and nothing banned."""
+    totals = []
+    for rows in itertools.product(*map(range, counts)):
+        used = [int(sets[digit, row]) for digit, row in enumerate(rows)]
+        apart = all((one & two) == 0 for one, two in itertools.combinations(used, 2))
+        if apart and not (np.array(rows) == banned).any():
+            totals.append(float(sum(scores[digit, row] for digit, row in enumerate(rows))))
+    return max(totals, default=None)
+
+
+@settings(deadline=None, max_examples=300)
+@given(tables())
+def test_no_other_choice_is_better(table):
+    scores, sets, counts, banned = table
+    best = np.full(len(counts), -7)
+    total, wanted = best_combination(scores, sets, counts, banned, best), best_of_all(*table)
+    if wanted is None:
+        assert total <= -IMPOSSIBLE / 2
+        return
+    assert total == pytest.approx(wanted)
+    chosen = np.arange(len(counts)), best
+    assert ((best >= 0) & (best < counts) & (best != banned)).all()
+    assert scores[chosen].sum() == pytest.approx(total)
+    assert all(one & two == 0 for one, two in itertools.combinations(sets[chosen].tolist(), 2))
+
+
+def test_without_a_conflict_everybody_has_the_best():
+    scores, sets = np.tile([9.0, 5.0, 0.0], (5, 1)), np.array([[1 << k, 1 << k, 0] for k in range(5)])
+    best = np.zeros(5, dtype=np.int64)
+    assert best_combination(scores, sets, np.full(5, 3), np.full(5, -1), best) == 45.0
+    assert best.tolist() == [0] * 5
+
+
+def test_a_point_goes_to_whom_it_is_worth_more():
+    scores, sets = np.array([[9.0, 8.0, 0.0], [9.0, 1.0, 0.0]]), np.array([[1, 2, 0], [1, 4, 0]])
+    best = np.zeros(2, dtype=np.int64)
+    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, -1]), best) == 17.0
+    assert best.tolist() == [1, 0]
+    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, 0]), best) == 10.0
+    assert best.tolist() == [0, 1]

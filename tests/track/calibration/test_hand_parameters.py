@@ -9,19 +9,28 @@ import numpy as np
 from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
+from handsim.hand.shape import named_shape, sample_shape
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
+    SkinPatch,
+    attachment_at,
+    build_skin,
+    displace_markers,
+    nearest_coordinates,
+    project_onto_skin,
     shape_at,
     shape_jacobian,
     shape_precision,
     skeleton_jacobian,
+    skin_mesh,
+    skin_points,
+    skin_weight_jacobian,
+    skin_weights,
     skinned_shape_jacobian,
     skinning_terms,
 )
-from track.calibration.skin_coordinates import nearest_coordinates, skin_weights
 
 
 def test_no_change_is_the_first_hand(rng):
@@ -82,3 +91,74 @@ def test_jacobian_of_a_linear_function(rng):
     )
     np.testing.assert_allclose(jacobian[:, 17:32], np.eye(15), atol=1e-9)
     np.testing.assert_allclose(jacobian[::3, 0], shape.knuckles[:, 0], rtol=1e-4)
+
+
+def points_of(coordinates, shape):
+    return skin_points(coordinates, SkinPatch(coordinates.faces).corners(HandModel(shape).surface.vertices))
+
+
+def dense_weights(worn):
+    weights = np.zeros((len(worn.points), 16))
+    np.add.at(weights, (np.arange(len(weights))[:, None], worn.bone_indices), worn.bone_weights)
+    return weights
+
+
+def test_neighbors_share_an_edge():
+    mesh = skin_mesh()
+    for corner in range(3):
+        other = mesh.faces[mesh.adjacent[:, corner]]
+        same = (other[:, :, None] == mesh.faces[:, None, :]).any(axis=1)
+        assert (same.sum(axis=1) == 2).all()
+        assert not same[:, corner].any()
+
+
+def test_a_glove_is_found_where_it_sits(rng):
+    shape = sample_shape(rng=rng)
+    worn = attach_markers(load_layout("dense19"), HandModel(shape))
+    coordinates = nearest_coordinates(worn.points, shape)
+    points, normals = points_of(coordinates, shape)
+    np.testing.assert_allclose(points, worn.points, atol=1e-9)
+    assert (normals * worn.normals).sum(axis=1).min() > 0.99
+    np.testing.assert_allclose(coordinates.heights, worn.layout.radius, atol=3e-4)
+    again = attachment_at(worn.layout, coordinates, shape)
+    np.testing.assert_allclose(dense_weights(again), dense_weights(worn), atol=0.03)
+
+
+def test_stalks_are_heights_above_the_skin(rng):
+    shape, layout = sample_shape(rng=rng), load_layout("dense19")
+    stalks = [dataclasses.replace(marker, height=rng.uniform(0.0, 0.012)) for marker in layout.markers]
+    worn = attach_markers(dataclasses.replace(layout, markers=tuple(stalks)), HandModel(shape))
+    coordinates = nearest_coordinates(worn.points, shape)
+    np.testing.assert_allclose(points_of(coordinates, shape)[0], worn.points, atol=1e-9)
+    np.testing.assert_allclose(coordinates.heights, worn.layout.heights, atol=1e-3)
+    moved = displace_markers(worn, shape, 0.0, rng=rng)
+    np.testing.assert_allclose(moved.points, worn.points, atol=1e-3)
+
+
+def test_slides_end_under_their_points(rng):
+    shape = sample_shape(rng=rng)
+    worn = attach_markers(load_layout("dense19"), HandModel(shape))
+    moved = displace_markers(worn, shape, 0.005, rng=rng)
+    coordinates = project_onto_skin(nearest_coordinates(worn.points, shape), moved.points, build_skin(shape))
+    np.testing.assert_allclose(points_of(coordinates, shape)[0], moved.points, atol=1e-9)
+    np.testing.assert_allclose(coordinates.heights, worn.layout.radius, atol=1e-9)
+    distance = np.linalg.norm(moved.points - worn.points, axis=1)
+    assert 0.0035 < distance.min() <= distance.max() < 0.0055
+
+
+def test_points_go_with_the_skin():
+    small, large = named_shape("XS"), named_shape("XL")
+    worn = attach_markers(load_layout("dense19"), HandModel(small))
+    coordinates = nearest_coordinates(worn.points, small)
+    there = attach_markers(load_layout("dense19"), HandModel(large)).points
+    assert np.linalg.norm(points_of(coordinates, large)[0] - there, axis=1).max() < 0.003
+
+
+def test_weights_change_as_their_jacobian_say(rng):
+    shape = sample_shape(rng=rng)
+    coordinates = nearest_coordinates(attach_markers(load_layout("dense19"), HandModel(shape)).points, shape)
+    jacobian = skin_weight_jacobian(coordinates, build_skin(shape).corners(coordinates.faces))
+    points, step = points_of(coordinates, shape)[0], 1e-7
+    for axis in np.eye(3):
+        there = skin_weights(project_onto_skin(coordinates, points + step * axis, build_skin(shape)))
+        np.testing.assert_allclose((there - skin_weights(coordinates)) / step, jacobian @ axis, atol=0.1)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from track.glove_advice.layout_score import score_layout
 from track.glove_advice.observed_hands import observe_poses
-from train.any_layout.layout_labeler import LayoutLabeler
+from train.labelers.layout_labeler import LayoutLabeler
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 from gloves.layout import load_layout
 from track.glove_advice.score_page import trial_rows
 from track.glove_advice.trials import METHODS, Trial, _rights, try_take, verdict
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track.bodies.rigid_body import BodyTracker, RigidTemplate
+from track.rigid_body import BodyTracker, RigidTemplate
 from track.streams import natnet, natnet_server
 from track.streams import point_stream as streaming
 from track.streams.live_stream import LiveStream

@@ -8,7 +8,7 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from track.tracker import Tracker
-from train.glove_labeler import load_labeler
+from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 
 

@@ -14,11 +14,11 @@ import torch
 
 from handsim.errors import ArgumentError, HandSimError
 from handsim.files.signals import Stopped
-from train.config import TrainConfig
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import start_fabric
 from train.devices.local_processes import in_local_processes
 from train.devices.world import world_of
+from train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
@@ -40,7 +40,7 @@ if __name__ == "__main__":
 
 
 def sums(*, progress, told):
-    fabric = start_fabric(TrainConfig(), Path("unused"))
+    fabric = start_fabric(TrainSettings(), Path("unused"))
     total = float(fabric.all_reduce(torch.tensor(fabric.global_rank + 1.0), reduce_op="sum"))
     progress(1, 2, total)
     told(f"step of {total:.0f}")
@@ -59,7 +59,7 @@ def listening():
 
 
 def fails(*, progress, told):
-    ranks = Agreement(start_fabric(TrainConfig(), Path("unused")))
+    ranks = Agreement(start_fabric(TrainSettings(), Path("unused")))
     mine = world_of().rank
 
     def attempt():
@@ -72,7 +72,7 @@ def fails(*, progress, told):
 
 
 def dies(*, progress, told):
-    fabric = start_fabric(TrainConfig(), Path("unused"))
+    fabric = start_fabric(TrainSettings(), Path("unused"))
     if world_of().rank == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     with Agreement(fabric).losses_told():
@@ -80,7 +80,7 @@ def dies(*, progress, told):
 
 
 def waits_for_a_signal(*, progress, told):
-    ranks = Agreement(start_fabric(TrainConfig(), Path("unused")))
+    ranks = Agreement(start_fabric(TrainSettings(), Path("unused")))
     with ranks.signals_noted():
         ranks.agree(lambda: None)
         if world_of().rank == 1:

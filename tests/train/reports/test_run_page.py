@@ -13,24 +13,27 @@ import pytest
 import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
-from handsim.hand.topology import BONES
+from handsim.hand.shape import BONES
 from tests.renames import fails_at
-from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
-from train.glove_labeler import load_labeler
-from train.history import History
-from train.labeler_evaluation import Report
-from train.labelers.storage import CARD, WEIGHTS
-from train.loop import CHECKPOINT, train_labeler
-from train.metrics import error_without, expected_calibration_error, macro_f1, percent
+from train.evaluation import (
+    History,
+    LabelingReport,
+    error_without,
+    expected_calibration_error,
+    macro_f1,
+    percent,
+)
+from train.labelers.storage import CARD, WEIGHTS, load_labeler
+from train.loop import CHECKPOINT, TrainingState, train_labeler
 from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
+from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings
-from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
-SMALL = TrainConfig(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
+SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
 
 
 def pictures(page: Path) -> list[str]:
@@ -152,7 +155,7 @@ def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path):
     assert len(pictures(tmp_path / "run" / PAGE)) == 4
 
 
-def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> tuple[dict, Report]:
+def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> tuple[dict, LabelingReport]:
     """A card and a report of a glove with names that pages and formulas take for their own."""
     places = []
     for number in range(count):
@@ -173,11 +176,11 @@ def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> t
     }  # fmt: skip
     card = {
         "dataset": {"layout": dataclasses.asdict(layout), "num_frames": 1000},
-        "train": dataclasses.asdict(TrainConfig(labeler="cnn", average=0.0)),
+        "train": dataclasses.asdict(TrainSettings(labeler="cnn", average=0.0)),
         "held_out_simulated": {"clean": figures, "occlude 1, ghosts 2": figures},
     }
     accuracy = confusion.diagonal()[:-1] / confusion[:-1].sum(axis=1)
-    return card, Report(figures, accuracy, 500, confusion, confidences, right)
+    return card, LabelingReport(figures, accuracy, 500, confusion, confidences, right)
 
 
 @pytest.mark.parametrize("count", [FEWEST_MARKERS, MOST_MARKERS])

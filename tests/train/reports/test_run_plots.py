@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from train.history import History
-from train.metrics import reliability
+from train.evaluation import History, reliability
 from train.reports.plot_style import picture
 from train.reports.run_plots import (
     LONGEST_NAME,

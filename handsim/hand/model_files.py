@@ -1,0 +1,302 @@
+"""A hand as URDF and as an OpenSim model, .osim.
+
+URDF has a link per bone, revolute joints, and capsules as cylinders with a sphere at each end. A bone with
+two joints has a link between them, `index_proximal_abduction`, which takes a hundredth of the bone's mass and
+inertia, because simulators refuse links without any. The root link is the palm, which a simulator leaves free
+or fixes.
+
+OpenSim's model has a body per bone, custom joints, capsules and markers. Its coordinates are those of the
+`.mot` that `handsim.motion_files` writes: `right_wrist_tx` to `tz` [m], `right_wrist_rx` to `rz` (rotations
+about x, y and z of the body, in this order), then `right_` and the name of each joint. A bone with two joints
+is moved by one custom joint about both axes, the first one first. The ground has the axes of the take, z up.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from handsim.hand.model import KEYPOINT_BONES, KEYPOINT_NAMES, HandModel, Site, hand_keypoints, join_qpos
+from handsim.hand.shape import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.space.transforms import body_fixed_angles, euler_angles, quaternion_matrix
+
+_SMALL_SHARE: Final = 0.01
+_MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
+_MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
+_COLOR: Final = "0.85 0.65 0.55 1"
+
+
+def hand_urdf(model: HandModel) -> str:
+    """The text of a .urdf file: meters, radians, kilograms."""
+    root = ET.Element("robot", name="hand")
+    ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
+    for number, bone in enumerate(BONES):
+        hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == number]
+        links = [*(_middle_name(index) for index in hinges[:-1]), bone.name]
+        shares = [_SMALL_SHARE] * (len(links) - 1) + [1.0 - _SMALL_SHARE * (len(links) - 1)]
+        for link, share in zip(links, shares, strict=True):
+            _add_link(root, model, number, link, share)
+        for step, index in enumerate(hinges):
+            parent = BONE_NAMES[bone.parent] if step == 0 else links[step - 1]
+            _add_joint(root, model, index, parent, links[step], at_rest=step == 0)
+    ET.indent(root)
+    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _middle_name(joint: int) -> str:
+    """The link between a bone's first joint and its second."""
+    kind = JOINTS[joint].name.rpartition("_")[2]
+    return f"{BONE_NAMES[JOINTS[joint].bone]}_{kind}"
+
+
+def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: float) -> None:
+    """A link with a share of its bone's mass; the shapes belong to the bone's own link."""
+    link = ET.SubElement(root, "link", name=name)
+    compiled, body = model.mj_model, bone + 1  # the world is body 0
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=vector_text(compiled.body_ipos[body]), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=number_text(share * compiled.body_mass[body]))
+    axes = quaternion_matrix(compiled.body_iquat[body])
+    moments = share * axes @ np.diag(compiled.body_inertia[body]) @ axes.T
+    entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    ET.SubElement(inertial, "inertia", {key: number_text(moments[at]) for key, at in entries.items()})
+    if name != BONE_NAMES[bone]:
+        return
+    capsules = model.capsules
+    for index in np.flatnonzero(capsules.bones == bone).tolist():
+        start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
+        for kind in ("visual", "collision"):
+            _add_capsule(link, kind, start, end, radius)
+
+
+def _add_capsule(
+    link: ET.Element, kind: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
+) -> None:
+    """A cylinder and two spheres, since URDF has no capsule."""
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / length
+    pitch, yaw = np.arccos(along[2]), np.arctan2(along[1], along[0])
+    shapes = (
+        ("cylinder", {"radius": number_text(radius), "length": number_text(length)}, 0.5 * (start + end)),
+        ("sphere", {"radius": number_text(radius)}, start),
+        ("sphere", {"radius": number_text(radius)}, end),
+    )
+    for shape, sizes, center in shapes:
+        part = ET.SubElement(link, kind)
+        turn = (
+            f"0 {number_text(pitch)} {number_text(yaw)}" if shape == "cylinder" else "0 0 0"
+        )  # z along the axis
+        ET.SubElement(part, "origin", xyz=vector_text(center), rpy=turn)
+        ET.SubElement(ET.SubElement(part, "geometry"), shape, sizes)
+        if kind == "visual":
+            ET.SubElement(part, "material", name="skin")
+
+
+def _add_joint(
+    root: ET.Element, model: HandModel, joint: int, parent: str, child: str, *, at_rest: bool
+) -> None:
+    """A hinge; the first of a bone stands at the bone's place at rest, the next one in the same place."""
+    skeleton, bone = model.skeleton, JOINTS[joint].bone
+    place, turn = np.zeros(3), np.zeros(3)
+    if at_rest:
+        place, turn = skeleton.offsets[bone], euler_angles(skeleton.rotations[bone][None])[0, ::-1]
+    element = ET.SubElement(root, "joint", name=JOINTS[joint].name, type="revolute")
+    ET.SubElement(element, "parent", link=parent)
+    ET.SubElement(element, "child", link=child)
+    ET.SubElement(element, "origin", xyz=vector_text(place), rpy=vector_text(turn))
+    ET.SubElement(element, "axis", xyz=vector_text(skeleton.axes[joint]))
+    low, high = skeleton.ranges[joint]
+    limits = {"lower": low, "upper": high, "effort": _MOST_TORQUE, "velocity": _MOST_SPEED}
+    ET.SubElement(element, "limit", {key: number_text(value) for key, value in limits.items()})
+    ET.SubElement(element, "dynamics", damping="0.01", friction="0")
+
+
+def vector_text(vector: Float[np.ndarray, "K"]) -> str:
+    """Numbers with blanks between them."""
+    return " ".join(number_text(value) for value in vector)
+
+
+def number_text(value: float) -> str:
+    """A number with twelve digits; zero has no sign."""
+    return f"{float(value) + 0.0:.12g}"
+
+
+_VERSION: Final = "40000"  # of the document: OpenSim 4.0 and later read it
+_GRAVITY: Final = "0 0 -9.80665"
+_OSIM_COLOR: Final = "0.85 0.65 0.55"
+_FARTHEST: Final = 5.0  # [m] of the wrist from the origin
+_MOST_TURN: Final = 2.0 * np.pi  # [rad] of the wrist
+_PARALLEL: Final = 0.5  # of two axes: the cosine of the angle between them
+
+
+def coordinate_names(side: Side) -> tuple[str, ...]:
+    """Names of a hand's coordinates, in the order of its 26 degrees of freedom."""
+    wrist = (f"wrist_{kind}{axis}" for kind in "tr" for axis in "xyz")
+    return tuple(f"{side}_{name}" for name in (*wrist, *JOINT_NAMES))
+
+
+def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
+    """The text of a .osim file: meters, radians, kilograms.
+
+    Args:
+        markers: Of its glove, each fixed to one bone. They are named as `handsim label` names them in a file
+            of one hand, `ThumbTip`, and again as in one of two, `right:ThumbTip`. The joints and tips
+            follow, as `handsim export` names them in a .trc, `right_index_tip`.
+    """
+    side = model.shape.side
+    document = ET.Element("OpenSimDocument", Version=_VERSION)
+    root = ET.SubElement(document, "Model", name=f"{side}_hand")
+    _add(root, "gravity", _GRAVITY)
+    _add(root, "length_units", "meters")
+    _add(root, "force_units", "N")
+    ET.SubElement(root, "Ground", name="ground")
+    bodies, joints, placed = (
+        ET.SubElement(ET.SubElement(root, kind), "objects") for kind in ("BodySet", "JointSet", "MarkerSet")
+    )
+    for bone in range(len(BONES)):
+        _add_body(bodies, model, bone)
+    # The palm turns about its own axes and moves along those of the ground, in which it is free.
+    names = coordinate_names(side)[:6]
+    joint = _add_osim_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
+    _add_motion(joint, [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)])
+    for bone in range(1, len(BONES)):
+        _add_knuckle(joints, model, bone)
+    for site in markers:
+        for name in (site.name, f"{side}:{site.name}"):
+            _add_marker(placed, name, side, site.bone, site.position)
+    for site in _keypoint_sites(model):
+        _add_marker(placed, f"{side}_{site.name}", side, site.bone, site.position)
+    ET.indent(document)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
+
+
+def _keypoint_sites(model: HandModel) -> list[Site]:
+    """Joints and tips, each in the frame of the bone that begins, or ends, there."""
+    at_rest = hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0]
+    bones = np.linalg.inv(model.rest_transforms)[list(KEYPOINT_BONES)]
+    local = np.einsum("kij,kj->ki", bones[:, :3, :3], at_rest) + bones[:, :3, 3]
+    return [
+        Site(name, bone, position, 0.0)
+        for name, bone, position in zip(KEYPOINT_NAMES, KEYPOINT_BONES, local, strict=True)
+    ]
+
+
+def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
+    """A bone with its mass and its capsules."""
+    compiled, number = model.mj_model, bone + 1  # the world is body 0
+    name = f"{model.shape.side}_{BONE_NAMES[bone]}"
+    body = ET.SubElement(bodies, "Body", name=name)
+    axes = quaternion_matrix(compiled.body_iquat[number])
+    moments = axes @ np.diag(compiled.body_inertia[number]) @ axes.T
+    shapes = ET.SubElement(body, "components")
+    capsules = model.capsules
+    for index in np.flatnonzero(capsules.bones == bone).tolist():
+        start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
+        _add_osim_capsule(shapes, f"{name}_{index}", start, end, radius)
+    _add(body, "mass", number_text(compiled.body_mass[number]))
+    _add(body, "mass_center", vector_text(compiled.body_ipos[number]))
+    _add(body, "inertia", vector_text(moments[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
+
+
+def _add_osim_capsule(
+    shapes: ET.Element, name: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
+) -> None:
+    """A cylinder and two spheres, since OpenSim draws no capsule."""
+    from scipy.spatial.transform import Rotation
+
+    along = (end - start) / np.linalg.norm(end - start)
+    turn, _ = Rotation.align_vectors(along[None], [[0.0, 1.0, 0.0]])  # cylinders lie along y
+    half_height = number_text(0.5 * float(np.linalg.norm(end - start)))
+    places = (("middle", 0.5 * (start + end)), ("start", start), ("end", end))
+    for place, center in places:
+        frame = ET.SubElement(shapes, "PhysicalOffsetFrame", name=f"{name}_{place}")
+        kind = "Cylinder" if place == "middle" else "Sphere"
+        shape = ET.SubElement(ET.SubElement(frame, "attached_geometry"), kind, name=f"{name}_{place}_shape")
+        _add(shape, "socket_frame", "..")
+        _add(ET.SubElement(shape, "Appearance"), "color", _OSIM_COLOR)
+        _add(shape, "radius", number_text(radius))
+        if kind == "Cylinder":
+            _add(shape, "half_height", half_height)
+        _add(frame, "socket_parent", "..")
+        _add(frame, "translation", vector_text(center))
+        _add(frame, "orientation", vector_text(body_fixed_angles(turn.as_matrix()[None])[0]))
+
+
+def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
+    """What moves a bone that is no palm: one hinge, or two in turn."""
+    side, skeleton = model.shape.side, model.skeleton
+    hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == bone]
+    names = [f"{side}_{JOINTS[index].name}" for index in hinges]
+    T_parent_bone = np.eye(4)
+    T_parent_bone[:3, :3], T_parent_bone[:3, 3] = skeleton.rotations[bone], skeleton.offsets[bone]
+    parent = f"/bodyset/{side}_{BONE_NAMES[BONES[bone].parent]}"
+    joint = _add_osim_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
+    axes = [skeleton.axes[index] for index in hinges]
+    # A custom joint takes three axes, all of them different, also where fewer turn.
+    axes += [axis for axis in np.eye(3) if all(abs(axis @ one) < _PARALLEL for one in axes)][: 3 - len(axes)]
+    _add_motion(
+        joint,
+        [*zip([*names, "", ""][:3], axes, strict=True), *(("", axis) for axis in np.eye(3))],
+        {name: skeleton.ranges[index] for name, index in zip(names, hinges, strict=True)},
+    )
+
+
+def _add_osim_joint(
+    joints: ET.Element, name: str, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]
+) -> ET.Element:
+    """A custom joint that lets the child lie so in its parent when all its coordinates are zero."""
+    joint = ET.SubElement(joints, "CustomJoint", name=name)
+    _add(joint, "socket_parent_frame", "at_rest")
+    _add(joint, "socket_child_frame", f"/bodyset/{child}")
+    frame = ET.SubElement(ET.SubElement(joint, "frames"), "PhysicalOffsetFrame", name="at_rest")
+    _add(frame, "socket_parent", parent)
+    _add(frame, "translation", vector_text(T_parent_child[:3, 3]))
+    _add(frame, "orientation", vector_text(body_fixed_angles(T_parent_child[None, :3, :3])[0]))
+    return joint
+
+
+def _add_motion(
+    joint: ET.Element,
+    axes: Sequence[tuple[str, Float[np.ndarray, "3"]]],
+    ranges: Mapping[str, Float[np.ndarray, "2"]] = MappingProxyType({}),
+) -> None:
+    """Coordinates of a custom joint: three rotations in turn, then three translations; '' is none.
+
+    Ranges [rad] are stated and not enforced ('clamped'): OpenSim's inverse kinematics takes another optimizer
+    for bounds, which ends degrees away from angles that lie well within them.
+    """
+    coordinates = ET.SubElement(joint, "coordinates")
+    transform = ET.SubElement(joint, "SpatialTransform")
+    for number, (name, axis) in enumerate(axes):
+        kind = f"{'rotation' if number < 3 else 'translation'}{number % 3 + 1}"
+        element = ET.SubElement(transform, "TransformAxis", name=kind)
+        if name:
+            coordinate = ET.SubElement(coordinates, "Coordinate", name=name)
+            widest = (-_MOST_TURN, _MOST_TURN) if number < 3 else (-_FARTHEST, _FARTHEST)
+            _add(coordinate, "range", " ".join(map(number_text, ranges.get(name, widest))))
+            _add(coordinate, "clamped", "false")
+            _add(element, "coordinates", name)
+        _add(element, "axis", vector_text(axis))
+        if name:
+            function = ET.SubElement(element, "LinearFunction", name="function")
+            _add(function, "coefficients", "1 0")
+        else:
+            _add(ET.SubElement(element, "Constant", name="function"), "value", "0")
+
+
+def _add_marker(
+    markers: ET.Element, name: str, side: Side, bone: int, position: Float[np.ndarray, "3"]
+) -> None:
+    marker = ET.SubElement(markers, "Marker", name=name)
+    _add(marker, "socket_parent_frame", f"/bodyset/{side}_{BONE_NAMES[bone]}")
+    _add(marker, "location", vector_text(position))
+    _add(marker, "fixed", "true")
+
+
+def _add(parent: ET.Element, tag: str, text: str) -> None:
+    ET.SubElement(parent, tag).text = text

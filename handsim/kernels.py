@@ -1,0 +1,399 @@
+"""Compiled arithmetic on plain arrays, shared by all packages: rotations, rigid motions, segments, bones.
+
+Everything is written out in scalars and into arrays of the caller, so that a kernel's inner loop makes no
+array. Orientations are quaternions (wxyz, MuJoCo's order) or 3x3 matrices.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar, overload
+
+import numba
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@overload
+def kernel(function: Callable[P, R], /) -> Callable[P, R]: ...
+
+
+@overload
+def kernel(*, inline: bool) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
+
+
+def kernel(function: Callable[P, R] | None = None, /, *, inline: bool = False) -> Any:
+    """Compile a function with numba at its first call, and keep the machine code on disk.
+
+    A division by zero gives infinity or NaN as in numpy. Sums keep their order (no fast-math), so that
+    results are the same on every machine. Arguments are arrays, numbers and other kernels; the body of an
+    inline kernel is copied into each kernel that calls it.
+    """
+    if function is None:
+        return lambda function: _compiled(function, inline=inline)
+    return _compiled(function, inline=inline)
+
+
+def _compiled(function: Callable[P, R], *, inline: bool) -> Any:
+    compiled = numba.njit(cache=True, error_model="numpy", inline="always" if inline else "never")(function)
+    kept = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if kept is not None:
+        kept._load_index = functools.partial(_known_kernels, kept._load_index)
+    return compiled
+
+
+def _known_kernels(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """The kernels kept on disk; none if an earlier version kept them under types that moved since."""
+    try:
+        return load()
+    except (ImportError, AttributeError):
+        return {}
+
+
+@kernel(inline=True)
+def squared_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Squared distance of two points [m^2]."""
+    return (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2  # type: ignore[no-any-return]
+
+
+@kernel(inline=True)
+def point_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Distance of two points [m]."""
+    return np.sqrt(squared_distance(one, other))  # type: ignore[no-any-return]
+
+
+@kernel(inline=True)
+def segment_distance_squared(
+    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
+) -> float:
+    """Squared distance [m^2] between the segments p-q and a-b, each point (3,) [m].
+
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
+    """
+    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    uu = ux * ux + uy * uy + uz * uz
+    vv = vx * vx + vy * vy + vz * vz
+    uv = ux * vx + uy * vy + uz * vz
+    uw = ux * wx + uy * wy + uz * wz
+    vw = vx * wx + vy * wy + vz * wz
+    tiny = 1e-18
+    s = 0.0
+    if uu > tiny:
+        determinant = uu * vv - uv * uv
+        if determinant > 1e-12 * uu * vv:
+            s = min(1.0, max(0.0, (uv * vw - vv * uw) / determinant))
+    t = (uv * s + vw) / vv if vv > tiny else 0.0
+    if t < 0.0 or t > 1.0 or vv <= tiny:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (uv * t - uw) / uu)) if uu > tiny else 0.0
+    dx, dy, dz = wx + s * ux - t * vx, wy + s * uy - t * vy, wz + s * uz - t * vz
+    return float(dx * dx + dy * dy + dz * dz)
+
+
+@kernel
+def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float, y: float, z: float) -> None:
+    """Write the rotation of a unit quaternion to the upper left 3x3 block of a matrix or transform."""
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@kernel
+def write_axis_angle_matrix(
+    matrix: Float[np.ndarray, "_ _"], axis: Float[np.ndarray, "3"], angle: float
+) -> None:
+    """Write the rotation matrix about a unit axis by an angle [rad], by way of its quaternion.
+
+    Args:
+        matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
+        axis: Unit vector (3,).
+    """
+    sine, cosine = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    write_quaternion_matrix(matrix, cosine, sine * axis[0], sine * axis[1], sine * axis[2])
+
+
+@kernel
+def multiply_rotations(
+    first: Float[np.ndarray, "_ _"], second: Float[np.ndarray, "_ _"], product: Float[np.ndarray, "_ _"]
+) -> None:
+    """Write `first @ second` of two rotations, of which the upper left 3x3 blocks are used.
+
+    Args:
+        first: Rotation (3, 3) or transform (4, 4).
+        second: Rotation (3, 3) or transform (4, 4); not the same array as `product`.
+        product: Where the product goes (3, 3) or (4, 4); may be `first`.
+    """
+    for i in range(3):
+        x, y, z = first[i, 0], first[i, 1], first[i, 2]
+        for j in range(3):
+            product[i, j] = x * second[0, j] + y * second[1, j] + z * second[2, j]
+
+
+@kernel
+def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float) -> None:
+    """Rotate a frame in place about an axis of its own (Rodrigues' formula on its rows).
+
+    Args:
+        rotation: Orientation (3, 3) of the frame, overwritten.
+        axis: Unit vector (3,) in the frame's own coordinates.
+    """
+    sine, cosine = np.sin(angle), np.cos(angle)
+    x, y, z = axis[0], axis[1], axis[2]
+    for row in range(3):
+        a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
+        along = (1.0 - cosine) * (a * x + b * y + c * z)
+        rotation[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
+        rotation[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
+        rotation[row, 2] = cosine * c + sine * (a * y - b * x) + along * z
+
+
+@kernel
+def quaternion_product(
+    w: float, x: float, y: float, z: float, e: float, a: float, b: float, c: float
+) -> tuple[float, float, float, float]:
+    """Product (wxyz) of the quaternions (w, x, y, z) and (e, a, b, c)."""
+    return (
+        w * e - x * a - y * b - z * c,
+        w * a + x * e + y * c - z * b,
+        w * b - x * c + y * e + z * a,
+        w * c + x * b - y * a + z * e,
+    )
+
+
+@kernel
+def rotate_quaternion(
+    before: Float[np.ndarray, "4"], vector: Float[np.ndarray, "3"], after: Float[np.ndarray, "4"]
+) -> None:
+    """Rotate an orientation by a rotation vector in its own frame.
+
+    Args:
+        before: Unit quaternion (4,) wxyz.
+        vector: Rotation vector (3,) [rad].
+        after: Where the new unit quaternion (4,) goes; may be `before`.
+    """
+    a, b, c = vector[0], vector[1], vector[2]
+    angle = np.sqrt(a * a + b * b + c * c)
+    share = 0.5 if angle < 1e-8 else np.sin(0.5 * angle) / angle
+    after[0], after[1], after[2], after[3] = quaternion_product(
+        before[0], before[1], before[2], before[3], np.cos(0.5 * angle), share * a, share * b, share * c
+    )
+    scale = 1.0 / np.sqrt(after[0] ** 2 + after[1] ** 2 + after[2] ** 2 + after[3] ** 2)
+    for n in range(4):
+        after[n] *= scale
+
+
+@kernel
+def horn_matrix(products: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """Horn's matrix (4, 4) of a sum of outer products: its last eigenvector is the best rotation."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = products
+    return np.array(
+        [
+            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        ]
+    )
+
+
+@kernel
+def align_rigid(
+    source: Float[np.ndarray, "N 3"],
+    target: Float[np.ndarray, "N 3"],
+    weights: Float[np.ndarray, "N"],
+    pose: Float[np.ndarray, "7"],
+) -> float:
+    """`handsim.space.transforms.rigid_fit` for kernels: weighted, and some points may be missing.
+
+    Horn, Closed-form solution of absolute orientation using unit quaternions (1987).
+
+    Args:
+        source: Points in the body's frame [m].
+        target: The same points in the world [m]; NaN where missing.
+        weights: Weight of each pair.
+        pose: Position [m] and orientation (wxyz) of the body in the world; the first seven numbers
+            are filled.
+
+    Returns:
+        The weighted sum of squared distances that is left.
+    """
+    total, size = 0.0, 0.0
+    centers, products = np.zeros((2, 3)), np.zeros((3, 3))
+    for point in range(len(source)):
+        if not np.isnan(target[point, 0]):
+            total += weights[point]
+            centers[0] += weights[point] * source[point]
+            centers[1] += weights[point] * target[point]
+    centers /= total
+    for point in range(len(source)):
+        if np.isnan(target[point, 0]):
+            continue
+        for i in range(3):
+            a = source[point, i] - centers[0, i]
+            size += weights[point] * (a * a + (target[point, i] - centers[1, i]) ** 2)
+            for j in range(3):
+                products[i, j] += weights[point] * a * (target[point, j] - centers[1, j])
+    values, vectors = np.linalg.eigh(horn_matrix(products))
+    rotation = np.empty((3, 3))
+    pose[3:7] = vectors[:, 3]
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
+    for i in range(3):
+        pose[i] = centers[1, i]
+        for j in range(3):
+            pose[i] -= rotation[i, j] * centers[0, j]
+    return size - 2.0 * values[3]  # type: ignore[no-any-return]
+
+
+def move(qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"]) -> Float[np.ndarray, "T 27"]:
+    """Poses after a step: what `mj_integratePos` computes.
+
+    Args:
+        qpos: Wrist position [m], wrist orientation (wxyz, unit), joint angles [rad].
+        step: Wrist translation in the world [m], wrist rotation vector in its own frame [rad], joint angles
+            [rad].
+    """
+    moved = np.empty_like(qpos)
+    _move(np.ascontiguousarray(qpos), np.ascontiguousarray(step), moved)
+    return moved
+
+
+def velocity_of(
+    before: Float[np.ndarray, "27"], after: Float[np.ndarray, "27"], span: float
+) -> Float[np.ndarray, "26"]:
+    """Velocity that takes a hand from one pose to another, the shorter way round: `mj_differentiatePos`.
+
+    Returns:
+        Wrist velocity in the world [m/s], its angular velocity in its own frame [rad/s], joint rates [rad/s].
+    """
+    velocity = np.empty(len(before) - 1)
+    _find_velocity(before, after, span, velocity)
+    return velocity
+
+
+@kernel
+def _move(
+    qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"], moved: Float[np.ndarray, "T 27"]
+) -> None:
+    """Write `qpos` after `step` into `moved`; units as in `move`."""
+    for row in range(len(qpos)):
+        before, by, after = qpos[row], step[row], moved[row]
+        for n in range(3):
+            after[n] = before[n] + by[n]
+        for n in range(7, len(before)):
+            after[n] = before[n] + by[n - 1]
+        rotate_quaternion(before[3:7], by[3:6], after[3:7])
+
+
+@kernel
+def _find_velocity(
+    before: Float[np.ndarray, "27"],
+    after: Float[np.ndarray, "27"],
+    span: float,
+    velocity: Float[np.ndarray, "26"],
+) -> None:
+    """Write the velocity from `before` to `after` into `velocity`; units as in `velocity_of`."""
+    rate = velocity[3:6]
+    cosine, rate[0], rate[1], rate[2] = quaternion_product(
+        before[3], -before[4], -before[5], -before[6], after[3], after[4], after[5], after[6]
+    )
+    sine = np.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    share = 2.0 if sine < 1e-8 else 2.0 * np.arctan2(sine, abs(cosine)) / sine
+    for n in range(3):
+        velocity[n] = (after[n] - before[n]) / span
+        rate[n] *= (share if cosine >= 0.0 else -share) / span
+    for n in range(7, len(before)):
+        velocity[n - 1] = (after[n] - before[n]) / span
+
+
+@kernel
+def pose_bones(
+    qpos: Float[np.ndarray, "T 27"],
+    offsets: Float[np.ndarray, "L 3"],
+    rotations: Float[np.ndarray, "L 3 3"],
+    axes: Float[np.ndarray, "J 3"],
+    chain: Int[np.ndarray, "L 2"],
+) -> Any:
+    """`T_world_bone` (T, L, 4, 4) of every bone in every frame, in one pass down the chain.
+
+    Args:
+        qpos: Wrist position [m], wrist orientation (wxyz, normalized here), joint angles [rad].
+        offsets: Origin of each bone in its parent's frame [m].
+        rotations: Orientation of each bone in its parent's frame at zero angles.
+        axes: Unit axis of each joint in the frame of the bone that it moves.
+        chain: Parent of each bone, and how many joints move it; parents come first, joints go by bones.
+    """
+    transforms = np.zeros((len(qpos), len(chain), 4, 4))
+    rotation = np.empty((3, 3))
+    for frame in range(len(qpos)):
+        pose = transforms[frame]
+        w, x, y, z = qpos[frame, 3], qpos[frame, 4], qpos[frame, 5], qpos[frame, 6]
+        scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+        write_quaternion_matrix(pose[0], w * scale, x * scale, y * scale, z * scale)
+        for i in range(3):
+            pose[0, i, 3] = qpos[frame, i]
+        pose[0, 3, 3] = 1.0
+        joint = 0
+        for bone in range(1, len(chain)):
+            parent, own = pose[chain[bone, 0]], pose[bone]
+            for i in range(3):
+                own[i, 3] = parent[i, 3]
+                for j in range(3):
+                    own[i, 3] += parent[i, j] * offsets[bone, j]
+            own[3, 3] = 1.0
+            multiply_rotations(parent, rotations[bone], own)
+            for _ in range(chain[bone, 1]):
+                write_axis_angle_matrix(rotation, axes[joint], qpos[frame, 7 + joint])
+                multiply_rotations(own, rotation, own)
+                joint += 1
+    return transforms
+
+
+@kernel
+def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: Any) -> None:
+    """Write the capsule axes of one digit: the forward kinematics of `pose_bones` for three bones.
+
+    Args:
+        wrist: The wrist's orientation (3, 3) and position (3,) [m] in the world.
+        angles: The digit's joint angles (4,) [rad]: two at its first bone, one at each further one.
+        digit: A tuple with the fields `offsets` (3, 3) [m], `rotations` (3, 3, 3) and `axes` (4, 3) of the
+            digit's bones and joints as `pose_bones` takes them, and `ends` (3, 2, 3), both ends of each
+            bone's capsule in the bone's frame [m].
+        posed: Where the axes' ends in the world go (3, 2, 3) [m].
+        scratch: Room for the arithmetic (4, 3).
+    """
+    frame, origin = scratch[:3], scratch[3]
+    frame[:] = wrist[0]
+    origin[:] = wrist[1]
+    joint = 0
+    for bone in range(3):
+        for row in range(3):
+            for column in range(3):
+                origin[row] += frame[row, column] * digit.offsets[bone, column]
+        multiply_rotations(frame, digit.rotations[bone], frame)
+        for _ in range(2 if bone == 0 else 1):
+            rotate_about_axis(frame, digit.axes[joint], angles[joint])
+            joint += 1
+        for end in range(2):
+            for row in range(3):
+                posed[bone, end, row] = origin[row]
+                for column in range(3):
+                    posed[bone, end, row] += frame[row, column] * digit.ends[bone, end, column]

@@ -1,1 +1,0 @@
-"""Compiled arithmetic on plain arrays, shared by all packages."""

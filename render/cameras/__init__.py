@@ -1,1 +1,0 @@
-"""The cameras of pictures: where they stand, and what their lenses do to a picture."""

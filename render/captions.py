@@ -1,0 +1,298 @@
+"""Names, titles, colors and sheets of pictures for people, and PNG files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
+
+from handsim.errors import HandSimError
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
+from handsim.hand.shape import BONES, DIGITS
+from handsim.hand.skin import vertex_normals
+from render.formats.records import CENTER, as_sensed
+from render.frames import HandTruth, RenderedFrame
+from render.painting.figures import Material, linear
+from render.skin.texture import GLOVE_COLOR
+
+Covering = Literal["skin", "glove"]
+BACKGROUND: Final = (0.957, 0.961, 0.969)
+SEEN_COLOR: Final = (0.13, 0.72, 0.33)
+HIDDEN_COLOR: Final = (0.89, 0.2, 0.2)
+UNLABELED_COLOR: Final = (0.5, 0.52, 0.56)
+_DIGIT_COLORS: Final = (
+    (0.85, 0.33, 0.1),
+    (0.93, 0.66, 0.08),
+    (0.15, 0.62, 0.35),
+    (0.1, 0.47, 0.82),
+    (0.56, 0.27, 0.68),
+)
+_PALM_COLOR: Final = (0.32, 0.36, 0.42)
+_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
+_ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
+
+
+def bone_colors() -> Float[np.ndarray, "L 3"]:
+    """One color (sRGB) per digit, and one for the palm, in the order of `topology.BONES`."""
+    colors = [_PALM_COLOR if bone.digit < 0 else _DIGIT_COLORS[bone.digit] for bone in BONES]
+    return np.array(colors)
+
+
+def covering_material(covering: Covering) -> Material:
+    """Bare skin or a dark glove, of one color."""
+    return Material(linear(_BASE[covering]), _ROUGHNESS[covering])
+
+
+def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
+    """Factors on the skin's color: redder towards the finger tips, paler on the palm's side."""
+    surface = model.surface
+    reddening = np.zeros(len(surface.vertices))
+    for digit in range(len(DIGITS)):
+        last = 3 + 3 * digit
+        origin, along = model.rest_transforms[last, :3, 3], model.rest_transforms[last, :3, 0]
+        share = ((surface.vertices - origin) @ along) / model.skeleton.lengths[last]
+        mine = (surface.bone_weights * (surface.bone_indices == last)).sum(axis=1)
+        reddening += mine * np.clip(share, 0.0, 1.0)
+    pale = np.clip(-vertex_normals(surface.vertices, surface.faces)[:, 2], 0.0, 1.0)[:, None]
+    paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
+    tint: NDArray[np.float64] = 1.0 + pale * paleness + reddening[:, None] * redness
+    return tint
+
+
+Picture = UInt8[np.ndarray, "H W 3"]
+
+_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
+_INK: Final = (38, 42, 50)
+_PAPER: Final = tuple(round(255 * level) for level in BACKGROUND)
+_TEXT_HEIGHT: Final = 24  # [pixels], of names and titles
+_LINE_STEP: Final = 1.35
+_PADDING: Final = 16  # [pixels]
+
+
+def write_png(path: str | Path, picture: Picture) -> None:
+    """Write a picture as PNG.
+
+    Raises:
+        HandSimError: The name does not end in .png.
+        OSError: The file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".png":
+        raise HandSimError(f"{path}: expected a file name that ends in .png")
+    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    assert done, "a PNG takes any 8-bit picture"
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def side_by_side(pictures: Sequence[Picture], *, gap: int = 0) -> Picture:
+    """Pictures in a row, those of less height centered, on the common background."""
+    height = max(picture.shape[0] for picture in pictures)
+    parts = []
+    for number, picture in enumerate(pictures):
+        above = (height - picture.shape[0]) // 2
+        below = height - picture.shape[0] - above
+        before = gap if number else 0
+        parts.append(pad(picture, (above, below), (before, 0)))
+    return np.concatenate(parts, axis=1)
+
+
+def titled(picture: Picture, title: str) -> Picture:
+    """The picture with a line of text above it, in its middle."""
+    band = round(_TEXT_HEIGHT * 2.2)
+    result = pad(picture, (band, 0), (0, 0))
+    width = text_width(title)
+    origin = ((picture.shape[1] - width) // 2, band - _PADDING // 2)
+    _write(result, title, origin, _INK)
+    return result
+
+
+def captioned(picture: Picture, captions: Sequence[tuple[float, str]]) -> Picture:
+    """The picture with a line of captions below it, each centered on its own column [px]."""
+    band = round(_TEXT_HEIGHT * 2.0)
+    result = pad(picture, (0, band), (0, 0))
+    for center, caption in captions:
+        origin = (round(center - text_width(caption) / 2), picture.shape[0] + round(_TEXT_HEIGHT * 1.2))
+        _write(result, caption, origin, _INK)
+    return result
+
+
+def with_names(
+    picture: Picture,
+    pixels: Float[np.ndarray, "M 2"],
+    names: Sequence[str],
+    colors: Float[np.ndarray, "M 3"] | None = None,
+) -> Picture:
+    """The picture between two columns of names, with a thin line from each name to its point in the picture.
+
+    Args:
+        pixels: Points in it, x right and y down [px]; NaN rows get no name.
+        names: One per point.
+        colors: sRGB in [0, 1] of each name; ink when not given.
+    """
+    shown = np.flatnonzero(np.isfinite(pixels).all(axis=1))
+    column = 2 * _PADDING + max((text_width(name) for name in names), default=0)
+    width = picture.shape[1]
+    shown = shown[np.argsort(pixels[shown, 1], kind="stable")]
+    left = shown[pixels[shown, 0] < width / 2]
+    right = shown[pixels[shown, 0] >= width / 2]
+    step = round(_TEXT_HEIGHT * _LINE_STEP)
+    rows = max(picture.shape[0], step * (max(len(left), len(right)) + 1))
+    above = (rows - picture.shape[0]) // 2
+    result = pad(picture, (above, rows - picture.shape[0] - above), (column, column))
+    shift = np.array([column, above])
+    for side, marks in (("left", left), ("right", right)):  # from top to bottom, or the lines would cross
+        heights = spread_out(pixels[marks, 1] + above, step, _TEXT_HEIGHT, rows - _TEXT_HEIGHT)
+        for mark, height in zip(marks, heights, strict=True):
+            ink = _INK if colors is None else tuple(int(level) for level in np.rint(255 * colors[mark]))
+            x, y = np.rint(pixels[mark] + shift).astype(int)
+            start = text_width(names[mark]) if side == "left" else 0
+            text_x = column - _PADDING - start if side == "left" else column + width + _PADDING
+            line_x = column - _PADDING // 2 if side == "left" else column + width + _PADDING // 2
+            cv2.line(result, (line_x, round(height)), (x, y), (150, 155, 165), 1, cv2.LINE_AA)
+            cv2.circle(result, (x, y), 2, ink, -1, cv2.LINE_AA)
+            _write(result, names[mark], (text_x, round(height) + _TEXT_HEIGHT // 3), ink)
+    return result
+
+
+def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> NDArray[np.float64]:
+    """Ascending heights near the desired ones, at least `step` apart, between `low` and `high` [px].
+
+    They are the least-squares solution, by pooling adjacent violators.
+    """
+    slots = step * np.arange(len(desired))
+    blocks: list[tuple[float, int]] = []  # mean of desired - slot, how many
+    for offset in desired - slots:
+        mean, count = float(offset), 1
+        while blocks and blocks[-1][0] > mean:
+            before, size = blocks.pop()
+            mean, count = (before * size + mean * count) / (size + count), size + count
+        blocks.append((mean, count))
+    means = np.repeat([mean for mean, _ in blocks], [count for _, count in blocks]) if blocks else slots
+    most = max(low, high - (slots[-1] if len(slots) else 0.0))
+    heights: NDArray[np.float64] = np.clip(means, low, most) + slots
+    return heights
+
+
+def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Picture:
+    """The picture with background above and below (`rows`), left and right (`columns`) [pixels]."""
+    height, width = picture.shape[:2]
+    result = np.empty((height + sum(rows), width + sum(columns), 3), dtype=np.uint8)
+    result[:] = _PAPER
+    result[rows[0] : rows[0] + height, columns[0] : columns[0] + width] = picture
+    return result
+
+
+def text_width(text: str) -> int:
+    """Width of a name or title [pixels]."""
+    return int(cv2.getTextSize(text, _FONT, _scale(), 2)[0][0])
+
+
+def _scale() -> float:
+    return _TEXT_HEIGHT / 32.0
+
+
+def _write(picture: Picture, text: str, origin: tuple[int, int], ink: tuple[int, ...]) -> None:
+    cv2.putText(picture, text, origin, _FONT, _scale(), ink, 2, cv2.LINE_AA)
+
+
+_GAP: Final = 6  # [px]
+_FRACTION_BITS: Final = 4  # OpenCV draws between pixels in sixteenths
+_EMPTY: Final = tuple(round(255 * level) for level in BACKGROUND)
+
+
+def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:
+    """Some frames in rows of `columns`, at most so wide each [px]; hidden keypoints are hollow.
+
+    A frame without colors shows its depth alone.
+
+    Raises:
+        HandSimError: There are no frames, or one has neither colors nor depth.
+    """
+    if not frames:
+        raise HandSimError("a contact sheet needs at least one frame")
+    cells = [_cell(frame, width) for frame in frames]
+    height = max(cell.shape[0] for cell in cells)
+    across = max(cell.shape[1] for cell in cells)
+    cells = [_padded(cell, height, across) for cell in cells]
+    blank = np.broadcast_to(np.array(_EMPTY, dtype=np.uint8), cells[0].shape)
+    columns = min(columns, len(cells))
+    cells += [blank] * (math.ceil(len(cells) / columns) * columns - len(cells))
+    rows = [side_by_side(cells[start : start + columns]) for start in range(0, len(cells), columns)]
+    return pad(np.concatenate(rows), (_GAP, 0), (_GAP, 0))
+
+
+def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float = 1.0) -> Picture:
+    """The picture with the hands' skeletons in it, in the digits' colors.
+
+    Args:
+        picture: The picture; not changed.
+        hands: Hands whose `pixels` are drawn where they are known.
+        scale: Pixels of this picture per pixel of the camera.
+    """
+    drawn = np.ascontiguousarray(picture).copy()
+    colors = np.rint(255 * bone_colors()).astype(int)
+    inks = [tuple(colors[0 if digit < 0 else 1 + 3 * digit].tolist()) for digit in KEYPOINT_DIGITS]
+    unit = 2**_FRACTION_BITS
+    style = {"lineType": cv2.LINE_AA, "shift": _FRACTION_BITS}
+    for hand in hands:
+        near = (np.abs(np.nan_to_num(hand.keypoints)) < 1e5).all(axis=1)
+        known = np.isfinite(hand.keypoints).all(axis=1) & near
+        pixels = (
+            np.rint(unit * (scale * np.nan_to_num(hand.keypoints) - CENTER)).astype(int).clip(-(2**24), 2**24)
+        )
+        for start, end in SKELETON:
+            if known[start] and known[end]:
+                cv2.line(drawn, pixels[start].tolist(), pixels[end].tolist(), inks[end], 1, **style)
+        for keypoint, pixel in enumerate(pixels.tolist()):
+            if known[keypoint]:
+                thickness = -1 if hand.visible[keypoint] else 1
+                cv2.circle(drawn, pixel, 3 * unit, inks[keypoint], thickness, **style)
+    return drawn
+
+
+def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
+    """Depth as colors, the nearest red, the farthest blue; background where there is nothing."""
+    present = depth > 0.0
+    picture: NDArray[np.uint8] = np.empty((*depth.shape, 3), dtype=np.uint8)
+    picture[:] = _EMPTY
+    if present.any():
+        near, far = depth[present].min(), depth[present].max()
+        share = (far - depth) / max(far - near, 1e-9)
+        levels = np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+        colors = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
+        picture[present] = colors[present]
+    return picture
+
+
+def _cell(frame: RenderedFrame, width: int) -> Picture:
+    sensed = as_sensed(frame)
+    if sensed.rgb is None and sensed.depth is None:
+        raise HandSimError(f"frame {frame.number} has neither colors nor depth to show")
+    scale = min(1.0, width / frame.camera.size[0])
+    parts = []
+    if sensed.rgb is not None:
+        parts.append(draw_keypoints(_scaled(sensed.rgb, scale), frame.hands, scale=scale))
+    if sensed.depth is not None:
+        depth = _scaled(colored_depth(sensed.depth), scale)
+        parts.append(depth if parts else draw_keypoints(depth, frame.hands, scale=scale))
+    return side_by_side(parts)
+
+
+def _scaled(picture: Picture, scale: float) -> Picture:
+    if scale == 1.0:
+        return picture
+    size = [max(1, round(scale * length)) for length in picture.shape[1::-1]]
+    smaller: NDArray[np.uint8] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return smaller
+
+
+def _padded(picture: Picture, height: int, width: int) -> Picture:
+    rows, columns = height - picture.shape[0], width - picture.shape[1]
+    return pad(picture, (0, rows + _GAP), (0, columns + _GAP))

@@ -1,0 +1,316 @@
+"""Color sensors: exposure and noise of a picture, motion blur and rolling shutter.
+
+The noise is EMVA 1288's (release 4.0) linear camera: shot noise of the electrons and the noise of reading
+them out, here as one normal number per pixel and channel with the variance of both.
+
+A row of a picture is open for `exposure` seconds; the rows open one after the other, `readout` seconds from
+the first to the last. Time 0 is the middle of the middle row's exposure: the time of a frame's ground
+truth.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
+
+from handsim.errors import ArgumentError
+from handsim.kernels import kernel
+from render.fields import quantiles, random_words
+
+_ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
+_SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
+_LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Exposure of one picture. The defaults change nothing."""
+
+    stops: float = 0.0
+    """Exposure over the nominal exposure, as a power of two."""
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors on red, green and blue after the sensor."""
+    white_electrons: float = 0.0
+    """Electrons in a pixel that is just white: full well over the sensor's gain; 0: no noise at all."""
+    read_noise: float = 0.0
+    """Standard deviation of a pixel in the dark [electrons]."""
+    vignetting: float = 0.0
+    """Share of the light that is missing in the corners."""
+    jpeg_quality: int | None = None
+    """Quality of JPEG compression, 1 to 100; None without it."""
+    blur: float = 0.0
+    """Standard deviation of what lens and color filters spread a point of light by [px]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureConfig:
+    """Ranges of exposures; drawn uniformly unless stated."""
+
+    stops: tuple[float, float] = (-0.5, 0.4)
+    balance: float = 0.05
+    """Standard deviation of the logarithms of the factors of red and blue."""
+    white_electrons: tuple[float, float] = (1000.0, 10000.0)
+    """Drawn uniformly on a logarithmic scale."""
+    read_noise: tuple[float, float] = (1.5, 6.0)
+    vignetting: tuple[float, float] = (0.0, 0.3)
+    jpeg_share: float = 0.5
+    """Share of pictures with JPEG compression."""
+    jpeg_quality: tuple[int, int] = (70, 98)
+    blur: tuple[float, float] = (0.3, 0.7)
+    """A lens in focus and the interpolation of a color filter's pixels [px]."""
+
+
+def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Exposure:
+    """A random exposure."""
+    red, blue = np.exp(config.balance * rng.standard_normal(2))
+    least, most = np.log(config.white_electrons)
+    is_jpeg = bool(rng.random() < config.jpeg_share)
+    quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
+    return Exposure(
+        stops=float(rng.uniform(*config.stops)),
+        balance=(float(red), 1.0, float(blue)),
+        white_electrons=float(np.exp(rng.uniform(least, most))),
+        read_noise=float(rng.uniform(*config.read_noise)),
+        vignetting=float(rng.uniform(*config.vignetting)),
+        jpeg_quality=quality if is_jpeg else None,
+        blur=float(rng.uniform(*config.blur)),
+    )
+
+
+def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
+    """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
+    light: NDArray[np.float32] = cv2.LUT(rgb, _decoded())
+    return light
+
+
+def expose(
+    linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The picture that a sensor takes of light (1 is white, more is as white), sRGB.
+
+    Raises:
+        ArgumentError: The light is not a picture of three colors.
+    """
+    if linear.ndim != 3 or linear.shape[2] != 3:
+        raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
+    height, width = linear.shape[:2]
+    rgb = np.empty((height, 3 * width), np.uint8)
+    white = exposure.white_electrons
+    words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
+    away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
+    numbers = _Sensor(
+        np.float32(2.0**exposure.stops),
+        np.float32(exposure.vignetting),
+        np.float32(1.0 / white if white > 0.0 else 0.0),
+        np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0),
+    )
+    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
+    light = np.ascontiguousarray(linear, dtype=np.float32)
+    if exposure.blur > 0.0:
+        light = cv2.GaussianBlur(light, _SPREAD, exposure.blur)
+    light = light.reshape(height, 3 * width)
+    _expose(light, *numbers, words.reshape(-1, 3 * width), quantiles(), away, balance, _root_curve(), rgb)
+    rgb = rgb.reshape(linear.shape)
+    return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
+
+
+class _Sensor(NamedTuple):
+    """Numbers of a picture's exposure."""
+
+    gain: np.float32
+    """Factor on the light in the middle of the picture."""
+    lost: np.float32
+    """Share that is missing in the corners; it grows with the squared distance from the middle."""
+    shot: np.float32
+    """One over the electrons of white; 0 for no noise."""
+    dark: np.float32
+    """Variance of the noise in the dark, 1 for white."""
+
+
+@kernel
+def _expose(
+    linear: NDArray[np.float32],
+    gain: np.float32,
+    lost: np.float32,
+    shot: np.float32,
+    dark: np.float32,
+    words: NDArray[np.uint16],
+    normal: NDArray[np.float32],
+    away: NDArray[np.float32],
+    balance: NDArray[np.float32],
+    curve: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
+) -> None:
+    """Write what a sensor makes of light (H, 3 W), row by row, in loops that compile to vector instructions.
+
+    `gain`, `lost`, `shot` and `dark` are those of `_Sensor`; `words` are random, and empty for no noise;
+    `away` is the squared distance of a row's values from the middle column [px^2], `balance` a factor on
+    each.
+    """
+    height, width = linear.shape
+    corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))
+    zero, one, half, top = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(_ROOTS - 1)
+    light, noise = np.empty(width, np.float32), np.zeros(width, np.float32)
+    level = np.empty(width, np.int32)
+    for row in range(height):
+        down = np.float32((row + 0.5 - 0.5 * height) ** 2)
+        for n in range(width):
+            light[n] = linear[row, n] * (gain * (one - lost * (down + away[n]) * corner))
+        if len(words):
+            for n in range(width):
+                noise[n] = normal[words[row, n]]
+            for n in range(width):
+                signal = light[n] if light[n] > zero else zero
+                light[n] += noise[n] * np.sqrt(signal * shot + dark)
+        for n in range(width):
+            value = light[n] * balance[n]
+            value = value if value > zero else zero
+            level[n] = int(np.sqrt(value if value < one else one) * top + half)
+        for n in range(width):
+            rgb[row, n] = curve[level[n]]
+
+
+def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
+    """The sRGB picture of light, clipped to what it can show: the inverse of `linear_of`."""
+    scaled = light * np.float32(_LEVELS - 1)
+    scaled += np.float32(0.5)
+    np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
+    return _curve().take(scaled.astype(np.uint16), mode="clip")
+
+
+def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    picture: NDArray[np.uint8] = cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return picture
+
+
+@functools.cache
+def _decoded() -> NDArray[np.float32]:
+    """Light of the 256 sRGB values (IEC 61966-2-1)."""
+    value = np.arange(256) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@functools.cache
+def _root_curve() -> NDArray[np.uint8]:
+    """The sRGB values of light in even steps of its root: sixteen or more to each."""
+    return encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
+
+
+@functools.cache
+def _curve() -> NDArray[np.uint8]:
+    """The sRGB values of light in even steps."""
+    light = np.arange(_LEVELS) / (_LEVELS - 1)
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.rint(255.0 * value).astype(np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """Exposure times of a picture's rows."""
+
+    exposure: float = 0.0
+    """Exposure time of each row [s]."""
+    readout: float = 0.0
+    """Time from the first row's opening to the last row's [s]; 0 for a global shutter."""
+    sub_frames: int = 1
+    """Number of instants that are drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterConfig:
+    """Ranges of shutters; drawn uniformly unless stated."""
+
+    exposure: tuple[float, float] = (0.001, 0.016)
+    """Drawn uniformly on a logarithmic scale [s]."""
+    readout: tuple[float, float] = (0.005, 0.025)
+    """Readout time of a rolling shutter [s]."""
+    rolling_share: float = 0.5
+    """Share of rolling shutters."""
+    sub_frames: int = 8
+
+
+def sample_shutter(config: ShutterConfig, *, rng: np.random.Generator) -> Shutter:
+    """A random shutter."""
+    exposure = float(np.exp(rng.uniform(*np.log(config.exposure))))
+    rolls, readout = bool(rng.random() < config.rolling_share), float(rng.uniform(*config.readout))
+    return Shutter(exposure, readout if rolls else 0.0, config.sub_frames)
+
+
+def shutter_times(
+    exposure: float, readout: float, sub_frames: int, height: int
+) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "H S"]]:
+    """Moments to draw, and how much each row of the picture has of each.
+
+    The time in which any row is open is cut into as many equal pieces; a moment is a piece's middle, and a
+    row's weights are the shares of its exposure that fall into the pieces.
+
+    Args:
+        exposure: Of a row [s].
+        readout: From the first row's opening to the last one's [s].
+        sub_frames: How many moments.
+        height: Rows of the picture.
+
+    Returns:
+        Times [s], 0 in the middle, and weights, which add up to 1 in every row.
+
+    Raises:
+        ArgumentError: A time is negative or not finite, or there is no moment or no row.
+    """
+    if not (0.0 <= exposure < np.inf and 0.0 <= readout < np.inf) or sub_frames < 1 or height < 1:
+        raise ArgumentError(
+            f"a shutter of {exposure:g} s, read out in {readout:g} s, with {sub_frames} sub-frames of "
+            f"{height} rows; expected times of at least 0 and counts of at least 1"
+        )
+    total = exposure + readout
+    cuts = total * (np.arange(sub_frames + 1) / sub_frames - 0.5)
+    times = 0.5 * (cuts[:-1] + cuts[1:])
+    middles = readout * (np.arange(height) / max(height - 1, 1) - 0.5) if height > 1 else np.zeros(1)
+    if exposure < 1e-9:  # rows are moments: each has the piece that it falls into
+        nearest = np.abs(middles[:, None] - times).argmin(axis=1)
+        return times, np.eye(sub_frames)[nearest]
+    opened, closed = middles[:, None] - 0.5 * exposure, middles[:, None] + 0.5 * exposure
+    overlap = np.minimum(closed, cuts[1:]) - np.maximum(opened, cuts[:-1])
+    weights = np.maximum(overlap, 0.0)
+    weights[weights < 1e-9 * exposure] = 0.0
+    return times, weights / weights.sum(axis=1, keepdims=True)
+
+
+def combine(
+    sub_frames: Iterable[UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]],
+    weights: Float[np.ndarray, "H S"],
+) -> Float32[np.ndarray, "H W 3"]:
+    """Light of the picture that a shutter makes of moments, for `render.color_sensor.expose`.
+
+    Moments come in their order, as sRGB bytes or as light; one is held at a time. Weights are those of
+    `shutter_times`.
+
+    Raises:
+        ArgumentError: There are not as many moments as weights, or one has another size.
+    """
+    total: NDArray[np.float32] | None = None
+    count = 0
+    for number, frame in enumerate(sub_frames):
+        count = number + 1
+        if number >= weights.shape[1] or len(frame) != len(weights):
+            break
+        if total is None:
+            total = np.zeros(frame.shape, np.float32)
+        (rows,) = np.nonzero(weights[:, number])
+        if len(rows):
+            part = slice(rows[0], rows[-1] + 1)
+            light = linear_of(np.ascontiguousarray(frame[part])) if frame.dtype == np.uint8 else frame[part]
+            total[part] += light * weights[part, number, None, None].astype(np.float32)
+    if total is None or count != weights.shape[1] or len(total) != len(weights):
+        raise ArgumentError(
+            f"{count} or more sub-frames of some height, expected {weights.shape[1]} of {len(weights)} rows"
+        )
+    return total

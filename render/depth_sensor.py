@@ -1,0 +1,488 @@
+"""Noise of depth sensors: disparity (structured light, stereo) and time of flight.
+
+Disparities follow Barron and Malik (CVPR 2013), who shift pixels, add noise and round to eighths of a
+pixel, and Bohg, Romero, Herzog and Schaal (ICRA 2014), whose matching windows fail at edges. Noise of time
+of flight grows with distance and angle, pixels at edges see two surfaces at once, and dark surfaces are not
+measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from numpy.typing import NDArray
+
+from handsim._checks import check_choice, check_number
+from handsim.errors import ArgumentError
+from handsim.kernels import kernel
+from handsim.space.camera import Camera, Lens, camera_matrix
+from render.fields import normal_numbers, quantiles, random_words
+
+_DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
+_FIXED: Final = 32.0  # disparities are compared in 1/32 px, which fit sixteen bits up to 1023 px
+_SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from itself
+
+
+@dataclass(frozen=True, slots=True)
+class StructuredLight:
+    """Noise of a disparity sensor; see `docs/sensors.md` for the sources of the numbers."""
+
+    sensor: str = "kinect1"
+    baseline: float = 0.075
+    """From the camera to the projector or second camera, to its right [m]."""
+    step: float = 0.125
+    """What disparities are rounded to [px]; 0: not at all."""
+    disparity_noise: float = 0.125 / 6
+    """Standard deviation before rounding [px]."""
+    shift: float = 0.5
+    """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
+    support: float = 0.6
+    """Share of a window's other dots that must agree with its middle, give or take `wavering`."""
+    wavering: float = 0.15
+    """Standard deviation of that share, alike in patches of 3 x 3 pixels."""
+    agreement: float = 1.0
+    """Largest difference of disparity inside a window [px]."""
+    steepest: float = 1.4
+    """Largest angle between a surface's normal and the ray that comes back [rad]."""
+    shadow: bool = True
+    """Whether the projector must see a surface too."""
+    nearest: float = 0.4
+    farthest: float = 4.0
+    """What is measured at all [m]."""
+
+
+def measure_disparity(
+    depth: Float32[np.ndarray, "H W"],
+    cosines: Float32[np.ndarray, "H W"] | None,
+    noise: StructuredLight,
+    focal: float,
+    *,
+    rng: np.random.Generator,
+) -> Float32[np.ndarray, "H W"]:
+    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
+
+    Cosines are of the angles between normals and the rays that come back (None: all surfaces face), `focal`
+    is the camera's horizontal focal length [px].
+    """
+    scale, height, width = np.float32(noise.baseline * focal), *depth.shape
+    with np.errstate(divide="ignore"):
+        ideal = np.where(depth > 0.0, scale / depth, np.float32(0.0))
+    kept = (depth >= noise.nearest) & (depth <= noise.farthest)
+    if cosines is not None:
+        kept &= cosines >= np.cos(noise.steepest)
+    if noise.support > 0.0:
+        coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
+        needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
+        _keep_supported(ideal, needed.astype(np.int64), int(noise.agreement * _FIXED), kept)
+    if noise.shadow:
+        _keep_lit(ideal, kept)
+    if max(noise.shift, noise.disparity_noise, noise.step) <= 0.0:
+        return np.where(kept, depth, np.float32(0.0))
+    moved, wavering = noise.shift > 0.0, noise.disparity_noise > 0.0
+    shifts = random_words((2, height, width) if moved else (2, 0, 0), rng=rng)
+    words = random_words((height, width) if wavering else (0, 0), rng=rng)
+    measured = np.zeros_like(depth)
+    table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
+    step = np.float32(noise.step)
+    _match(ideal, kept, shifts, _whole_shifts(noise.shift), words, table, step, least, scale, measured)
+    return measured
+
+
+def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels that a nearer surface hides from the projector, which stands to the right in the same row.
+
+    A pixel of disparity d is d columns further left in the projector's picture. Where several pixels fall on
+    one of its columns, the nearest one is visible to it.
+    """
+    lit = np.ones(disparity.shape, np.bool_)
+    _keep_lit(disparity, lit)
+    return ~lit
+
+
+@kernel
+def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
+    """Clear what is `shadowed` of `kept` (H, W)."""
+    height, width = disparity.shape
+    most = (
+        np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
+        if disparity.size
+        else np.float32(1.0)
+    )
+    first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
+    for row in range(height):
+        first[:] = 0.0
+        for column in range(width):
+            near = disparity[row, column]
+            cells[column] = 1 + int(np.rint(np.float32(column) - near + most))
+            first[cells[column]] = max(first[cells[column]], near)
+        for column in range(width):
+            if kept[row, column]:  # neighbors close what rounding left open
+                cell = cells[column]
+                nearest = max(first[cell - 1], first[cell], first[cell + 1])
+                kept[row, column] = nearest <= disparity[row, column] + np.float32(_SHADOW_SLACK)
+
+
+@kernel
+def _keep_supported(
+    disparity: NDArray[np.float32], needed: NDArray[np.int64], most: int, kept: NDArray[np.bool_]
+) -> None:
+    """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
+
+    `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
+    """
+    height, width = disparity.shape
+    fixed = np.empty((height, width), np.int16)
+    for row in range(height):
+        for column in range(width):
+            fixed[row, column] = int(min(disparity[row, column] * np.float32(_FIXED), np.float32(32767.0)))
+    for row in range(height):
+        for column in range(width):
+            if not kept[row, column]:
+                continue
+            middle, agreed = fixed[row, column], -1
+            for down in _DOTS:
+                for right in _DOTS:
+                    i, j = min(max(row + down, 0), height - 1), min(max(column + right, 0), width - 1)
+                    agreed += abs(fixed[i, j] - middle) <= most
+            # Where all agree, nothing is lost.
+            kept[row, column] = agreed >= min(needed[row // 3, column // 3], len(_DOTS) ** 2 - 1)
+
+
+@kernel
+def _match(
+    disparity: NDArray[np.float32],
+    kept: NDArray[np.bool_],
+    shifts: NDArray[np.uint16],
+    offsets: NDArray[np.int32],
+    words: NDArray[np.uint16],
+    noise: NDArray[np.float32],
+    step: np.float32,
+    least: np.float32,
+    scale: np.float32,
+    depth: NDArray[np.float32],
+) -> None:
+    """Write the depth [m] of the pixels that are kept.
+
+    Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
+    then come noise and rounding. Random words pick offsets (65536,) [px] and noise (65536,) [px]; those of
+    shape 0 pick none. Less than the `least` disparity is nothing.
+    """
+    height, width = disparity.shape
+    for row in range(height):
+        for column in range(width):
+            if not kept[row, column]:
+                continue
+            i, j = row, column
+            if shifts.shape[1]:
+                i = min(max(row + offsets[shifts[0, row, column]], 0), height - 1)
+                j = min(max(column + offsets[shifts[1, row, column]], 0), width - 1)
+            value = disparity[i, j]
+            if len(words):
+                value += noise[words[row, column]]
+            if step > 0.0:
+                value = np.rint(value / step) * step
+            if value > least:
+                depth[row, column] = scale / max(value, np.float32(1e-6))
+
+
+@functools.lru_cache(maxsize=16)
+def _whole_shifts(deviation: float) -> NDArray[np.int32]:
+    return np.rint(deviation * quantiles()).astype(np.int32)
+
+
+_WALL: Final = 0.8  # reflectance of the white walls that noise was published for
+_BANDS: Final = 1024  # of cosines in the tables below
+_FADING: Final = 0.09  # [rad] over which surfaces go before the steepest
+_NOTHING: Final = np.float32(1e6)
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOfFlight:
+    """Noise of a time-of-flight sensor; see `docs/sensors.md` for the sources of the numbers."""
+
+    sensor: str = "kinect2"
+    sigma: tuple[float, float, float] = (1.5e-3, -0.5e-3, 0.3e-3)
+    """Standard deviation c0 + c1 z + c2 z^2 of a white wall that faces, depth z in meters [m]."""
+    angle_sigma: float = 0.1e-3
+    """What is added at an angle a, times z^1.5 (a / (pi/2 - a))^2 [m]."""
+    offset: float = 0.0
+    """Added to every depth [m]."""
+    edge: float = 0.03
+    """Step between neighboring pixels that makes an edge, as a share of the depth."""
+    flying: float = 0.5
+    """Share of pixels along edges that mix both surfaces."""
+    dropped: float = 0.15
+    """Share of pixels along edges that are not measured."""
+    weakest: float = 0.0074
+    """Least light: reflectance times the angle's cosine over the squared depth [1/m^2]."""
+    steepest: float = 1.48
+    """Largest angle between a surface's normal and the ray that comes back [rad]."""
+    step: float = 0.001
+    """What depths are rounded to [m]; 0: not at all."""
+    nearest: float = 0.5
+    farthest: float = 4.5
+    """What is measured at all [m]."""
+
+
+def measure_flight(
+    depth: Float32[np.ndarray, "H W"],
+    cosines: Float32[np.ndarray, "H W"] | None,
+    reflectance: Float32[np.ndarray, "H W"] | None,
+    noise: TimeOfFlight,
+    *,
+    rng: np.random.Generator,
+) -> Float32[np.ndarray, "H W"]:
+    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
+
+    Cosines are of the angles between normals and the rays that come back (None: all surfaces face),
+    reflectance the share of light that surfaces send back (None: all are white walls).
+    """
+    there = depth > 0.0
+    measured = _mixed(depth, noise, rng=rng)
+    sigma = _sigma(depth, cosines, reflectance, noise)
+    if sigma is not None:
+        measured += sigma * normal_numbers(depth.shape, rng=rng)
+    measured += np.float32(noise.offset)
+    if noise.step > 0.0:
+        measured = np.rint(measured * np.float32(1.0 / noise.step)) / np.float32(1.0 / noise.step)
+    there &= (measured >= noise.nearest) & (measured <= noise.farthest)
+    _drop_weak(there, depth, cosines, reflectance, noise, rng=rng)
+    return np.where(there, measured, np.float32(0.0))
+
+
+def _mixed(
+    depth: NDArray[np.float32], noise: TimeOfFlight, *, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Depth with flying pixels along edges, and 0 where an edge is not measured."""
+    mixed = depth.copy()
+    if noise.flying + noise.dropped <= 0.0:
+        return mixed
+    around = np.ones((3, 3), np.uint8)
+    far = cv2.dilate(depth, around)
+    near = cv2.erode(np.where(depth > 0.0, depth, _NOTHING), around)
+    bare = cv2.erode(depth, around) <= 0.0
+    pixels = np.flatnonzero((depth > 0.0) & (bare | (far - near > np.float32(noise.edge) * depth)))
+    here, near, far = depth.ravel()[pixels], near.ravel()[pixels], far.ravel()[pixels]
+    fate, share = rng.random((2, len(pixels)), dtype=np.float32)
+    other = np.where(here - near < far - here, far, near)
+    # Light goes with the squared distance, and the phase follows the brighter part.
+    mine, theirs = (1.0 - share) / here**2, share / other**2
+    flown = (mine * here + theirs * other) / (mine + theirs)
+    flies = (fate < noise.flying) & (far - near > noise.edge * here)
+    value = np.where(flies, flown, here)
+    mixed.ravel()[pixels] = np.where(fate >= 1.0 - noise.dropped, np.float32(0.0), value)
+    return mixed
+
+
+def _sigma(
+    depth: NDArray[np.float32],
+    cosines: NDArray[np.float32] | None,
+    reflectance: NDArray[np.float32] | None,
+    noise: TimeOfFlight,
+) -> NDArray[np.float32] | None:
+    """Standard deviation of each pixel [m]; None: there is none."""
+    c0, c1, c2 = (np.float32(c) for c in noise.sigma)
+    if not (any(noise.sigma) or noise.angle_sigma):
+        return None
+    sigma = (c2 * depth + c1) * depth + c0
+    if cosines is not None and noise.angle_sigma > 0.0:
+        bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+        sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
+    if reflectance is not None:  # shot noise: as the root of the light
+        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
+    return sigma
+
+
+def _drop_weak(
+    there: NDArray[np.bool_],
+    depth: NDArray[np.float32],
+    cosines: NDArray[np.float32] | None,
+    reflectance: NDArray[np.float32] | None,
+    noise: TimeOfFlight,
+    *,
+    rng: np.random.Generator,
+) -> None:
+    """Take out what is too steep and, within half of the least light above and below it, too dark."""
+    if cosines is not None:
+        last = np.cos(noise.steepest - _FADING)
+        steep = np.flatnonzero(there & (cosines < last))
+        chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
+        there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
+    if noise.weakest <= 0.0:
+        return
+    light = np.float32(1.0) if reflectance is None else reflectance
+    if cosines is not None:
+        light = light * cosines
+    dim = np.flatnonzero(there & (light < np.float32(1.5 * noise.weakest) * depth * depth))
+    bright = np.broadcast_to(light, depth.shape).ravel()[dim] / depth.ravel()[dim] ** 2
+    chance = 1.5 - bright / noise.weakest
+    there.ravel()[dim] = rng.random(len(dim), dtype=np.float32) > chance
+
+
+@functools.lru_cache(maxsize=16)
+def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
+    angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
+    angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
+    return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
+
+
+DepthNoise = StructuredLight | TimeOfFlight
+# Numbers and their sources are in docs/sensors.md.
+_SENSORS: Final[dict[str, DepthNoise]] = {
+    "kinect1": StructuredLight(),
+    "d435": StructuredLight(
+        sensor="d435",
+        baseline=0.05,
+        step=1.0 / 32.0,
+        disparity_noise=0.08,
+        agreement=2.0,
+        nearest=0.2,
+        farthest=10.0,
+    ),
+    "kinect2": TimeOfFlight(),
+    "azure_kinect": TimeOfFlight(
+        sensor="azure_kinect",
+        sigma=(0.0, 1.0e-3, 0.0),
+        flying=0.1,
+        dropped=0.6,
+        weakest=0.0101,
+        nearest=0.5,
+        farthest=3.86,
+    ),
+}
+SENSORS: Final = tuple(_SENSORS)
+
+
+_OTHER_NAMES: Final = {"realsense_d435": "d435"}
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSensor:
+    """A depth sensor whose noise is added to depth, or several, one of which is drawn each time.
+
+    Raises:
+        ArgumentError: A sensor is unknown, or a number is negative.
+    """
+
+    sensors: tuple[str, ...] = ("kinect2",)
+    """Some of `SENSORS`; a name stands for itself alone."""
+    noise: float = 1.0
+    """Factor of the noise that was published of it."""
+    spread: float = 0.2
+    """Standard deviation of the logarithm of a copy's noise."""
+    offset: float = 0.0035
+    """Standard deviation of a time-of-flight camera's own offset [m]."""
+
+    def __post_init__(self) -> None:
+        given = (self.sensors,) if isinstance(self.sensors, str) else tuple(self.sensors)
+        names = tuple(_OTHER_NAMES.get(name, name) for name in given)
+        for name in names:
+            check_choice(name, SENSORS, noun="depth sensor")
+        for name in ("noise", "spread", "offset"):
+            check_number(name, getattr(self, name), 0.0)
+        object.__setattr__(self, "sensors", names)
+
+
+def named_sensor(name: str) -> DepthNoise:
+    """A depth sensor as it was published."""
+    check_choice(name, _SENSORS, noun="depth sensor")
+    return _SENSORS[name]
+
+
+def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> DepthNoise | None:
+    """One copy of one of the sensors; None if there are none."""
+    sensors = [named_sensor(name) for name in config.sensors]
+    if not sensors:
+        return None
+    noise = sensors[int(rng.integers(len(sensors)))]
+    louder = config.noise * float(np.exp(config.spread * rng.standard_normal()))
+    offset = float(rng.standard_normal())
+    if isinstance(noise, StructuredLight):
+        return dataclasses.replace(noise, disparity_noise=louder * noise.disparity_noise)
+    c0, c1, c2 = (louder * c for c in noise.sigma)
+    return dataclasses.replace(noise, sigma=(c0, c1, c2), offset=config.offset * offset)
+
+
+def apply_depth_noise(
+    depth: Float32[np.ndarray, "H W"],
+    normals: Float32[np.ndarray, "H W 3"] | None,
+    noise: DepthNoise | None,
+    *,
+    camera: Camera,
+    reflectance: Float32[np.ndarray, "H W"] | None = None,
+    rng: np.random.Generator,
+) -> Float32[np.ndarray, "H W"]:
+    """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
+
+    Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
+    infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
+    nothing.
+    """
+    shape = camera.size[1], camera.size[0]
+    for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
+        if picture is not None and picture.shape[:2] != shape:
+            raise ArgumentError(
+                f"{name} has shape {picture.shape}, expected {shape} as camera '{camera.name}' has"
+            )
+    if noise is None:
+        return depth.copy()
+    cosines = None if normals is None else _facing(normals, camera)
+    if isinstance(noise, StructuredLight):
+        return measure_disparity(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
+    return measure_flight(depth, cosines, reflectance, noise, rng=rng)
+
+
+def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Cosines between normals and the rays that come back."""
+    (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+    if camera.lens.kind == "pinhole":
+        return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
+    rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
+    cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
+    cosines += rays[1] * normals[..., 1]
+    cosines += rays[2] * normals[..., 2]
+    np.maximum(cosines, np.float32(0.0), out=cosines)
+    return cosines
+
+
+@kernel
+def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: float, cy: float) -> Any:
+    """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
+    height, width = normals.shape[:2]
+    cosines = np.zeros((height, width), np.float32)
+    for row in range(height):
+        y = (row + 0.5 - cy) / fy
+        for column in range(width):
+            nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+            if nx != 0.0 or ny != 0.0 or nz != 0.0:
+                x = (column + 0.5 - cx) / fx
+                along = -(x * nx + y * ny + nz)
+                if along > 0.0:
+                    cosines[row, column] = along / np.sqrt(x * x + y * y + 1.0)
+    return cosines
+
+
+@functools.lru_cache(maxsize=16)
+def _back(
+    size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
+) -> NDArray[np.float32]:
+    """Directions (3, H, W) from what is seen to the camera."""
+    rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
+    return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
+
+
+def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
+    light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
+    return light
+
+
+@functools.cache
+def _luminance() -> NDArray[np.float32]:
+    return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)

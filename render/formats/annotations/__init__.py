@@ -1,1 +1,0 @@
-"""Ground truth of rendered frames in the JSON of other data sets."""

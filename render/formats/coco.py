@@ -1,0 +1,411 @@
+"""COCO keypoints (`annotations.json`), YOLO's labels beside them, and InterHand2.6M's files.
+
+COCO's keypoints count pixels from the first one's center, boxes from the picture's corner, as in COCO's own
+files. Beyond COCO's fields an image has its camera (`K` for such pixels, the lens, the pose), who is in it
+and every random choice; an annotation has its side, its keypoints in the camera's axes [m], its pose, its
+shape and its skin.
+
+A line of YOLO's is the class, the box (center and size) and 21 x (x, y, flag), as shares of the picture's
+width and height from its corner. There is one class, because ultralytics mirrors pictures while it trains,
+which makes a right hand a left one.
+
+InterHand2.6M has millimeters and 42 joints: 21 of the right hand and 21 of the left, tip first and wrist
+last. Projections count pixels from the first one's center, boxes from the picture's corner. A dataset is
+one capture, "0". Its cameras are called by numerals, because its loader takes `int` of them, and have one
+pose each, so that a camera that moves becomes many. Each picture has our name of its camera beside the
+numeral.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handsim import __version__
+from handsim.errors import DatasetError
+from handsim.hand.model import KEYPOINT_NAMES, SKELETON
+from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.space.camera import Camera
+from render.formats.records import (
+    CENTER,
+    by_side,
+    centered_K,
+    hand_mask,
+    is_seen,
+    keypoint_flags,
+    rounded,
+    run_lengths,
+    shape_record,
+    shifted_K,
+    to_json,
+    to_order,
+)
+from render.formats.shards import (
+    _LABELS,
+    FolderWriter,
+    _need_colors,
+    _write,
+    json_list,
+    one_sentence,
+    save_text,
+)
+from render.frames import HandTruth, RenderedFrame
+from render.skin.look import SkinLook, tone_name
+
+INFO: Final[dict[str, Any]] = {
+    "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
+    "version": __version__,
+}
+"""What a file tells of itself. It has no date, so that the same frames give the same bytes."""
+CATEGORY: Final[dict[str, Any]] = {
+    "id": 1,
+    "name": "hand",
+    "supercategory": "hand",
+    "keypoints": list(KEYPOINT_NAMES),
+    "skeleton": [[start + 1, end + 1] for start, end in SKELETON],  # COCO counts keypoints from one
+}
+
+
+def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
+    """The picture and its hands, still without COCO's numbers."""
+    camera = frame.camera
+    image = {
+        "file_name": file_name,
+        "width": camera.size[0],
+        "height": camera.size[1],
+        "frame": frame.number,
+        "time": frame.time,
+        "camera": camera.name,
+        "K": shifted_K(camera).tolist(),
+        "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
+        "T_world_camera": camera.T_world_camera.tolist(),
+        "choices": frame.choices,
+    }
+    if "person" in frame.choices:
+        image["person"] = frame.choices["person"]
+    hands = [_hand_record(frame, number, hand) for number, hand in enumerate(frame.hands) if is_seen(hand)]
+    return {"image": image, "annotations": hands}
+
+
+def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """Images and their annotations with COCO's numbers, in the order of the records."""
+    annotation_id = 0
+    for image_id, record in enumerate(records, start=1):
+        hands = []
+        for hand in record["annotations"]:
+            annotation_id += 1
+            hands.append({"id": annotation_id, "image_id": image_id, **hand})
+        yield {"id": image_id, **record["image"]}, hands
+
+
+def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
+    keypoints, known = _keypoints(frame.camera, hand)
+    mask = hand_mask(frame, number)
+    record = {
+        "category_id": CATEGORY["id"],
+        "keypoints": keypoints,
+        "num_keypoints": known,
+        "bbox": rounded(hand.box, 3),
+        "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
+        "iscrowd": 0,
+        "side": hand.shape.side,
+        "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
+        "qpos": hand.qpos.tolist(),
+        "shape": shape_record(hand.shape),
+    }
+    looks = frame.choices.get("people", ())
+    if number < len(looks):
+        angle = SkinLook(**looks[number]["skin"]).typology_angle
+        record["look"], record["skin_tone"] = (
+            looks[number],
+            {"class": tone_name(angle), "typology_angle": round(angle, 3)},
+        )
+    if mask is not None:
+        record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
+    return record
+
+
+def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
+    """COCO's 21 x (u, v, flag): 0 outside the picture, 1 hidden, 2 seen; and how many are not 0."""
+    flags = keypoint_flags(hand, camera.size)
+    pixels = np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0)
+    rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
+    return [value for (u, v), flag in rows for value in (u, v, flag)], int((flags > 0).sum())
+
+
+_CLASS: Final = 0
+
+
+def label_lines(frame: RenderedFrame) -> str:
+    """The text of a picture's labels: one line per visible hand, none where there is no hand."""
+    return "".join(f"{_line(hand, frame.camera.size)}\n" for hand in frame.hands if is_seen(hand))
+
+
+def data_yaml() -> str:
+    """The text of `data.yaml`; paths count from its own folder."""
+    return "\n".join(
+        (
+            "# For ultralytics: yolo pose train data=data.yaml model=yolo11n-pose.pt",
+            "train: images",
+            "# The same pictures: render others with another --seed and name their folder here.",
+            "val: images",
+            f"kpt_shape: [{NUM_KEYPOINTS}, 3]",
+            f"flip_idx: {list(range(NUM_KEYPOINTS))}",
+            "names: {0: hand}",
+            f"kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}",
+            "",
+        )
+    )
+
+
+def _line(hand: HandTruth, size: tuple[int, int]) -> str:
+    corner, extent = hand.box[:2], hand.box[2:]
+    box = np.concatenate([(corner + 0.5 * extent) / size, extent / size])
+    flags = keypoint_flags(hand, size)
+    points = np.where(flags[:, None] > 0, hand.keypoints / size, 0.0)
+    rows = (f"{x:.6f} {y:.6f} {flag}" for (x, y), flag in zip(points.tolist(), flags.tolist(), strict=True))
+    return " ".join([str(_CLASS), *(f"{value:.6f}" for value in box.tolist()), *rows])
+
+
+class CocoWriter(FolderWriter):
+    """`images/shard-00000/KEY.jpg`, `depth/shard-00000/KEY.png` ..., and `annotations.json` beside them."""
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        _need_colors(frame, "coco")
+        record = picture_record(frame, f"{name}/{frame.key}.jpg")
+        record["image"] |= self._add_pictures(folder, frame, name)
+        return record
+
+    def finish(self) -> None:
+        """Write `annotations.json`.
+
+        Raises:
+            HandSimError: A shard is damaged, or the disk takes no more.
+        """
+
+        def pictures() -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+            return numbered(self._records())
+
+        with one_sentence(self.folder, "writing the annotations"):
+            save_text(self.folder / "annotations.json", _coco_file(pictures, [CATEGORY]))
+
+
+class YoloWriter(CocoWriter):
+    """COCO's folder with `labels/shard-00000/KEY.txt`, and `data.yaml`, which ultralytics trains from."""
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        record = super()._add(folder, frame, name)
+        _write(folder / _LABELS / f"{frame.key}.txt", label_lines(frame).encode())
+        return record
+
+    def finish(self) -> None:
+        """Write `annotations.json` and `data.yaml`.
+
+        Raises:
+            HandSimError: A shard is damaged, or the disk takes no more.
+        """
+        super().finish()
+        with one_sentence(self.folder, "writing data.yaml"):
+            save_text(self.folder / "data.yaml", [data_yaml()])
+
+
+def _coco_file(
+    numbered: Callable[[], Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]],
+    categories: list[dict[str, Any]],
+) -> Iterator[str]:
+    """Pieces of a COCO file; the shards are read twice, so that they need not fit into memory.
+
+    Its list of licenses is empty, because pictures belong to who draws them.
+    """
+    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json(categories)},\n"images":'
+    yield from json_list(image for image, _ in numbered())
+    yield ',\n"annotations":'
+    yield from json_list(hand for _, hands in numbered() for hand in hands)
+    yield "}\n"
+
+
+SPLIT: Final = "train"
+CAPTURE: Final = 0
+_ORDER: Final[tuple[Side, Side]] = (SIDES[1], SIDES[0])  # right, left
+
+
+def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
+    """The picture, its camera and its joints, still without numbers.
+
+    Raises:
+        HandSimError: The camera's lens is not a pinhole, or two hands are of the same side.
+    """
+    hands = by_side(frame)
+    seen = [hand.box for hand in frame.hands if is_seen(hand)]
+    joints, valid = _joints(hands)
+    kind = "interacting" if len(hands) == 2 else next(iter(hands), "right")
+    return {
+        "image": {
+            "file_name": file_name,
+            "width": frame.camera.size[0],
+            "height": frame.camera.size[1],
+            "capture": CAPTURE,
+            "subject": CAPTURE,
+            "seq_name": "handsim",
+            "frame_idx": frame.number,
+        },
+        "annotation": {
+            "bbox": rounded(_union(seen), 3),
+            "joint_valid": valid,
+            "hand_type": kind,
+            "hand_type_valid": 1,
+            "category_id": 1,
+            "iscrowd": 0,
+        }
+        if seen
+        else None,
+        "camera_name": frame.camera.name,
+        "camera": _camera(frame.camera),
+        "joints": {
+            "world_coord": joints,
+            "joint_valid": [[value] for value in valid],
+            "hand_type": kind,
+            "hand_type_valid": True,
+        },
+    }
+
+
+class Cameras:
+    """Numerals of the poses that cameras have, in the order of pictures: the same pose, the same one."""
+
+    def __init__(self) -> None:
+        self._numerals: dict[str, str] = {}
+        self._records: dict[str, Any] = {}
+
+    def numeral(self, record: dict[str, Any]) -> str:
+        """What the camera of a record of `interhand_record` is called."""
+        pose = to_json([record["camera_name"], record["camera"]])
+        numeral = self._numerals.setdefault(pose, str(len(self._numerals)))
+        self._records[numeral] = record["camera"]
+        return numeral
+
+    def table(self) -> dict[str, Any]:
+        """Content of `_camera.json`."""
+        fields = ("campos", "camrot", "focal", "princpt")
+        table = {
+            field: {numeral: camera[field] for numeral, camera in self._records.items()} for field in fields
+        }
+        return {str(CAPTURE): table}
+
+
+def interhand_numbered(
+    records: Iterable[dict[str, Any]], cameras: Cameras
+) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """Images and their annotations with COCO's numbers; annotations are of pictures, not of hands."""
+
+    def with_cameras() -> Iterator[dict[str, Any]]:
+        for record in records:
+            names = {"camera": cameras.numeral(record), "camera_name": record["camera_name"]}
+            annotations = [] if record["annotation"] is None else [record["annotation"]]
+            yield {"image": names | record["image"], "annotations": annotations}
+
+    return numbered(with_cameras())
+
+
+def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Joints of every frame number, however many cameras saw it."""
+    known: dict[int, int] = {}
+    for record in records:
+        number, joints = record["image"]["frame_idx"], record["joints"]
+        seal = hash(to_json(joints))
+        if number not in known:
+            known[number] = seal
+            yield number, joints
+        elif known[number] != seal:
+            raise DatasetError(
+                f"two pictures of frame {number} have different hands; interhand holds one take a folder"
+            )
+
+
+def skeleton_lines() -> str:
+    """`skeleton.txt`: name, index and parent's index of the 42 joints."""
+    lines = ["# joint_name joint_id joint_parent_id"]
+    for side_number, side in enumerate(_ORDER):
+        first, letter = NUM_KEYPOINTS * side_number, side[0]
+        for digit_number, digit in enumerate(DIGITS):
+            name = "pinky" if digit == "little" else digit
+            for step in range(4):
+                index = first + 4 * digit_number + step
+                parent = index + 1 if step < 3 else first + NUM_KEYPOINTS - 1
+                lines.append(f"{letter}_{name}{4 - step} {index} {parent}")
+        lines.append(f"{letter}_wrist {first + NUM_KEYPOINTS - 1} -1")
+    return "\n".join(lines) + "\n"
+
+
+def _joints(hands: dict[Side, HandTruth]) -> tuple[list[list[float]], list[int]]:
+    """42 joints in the world [mm], zero for a hand that is not there, and which of them are."""
+    joints, valid = np.zeros((2 * NUM_KEYPOINTS, 3)), np.zeros(2 * NUM_KEYPOINTS, dtype=int)
+    for number, side in enumerate(_ORDER):
+        if side in hands:
+            rows = slice(NUM_KEYPOINTS * number, NUM_KEYPOINTS * (number + 1))
+            joints[rows], valid[rows] = 1e3 * to_order(hands[side].keypoints_world, "interhand"), 1
+    return rounded(joints, 6), valid.tolist()
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    K = centered_K(camera)
+    return {
+        "campos": (1e3 * camera.T_world_camera[:3, 3]).tolist(),
+        "camrot": camera.T_world_camera[:3, :3].T.tolist(),
+        "focal": [K[0, 0], K[1, 1]],
+        "princpt": K[:2, 2].tolist(),
+    }
+
+
+def _union(boxes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Smallest box (left, top, width, height) around some."""
+    if not boxes:
+        return np.zeros(4)
+    corners = np.array(boxes)
+    low, high = corners[:, :2].min(axis=0), (corners[:, :2] + corners[:, 2:]).max(axis=0)
+    return np.concatenate([low, high - low])
+
+
+class InterhandWriter(FolderWriter):
+    """`images/train/shard-00000/KEY.jpg`, and InterHand2.6M's JSON files in `annotations/train`."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, part=SPLIT)
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        _need_colors(frame, "interhand")
+        record = interhand_record(frame, f"{name}/{frame.key}.jpg")
+        record["image"] |= self._add_pictures(folder, frame, name)
+        return record
+
+    def finish(self) -> None:
+        """Write the files in `annotations`.
+
+        Raises:
+            HandSimError: A shard is damaged, pictures of one frame have different hands, or the disk takes
+                no more.
+        """
+        annotations = self.folder / "annotations"
+        start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
+        cameras = Cameras()
+
+        def pictures() -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+            return interhand_numbered(self._records(), cameras)
+
+        def joints() -> Iterator[str]:
+            yield f'{{"{CAPTURE}":{{'
+            for index, (number, record) in enumerate(frames_once(self._records())):
+                yield f'{"," if index else ""}\n"{number}":{to_json(record)}'
+            yield "\n}}\n"
+
+        category = {"id": 1, "name": "hand", "supercategory": "hand"}
+        with one_sentence(self.folder, "writing the annotations"):
+            save_text(Path(f"{start}_joint_3d.json"), joints())
+            save_text(Path(f"{start}_data.json"), _coco_file(pictures, [category]))
+            save_text(Path(f"{start}_camera.json"), [to_json(cameras.table()) + "\n"])
+            save_text(annotations / "skeleton.txt", [skeleton_lines()])

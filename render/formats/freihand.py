@@ -1,0 +1,186 @@
+"""FreiHAND's folders: pictures numbered through the whole set, and the lists beside them.
+
+One entry per hand, for loaders of that dataset. `K @ xyz` gives pixels that are counted from the first one's
+center. Left hands stay left hands, although FreiHAND has none; `training_info.json` says which is which.
+There are no MANO parameters: `training_mano.json` holds a null an entry, so that its readers find a list of
+the right length.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from handsim.errors import DatasetError, HandSimError
+from render.formats.records import (
+    as_sensed,
+    centered_K,
+    encode_depth,
+    encode_jpeg,
+    hand_mask,
+    is_seen,
+    rounded,
+    to_json,
+    without_colors,
+)
+from render.formats.shards import (
+    json_list,
+    load_index,
+    new_folder,
+    one_sentence,
+    save_index,
+    save_text,
+    shard_name,
+    shards_in,
+)
+from render.frames import RenderedFrame
+
+SET: Final = "training"
+LISTS: Final = ("K", "xyz", "scale", "mano", "info")
+"""The JSON files that every set has; `verts` is written on demand."""
+_NUMBERS: Final = "numbers.json"
+_KINDS: Final = {"rgb": ".jpg", "mask": ".jpg", "depth": ".png"}
+
+
+def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dict[str, Any]]]:
+    """The visible hands: their indices in the frame, and their entries in each of the lists.
+
+    The skin is added where `vertices`, some 150 kB a hand.
+
+    Raises:
+        HandSimError: The camera's lens is not a pinhole.
+    """
+    K = centered_K(frame.camera).tolist()
+    entries = []
+    for number, hand in enumerate(frame.hands):
+        if not is_seen(hand):
+            continue
+        # The bone that FreiHAND measures hands by: the middle finger's first.
+        scale = float(np.linalg.norm(hand.keypoints_world[10] - hand.keypoints_world[9]))
+        entry: dict[str, Any] = {
+            "K": K,
+            "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
+            "scale": scale,
+            "mano": None,
+            "info": {"side": hand.shape.side, "frame": frame.number, "camera": frame.camera.name},
+        }
+        if vertices:
+            entry["verts"] = rounded(frame.camera.local(hand.vertices), 6)
+        entries.append((number, entry))
+    return entries
+
+
+class FreihandWriter:
+    """`training/rgb/00000000.jpg`, `training/mask/00000000.jpg` and the lists `training_*.json`.
+
+    One entry per hand: a picture of two hands comes twice. Shards wait in `parts` until `finish` moves their
+    pictures to their numbers, which a shard keeps: what is rendered later comes after it. The shards' lists
+    stay in `parts`.
+
+    Args:
+        folder: Where the set shall be.
+        vertices: Whether to write `training_verts.json`, some 150 kB a hand.
+    """
+
+    def __init__(self, folder: Path, *, vertices: bool = False) -> None:
+        self.folder = folder
+        self.parts = folder / "parts"
+        self.vertices = vertices
+
+    def done(self) -> frozenset[int]:
+        """Shards that are complete."""
+        return shards_in(self.parts)
+
+    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
+        """Write a shard.
+
+        Raises:
+            HandSimError: The shard has its numbers already, a camera is not a pinhole camera, there are no
+                color pictures, or the disk takes no more.
+        """
+        if str(shard) in self._numbers():
+            raise HandSimError(f"{self.folder}: shard {shard} is numbered already and cannot be written anew")
+        folder = self.parts / shard_name(shard)
+        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(folder) as temporary:
+            entries: list[dict[str, Any]] = []
+            for kind in _KINDS:
+                (temporary / kind).mkdir()
+            for frame in frames:
+                for hand, entry in hand_entries(frame, vertices=self.vertices):
+                    for kind, content in _pictures(frame, hand).items():
+                        (temporary / kind / f"{len(entries):08d}{_KINDS[kind]}").write_bytes(content)
+                    entries.append(entry)
+            save_index(temporary, entries)
+
+    def finish(self) -> None:
+        """Number the pictures and write the lists.
+
+        Raises:
+            HandSimError: A shard is damaged, or the disk takes no more.
+        """
+        with one_sentence(self.folder, "numbering the pictures"):
+            numbers = self._numbered()
+            for shard, (first, count) in numbers.items():
+                self._move(int(shard), first, count)
+            shards = sorted(numbers, key=lambda shard: numbers[shard])
+            names = (*LISTS, "verts") if self.vertices else LISTS
+            for name in names:
+                entries = (
+                    entry for shard in shards for entry in load_index(self.parts / shard_name(int(shard)))
+                )
+                save_text(self.folder / f"{SET}_{name}.json", json_list(entry[name] for entry in entries))
+
+    def _numbers(self) -> dict[str, list[int]]:
+        """First number and count of every shard that has been numbered."""
+        path = self.parts / _NUMBERS
+        if not path.is_file():
+            return {}
+        try:
+            numbers = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DatasetError(f"{path}: damaged: it holds no JSON; render into another folder") from error
+        if not isinstance(numbers, dict) or not all(map(_is_pair, numbers.values())):
+            raise DatasetError(f"{path}: damaged: it holds no numbers; render into another folder")
+        return numbers
+
+    def _numbered(self) -> dict[str, list[int]]:
+        """Numbers of all complete shards, on the disk before the first picture moves."""
+        numbers = self._numbers()
+        after = max((first + count for first, count in numbers.values()), default=0)
+        for shard in sorted(self.done()):
+            if str(shard) not in numbers:
+                count = len(load_index(self.parts / shard_name(shard)))
+                numbers[str(shard)] = [after, count]
+                after += count
+        save_text(self.parts / _NUMBERS, [to_json(numbers) + "\n"])
+        return numbers
+
+    def _move(self, shard: int, first: int, count: int) -> None:
+        for kind, suffix in _KINDS.items():
+            target = self.folder / SET / kind
+            for index in range(count):
+                source = self.parts / shard_name(shard) / kind / f"{index:08d}{suffix}"
+                if source.exists():  # it does not after an earlier `finish`, nor without such a picture
+                    target.mkdir(parents=True, exist_ok=True)
+                    source.replace(target / f"{first + index:08d}{suffix}")
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(number, int) for number in value)
+
+
+def _pictures(frame: RenderedFrame, hand: int) -> dict[str, bytes]:
+    sensed = as_sensed(frame)
+    if sensed.rgb is None:
+        raise without_colors("freihand")
+    files = {"rgb": encode_jpeg(sensed.rgb)}
+    mask = hand_mask(frame, hand)
+    if mask is not None:  # JPEG, because FreiHAND's readers ask for it; its best keeps black and white apart
+        files["mask"] = encode_jpeg(255 * mask.astype(np.uint8), quality=100)
+    if sensed.depth is not None:
+        files["depth"] = encode_depth(sensed.depth)
+    return files

@@ -1,0 +1,351 @@
+"""Clips in webdataset tars as UmeTrack and HOT3D have them, and the ground truth of a frame in ours.
+
+A clip's sample is one time, seen by one or more cameras ("streams"). What their tools read counts pixels
+from the first one's center, boxes from the picture's corner. `frame_record`, for formats of our own, counts
+all from the corner.
+
+Our hand as a UmeTrack hand model: UmeTrack describes left hands and mirrors them in its x axis for right
+ones; ours are mirrored in y. Its wrist frame is therefore ours rotated by 90 degrees about z. Like ours it
+has four joint angles per digit and equal angles for mirrored poses, so that our angles are its angles.
+
+A crop's camera is a square pinhole camera at the place of the stream's camera. It looks at the middle of
+one hand's keypoints, with room around them. The tools warp the stream's picture to it, which takes the lens
+out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from handsim.errors import HandSimError
+from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import JOINTS, NUM_BONES, NUM_JOINTS, HandShape
+from handsim.space.camera import Camera
+from handsim.space.transforms import quaternion_matrix
+from render.formats.records import (
+    CENTER,
+    METERS_PER_UNIT,
+    by_side,
+    encode_pictures,
+    is_seen,
+    joint_order,
+    rigid_record,
+    rounded,
+    shape_record,
+    to_json,
+    to_order,
+)
+from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
+from render.frames import HandTruth, RenderedFrame
+
+HAND_SHAPES: Final = "__hand_shapes.json__"
+"""File of a clip with the hand model; webdataset passes over such names."""
+_MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "OculusVisionFishEye"}
+# Our wrist frame seen from UmeTrack's.
+_UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_JOINTS_PER_DIGIT: Final = 4
+_ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bones
+
+
+def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them.
+
+    Args:
+        T_world_device: Pose of what the sample's cameras are fixed to.
+    """
+    K, lens = camera.K, camera.lens
+    coefficients = list(lens.coefficients)
+    if lens.kind == "brown":
+        k1, k2, p1, p2, k3 = coefficients
+        coefficients = [k1, k2, k3, p1, p2]
+    elif lens.kind == "fisheye":
+        coefficients += [0.0] * 4  # it has four tangential ones too
+    focal_center = [K[0, 0], K[1, 1], K[0, 2] - CENTER, K[1, 2] - CENTER]
+    return {
+        "calibration": {
+            "label": f"rgb-{camera.name}",  # readers distinguish color from gray by these letters
+            "stream_id": camera.name,
+            "serial_number": camera.name,
+            "image_width": camera.size[0],
+            "image_height": camera.size[1],
+            "projection_model_type": _MODELS[lens.kind],
+            "projection_params": [*focal_center, *coefficients],
+            "T_device_from_camera": rigid_record(np.linalg.inv(T_world_device) @ camera.T_world_camera),
+        },
+        "T_world_from_camera": rigid_record(camera.T_world_camera),
+        "depth_metres_per_unit": METERS_PER_UNIT,
+        "camera": camera.record(),
+    }
+
+
+def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
+    """`hands.json` of one time, a frame a stream: `left` and `right`, null for a hand that is not there.
+
+    Raises:
+        HandSimError: Two hands are of the same side.
+    """
+    streams = [(frame.camera.name, by_side(frame)) for frame in frames]
+    record: dict[str, Any] = {"left": None, "right": None}
+    for side, hand in streams[0][1].items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = quaternion_matrix(hand.qpos[3:7]), hand.qpos[:3]
+        wrist = umetrack_wrist(pose)
+        record[side] = {
+            "umetrack_pose": {
+                "joint_angles": hand.qpos[7:].tolist(),
+                "wrist_xform": wrist.tolist(),
+                "T_world_from_wrist": rigid_record(wrist),
+            },
+            "landmarks": rounded(to_order(hand.keypoints_world, "umetrack"), 9),
+            **_truth(hand),
+            "pixels": {name: rounded(hands[side].keypoints - CENTER, 5) for name, hands in streams},
+            "visible": {name: hands[side].visible for name, hands in streams},
+            "boxes": {name: rounded(hands[side].box, 3) for name, hands in streams},
+        }
+    return record
+
+
+def hand_shapes_record(shape: HandShape) -> dict[str, Any]:
+    """`__hand_shapes.json__`, shared by both hands of a clip; without MANO parameters."""
+    return {"mano": [], "umetrack": umetrack_hand(shape)}
+
+
+def objects_record(frame: RenderedFrame) -> dict[str, Any]:
+    """`objects.json`: poses of the rigid things by name."""
+    record: dict[str, Any] = {}
+    for body in frame.bodies:
+        entry = {"object_name": body.name, "T_world_from_object": rigid_record(body.T_world_body)}
+        record.setdefault(body.name, []).append(entry)
+    return record
+
+
+def markers_record(frame: RenderedFrame) -> dict[str, Any]:
+    """`markers.json`: what the optical system saw, whose points they are, and where the markers were [m]."""
+    return {
+        "points": rounded(frame.points, 9),
+        "labels": frame.labels,
+        "label_names": frame.label_names,
+        "hands": [
+            {
+                "side": hand.shape.side,
+                "marker_names": hand.marker_names,
+                "markers": rounded(hand.markers, 9),
+            }
+            for hand in frame.hands
+        ],
+    }
+
+
+def frame_record(frame: RenderedFrame) -> dict[str, Any]:
+    """The ground truth of a frame without its skin: meters, world axes, pixels from the corner."""
+    return {
+        "number": frame.number,
+        "time": frame.time,
+        "camera": frame.camera.record(),
+        "depth_metres_per_unit": METERS_PER_UNIT,
+        "hands": [
+            {
+                "side": hand.shape.side,
+                **_truth(hand),
+                "pixels": rounded(hand.keypoints, 5),
+                "visible": hand.visible,
+                "box": rounded(hand.box, 3),
+            }
+            for hand in frame.hands
+        ],
+        "bodies": [{"name": body.name, "T_world_body": body.T_world_body.tolist()} for body in frame.bodies],
+        "markers": markers_record(frame),
+        "choices": frame.choices,
+    }
+
+
+def _truth(hand: HandTruth) -> dict[str, Any]:
+    return {
+        "keypoints": rounded(hand.keypoints_world, 9),
+        "qpos": hand.qpos.tolist(),
+        "shape": shape_record(hand.shape),
+    }
+
+
+def umetrack_wrist(T_world_wrist: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """`T_world_from_wrist` of a hand whose wrist is there."""
+    pose: NDArray[np.float64] = np.array(T_world_wrist, dtype=np.float64)
+    pose[:3, :3] = pose[:3, :3] @ _UMETRACK_FROM_OURS.T
+    return pose
+
+
+def umetrack_hand(shape: HandShape) -> dict[str, Any]:
+    """The hand model of a person, the same for both sides; lengths in millimeters, as UmeTrack has them."""
+    model = HandModel(shape.with_side("left"))
+    bones = [joint.bone for joint in JOINTS]
+    rest = model.rest_transforms[bones]
+    axes = np.einsum("jab,jb->ja", rest[:, :3, :3], model.skeleton.axes)
+    step = np.arange(NUM_JOINTS) % _JOINTS_PER_DIGIT
+    numbers = np.arange(NUM_JOINTS)
+    next_digit = numbers + _JOINTS_PER_DIGIT
+    surface = model.surface
+    weights = np.zeros((len(surface.vertices), _ROOT_FRAMES + NUM_BONES))
+    np.add.at(
+        weights, (np.arange(len(weights))[:, None], surface.bone_indices + _ROOT_FRAMES), surface.bone_weights
+    )
+    landmarks = to_order(hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0], "umetrack")
+    return {
+        "joint_rotation_axes": rounded(axes @ _UMETRACK_FROM_OURS.T, 8),
+        "joint_rest_positions": rounded(1e3 * rest[:, :3, 3] @ _UMETRACK_FROM_OURS.T, 5),
+        "joint_frame_index": [_ROOT_FRAMES + bone for bone in bones],
+        "joint_parent": np.where(step == 0, -1, numbers - 1).tolist(),
+        "joint_first_child": np.where(step == _JOINTS_PER_DIGIT - 1, -1, numbers + 1).tolist(),
+        "joint_next_sibling": np.where((step == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
+        "landmark_rest_positions": rounded(1e3 * landmarks @ _UMETRACK_FROM_OURS.T, 5),
+        "landmark_rest_bone_weights": [[1.0]] * len(landmarks),
+        "landmark_rest_bone_indices": [[_ROOT_FRAMES + _bone(joint)] for joint in joint_order("umetrack")],
+        "mesh_vertices": rounded(1e3 * surface.vertices @ _UMETRACK_FROM_OURS.T, 4),
+        "mesh_triangles": surface.faces.tolist(),
+        "dense_bone_weights": rounded(weights, 6),
+        "joint_limits": rounded(model.skeleton.ranges, 6),
+    }
+
+
+def _bone(keypoint: int) -> int:
+    """The bone that a keypoint is fixed to: the one that begins there, for a tip the last."""
+    digit = KEYPOINT_DIGITS[keypoint]
+    return 0 if digit < 0 else 1 + 3 * digit + min((keypoint - 1) % 4, 2)
+
+
+_STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
+TAR: Final = ".tar"
+_FILLED: Final = 0.8  # of the crop's half width, by the keypoint that is farthest from its middle
+_WIDEST: Final = np.deg2rad(120.0)  # a flat picture of more is mostly stretching
+_ROUNDS: Final = 5  # towards the middle, which moves a little when the camera turns
+_NEAREST: Final = 1e-3  # [m]
+
+
+class WebdatasetWriter:
+    """`shard-00000.tar`: clips as UmeTrack and HOT3D have them, a sample a time, a stream a camera."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def done(self) -> frozenset[int]:
+        """Shards that are complete."""
+        return shards_in(self.folder, suffix=TAR)
+
+    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
+        """Write a shard, or write it anew; frames of one number, from different cameras, follow one another.
+
+        Raises:
+            HandSimError: They do not, a frame has two hands of one side, or the disk takes no more.
+        """
+        persons: dict[str, HandShape] = {}
+        numbers = set()
+        path = self.folder / f"{shard_name(shard)}{TAR}"
+        with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as tar:
+            for number, group in itertools.groupby(frames, key=lambda frame: frame.number):
+                if number in numbers:
+                    raise HandSimError(f"the pictures of frame {number} do not follow one another")
+                numbers.add(number)
+                views = list(group)
+                for name, content in _sample(views):
+                    tar.add(f"{number:06d}.{name}", content)
+                for hand in views[0].hands:
+                    persons.setdefault(to_json({**shape_record(hand.shape), "side": None}), hand.shape)
+            if len(persons) == 1:  # a clip has room for one
+                record = hand_shapes_record(*persons.values())
+                tar.add(HAND_SHAPES, to_json(record).encode())
+
+    def finish(self) -> None:
+        """Tars stand alone."""
+
+
+def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
+    """Files of one time: their names after the key, and their bytes."""
+    names = [view.camera.name for view in views]
+    for name in names:
+        if not _STREAM.fullmatch(name):
+            raise HandSimError(f"camera '{name}': a stream's name has letters, digits, - and _ only")
+    if len(set(names)) < len(names):
+        raise HandSimError(f"frame {views[0].number} has two pictures of one camera: {', '.join(names)}")
+    for view in views:
+        for suffix, content in encode_pictures(view, lossless=False).items():
+            kind, _, ending = suffix.rpartition(".")
+            yield f"{kind.strip('.') or 'image'}_{view.camera.name}.{ending}", content
+    first = views[0]
+    device = first.camera.T_world_camera  # the first camera is the device
+    records = {
+        "cameras": {view.camera.name: camera_record(view.camera, device) for view in views},
+        "hands": hands_record(views),
+        "hand_crops": crops_record(views),
+        "objects": objects_record(first),
+        "markers": markers_record(first),
+        "choices": {view.camera.name: view.choices for view in views},
+        "info": {"number": first.number, "time": first.time},
+    }
+    for name, record in records.items():
+        yield f"{name}.json", to_json(record).encode()
+
+
+def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
+    """`hand_crops.json` of one time: for each side the crop's camera in each stream that sees the hand.
+
+    By stream: `T_world_from_crop_camera`, and `crop_camera_fov`, the full angle of view [rad].
+
+    Raises:
+        HandSimError: Two hands are of the same side.
+    """
+    record: dict[str, Any] = {"left": {}, "right": {}}
+    for frame in frames:
+        for side, hand in by_side(frame).items():
+            crop = crop_camera(frame.camera, hand.keypoints_world) if is_seen(hand) else None
+            if crop is not None:
+                T_world_crop, angle = crop
+                record[side][frame.camera.name] = {
+                    "T_world_from_crop_camera": rigid_record(T_world_crop),
+                    "crop_camera_fov": angle,
+                }
+    return record
+
+
+def crop_camera(
+    camera: Camera, keypoints: Float[np.ndarray, "21 3"]
+) -> tuple[Float[np.ndarray, "4 4"], float] | None:
+    """The pose of a camera for one hand alone, from its keypoints [m], and its full angle of view [rad].
+
+    None for a hand beside or behind the camera, or one that no flat picture of 120 degrees holds.
+    """
+    local = camera.local(keypoints)
+    if local[:, 2].mean() < _NEAREST:
+        return None
+    rotation = _looking_along(local.mean(axis=0))
+    for _ in range(_ROUNDS):
+        turned = local @ rotation
+        if turned[:, 2].min() < _NEAREST:
+            return None
+        flat = turned[:, :2] / turned[:, 2:]
+        middle = (flat.min(axis=0) + flat.max(axis=0)) / 2.0
+        rotation = _looking_along(rotation @ np.append(middle, 1.0))
+    turned = local @ rotation
+    if turned[:, 2].min() < _NEAREST:
+        return None
+    reach = float(np.abs(turned[:, :2] / turned[:, 2:]).max()) / _FILLED
+    angle = 2.0 * float(np.arctan(reach))
+    if angle > _WIDEST:
+        return None
+    T_world_crop: NDArray[np.float64] = camera.T_world_camera.copy()
+    T_world_crop[:3, :3] = T_world_crop[:3, :3] @ rotation
+    return T_world_crop, angle
+
+
+def _looking_along(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation whose z axis is this direction, and whose x axis is as level as the camera's."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -1,0 +1,538 @@
+"""Ready-made pictures and videos of hands, gloves, camera views and labeled frames, without OpenGL."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.layout import MarkerLayout
+from gloves.optics.visibility import visible_cameras
+from handsim._checks import check_array
+from handsim.errors import ArgumentError, FileError, HandSimError
+from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import BONE_NAMES, NUM_QPOS, SIZES
+from handsim.hand.skin import vertex_normals
+from handsim.space.camera import Camera, pinhole
+from handsim.space.rig import CameraRig
+from poses.shapes import gesture, make_valid
+from render.captions import (
+    BACKGROUND,
+    HIDDEN_COLOR,
+    SEEN_COLOR,
+    UNLABELED_COLOR,
+    Covering,
+    bone_colors,
+    captioned,
+    covering_material,
+    pad,
+    side_by_side,
+    skin_tint,
+    titled,
+    with_names,
+)
+from render.painting.figures import MARKER_COLOR, Drawn, Material, ball_material, linear, sphere_surface
+from render.painting.painter import paint, put_before
+from render.painting.rasterizer import NEAR, Triangles, join, rasterize
+from render.scenery.lights import STUDIO
+
+if TYPE_CHECKING:
+    from render.captions import Picture
+
+_BALL_LEVEL: Final = 3
+_OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera: its pose and its field of view.
+
+    Raises:
+        HandSimError: The pose is not (4, 4), or the angle is out of range.
+    """
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Pose in the world [m], OpenCV axes: x right, y down, z into the picture."""
+    field_of_view: float
+    """Full vertical opening angle [rad]."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
+        if not 0.0 < self.field_of_view < np.pi:
+            raise HandSimError(f"field_of_view is {self.field_of_view:g}, expected radians between 0 and pi")
+
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """The pinhole camera of this view; an `ArgumentError` if no picture has that size [px]."""
+        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
+        return pinhole("view", size, float(focal)).at(self.T_world_camera)
+
+    def project(
+        self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of world points [m] in a picture (width, height) [px]; counted as by `Camera`."""
+        rotation, center = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        local = (points - center) @ rotation
+        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
+        pixels: NDArray[np.float64] = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
+        return pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Balls:
+    """Spheres of one radius, such as markers or the points that an optical system sees."""
+
+    centers: Float[np.ndarray, "N 3"]
+    """Centers in the world [m]; NaN rows are not drawn."""
+    radius: float
+    """Radius [m]."""
+    colors: Float[np.ndarray, "N 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all or one each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedHand:
+    """A hand in a pose, with or without a glove's markers."""
+
+    hand: GloveFit | HandModel
+    """In a glove whose markers are drawn, or without one."""
+    qpos: Float[np.ndarray, "27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
+    covering: Covering = "skin"
+    """Bare skin or a dark glove."""
+    marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all markers or one each."""
+
+    def __post_init__(self) -> None:
+        qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
+        if qpos.ndim != 1:
+            raise HandSimError(f"qpos has shape {qpos.shape}, expected ({NUM_QPOS},): one pose per hand")
+        object.__setattr__(self, "qpos", qpos)
+
+    @property
+    def model(self) -> HandModel:
+        """The hand without its glove."""
+        return self.hand.model if isinstance(self.hand, GloveFit) else self.hand
+
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Skin in the world [m]."""
+        vertices: NDArray[np.float64] = self.model.skin(self.qpos[None])[0]
+        return vertices
+
+    def markers(self) -> Float[np.ndarray, "M 3"]:
+        """Marker centers in the world [m]; none without a glove."""
+        if not isinstance(self.hand, GloveFit):
+            return np.empty((0, 3))
+        markers: NDArray[np.float64] = self.hand.markers(self.qpos[None])[0][0]
+        return markers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandScene:
+    """The content of one picture."""
+
+    view: View
+    hands: tuple[PosedHand, ...] = ()
+    balls: tuple[Balls, ...] = ()
+    background: tuple[float, float, float] = BACKGROUND
+    """sRGB in [0, 1]."""
+
+
+def view_along(
+    direction: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+    points: Float[np.ndarray, "N 3"],
+    size: tuple[int, int],
+    *,
+    field_of_view: float = np.deg2rad(24.0),
+    margin: float = 0.06,
+) -> View:
+    """The nearest view in a given direction that has all points [m] in the picture.
+
+    `up` is the direction in the world that points up in the picture, the field of view its full vertical
+    opening angle [rad], and the margin on each side a share of the picture.
+    """
+    ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    local = points @ rotation
+    slope = np.tan(field_of_view / 2) * (1 - 2 * margin) * np.array([size[0] / size[1], 1.0])
+    # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
+    above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    distance = max(*((above + below) / (2 * slope)), 2 * NEAR - local[:, 2].min())
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
+    return View(pose, field_of_view)
+
+
+def scene_surfaces(scene: HandScene) -> list[Drawn]:
+    """The surfaces of a scene: skins with smooth normals, markers and free points."""
+    surfaces: list[Drawn] = []
+    for hand in scene.hands:
+        vertices, faces = hand.vertices(), hand.model.surface.faces
+        colors = skin_tint(hand.model) if hand.covering == "skin" else np.ones((len(vertices), 3))
+        surfaces.append(
+            _surface(
+                vertices, vertex_normals(vertices, faces), faces, colors, covering_material(hand.covering)
+            )
+        )
+        if isinstance(hand.hand, GloveFit):
+            surfaces += _ball_surfaces(Balls(hand.markers(), hand.hand.layout.radius, hand.marker_colors))
+    for balls in scene.balls:
+        surfaces += _ball_surfaces(balls)
+    return surfaces
+
+
+def _ball_surfaces(balls: Balls) -> list[Drawn]:
+    """All balls as one surface, with colors by vertex; nothing where no center is known."""
+    known = np.isfinite(balls.centers).all(axis=-1)
+    centers = balls.centers[known]
+    if not len(centers):
+        return []
+    vertices, normals, faces = sphere_surface(centers, balls.radius, level=_BALL_LEVEL)
+    tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
+    colors = np.repeat(tint, len(vertices) // len(centers), axis=0)
+    return [_surface(vertices, normals, faces, colors, ball_material())]
+
+
+def _surface(
+    vertices: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    colors: NDArray[np.float64],
+    material: Material,
+) -> Drawn:
+    """A surface without ids, its colors (V, 3) linear factors on the material's."""
+    ids = np.zeros(len(faces), dtype=np.uint8)
+    factors = np.ones((len(vertices), 4), dtype=np.float32)
+    factors[:, :3] = colors
+    return Drawn(Triangles(vertices, faces, normals, ids, ids, ids), factors, None, lambda: material)
+
+
+def render_rgb(
+    scene: HandScene, size: tuple[int, int], *, behind: UInt8[np.ndarray, "H W 3"] | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Color picture, sRGB, before a picture or the scene's background."""
+    width, height = size
+    camera = scene.view.camera(size)
+    K = camera.K.copy()
+    K[:2] *= _OVERSAMPLING
+    large = dataclasses.replace(camera, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), K=K)
+    painted = cv2.resize(paint(large, scene_surfaces(scene), STUDIO), size, interpolation=cv2.INTER_AREA)
+    if behind is None:
+        paper = np.rint(255.0 * np.array(scene.background))
+        behind = np.broadcast_to(paper.astype(np.uint8), (height, width, 3))
+    return put_before(painted, np.ascontiguousarray(behind, dtype=np.float32))
+
+
+def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
+    """Depth picture: distance along the camera's axis [m] at each pixel's center, 0 where there is nothing.
+
+    Raises:
+        ArgumentError: No picture has that size.
+    """
+    camera, surfaces = scene.view.camera(size), scene_surfaces(scene)
+    if not surfaces:
+        return np.zeros(size[::-1], dtype=np.float32)
+    depth = rasterize(camera, join([one.triangles for one in surfaces]), with_normals=False).depth
+    assert depth is not None
+    return depth
+
+
+def unoccluded(
+    depth: Float32[np.ndarray, "H W"], view: View, points: Float[np.ndarray, "N 3"], *, slack: float
+) -> Bool[np.ndarray, "N"]:
+    """Which points lie in a depth picture with nothing in front of them.
+
+    Args:
+        depth: The picture [m], 0 where there is nothing.
+        points: Points in the world [m].
+        slack: How far behind the first surface a point still counts [m], such as a marker's radius.
+    """
+    height, width = depth.shape
+    column, row = np.floor(view.project(points, (width, height))).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    first = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    ahead = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
+    free: NDArray[np.bool_] = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
+    return free
+
+
+SUFFIX: Final = ".mp4"
+_SIZE: Final = (800, 600)  # [px]
+_CODEC: Final = "mp4v"  # part of every build of OpenCV
+_AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
+_TEXT: Final = (60, 60, 60)
+
+
+class ClipFrame(NamedTuple):
+    """One picture of a video."""
+
+    hands: Sequence[tuple[HandModel, Float[np.ndarray, "27"]]]
+    """Hands with their poses in the world [m, rad]."""
+    points: Float[np.ndarray, "N 3"]
+    """World [m]."""
+    colors: Float[np.ndarray, "N 3"]
+    """Of the points, sRGB in [0, 1]."""
+    caption: str
+    """One line of text at the bottom."""
+
+
+def write_clip(
+    path: Path,
+    frames: Iterable[tuple[object, ...]],
+    *,
+    rate: float,
+    shown: Float[np.ndarray, "N 3"],
+    radius: float,
+) -> None:
+    """Write a video (.mp4) of frames with the fields of `ClipFrame`, whole or not at all.
+
+    The view shows some points in the world [m]; points of frames have this radius [m].
+    """
+    if path.suffix.lower() != SUFFIX:
+        raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
+    view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
+    try:
+        with atomic_write(path) as temporary, plain_path(temporary) as plain:
+            writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
+            try:
+                if not writer.isOpened():
+                    raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
+                for frame in frames:
+                    picture = draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
+                    writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            finally:
+                writer.release()
+            _check_written(plain)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _check_written(path: Path) -> None:
+    """Check that a video can be read: OpenCV does not notice failed writes, such as on a full disk."""
+    reader = cv2.VideoCapture(str(path))
+    try:
+        if not reader.isOpened():
+            raise unwritten(path)
+    finally:
+        reader.release()
+
+
+def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:
+    """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out.
+
+    Args:
+        radius: Radius of the points [m].
+    """
+    hands = tuple(PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all())
+    balls = (Balls(frame.points, radius, frame.colors),) if len(frame.points) else ()
+    picture = render_rgb(HandScene(view, hands, balls), _SIZE)
+    place = (16, _SIZE[1] - 18)
+    cv2.putText(picture, frame.caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
+    return picture
+
+
+FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
+# Directions of view in the wrist frame of a right hand; mirrored for a left hand.
+SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
+    "back": (0.0, 0.0, -1.0),
+    "palm": (0.0, 0.0, 1.0),
+    "thumb side": (0.0, -1.0, -0.25),
+}
+_GAP: Final = 0.025  # between hands in a row [m]
+_WIDTH, _COLUMNS = 2000, 4  # of a picture of rows [px]; gloves in a row
+_HEIGHT: Final = 900  # of a glove from one side [px]
+_CAMERA_SIZE: Final = (1100, 900)  # [px], without names
+_LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
+
+
+def draw_row(
+    hands: Sequence[tuple[str, HandModel | GloveFit, Float[np.ndarray, "27"]]],
+    *,
+    direction: Float[np.ndarray, "3"] | tuple[float, float, float] = SIDES_OF_HAND["back"],
+    covering: Covering = "skin",
+    width: int = _WIDTH,
+) -> Picture:
+    """Hands side by side at one scale, wrists on one line, each with its caption.
+
+    Args:
+        hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
+        direction: Direction of view.
+    """
+    ahead = np.asarray(direction, dtype=np.float64)
+    right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
+    posed, centers, extent = [], [], 0.0
+    for _, hand, qpos in hands:
+        at_origin = np.array(qpos)
+        at_origin[:3] = 0.0
+        vertices = PosedHand(hand, at_origin).vertices()
+        across = vertices @ right
+        at_origin[:3] = right * (extent - across.min())
+        at_origin[0] -= vertices[:, 0].min()
+        centers.append(at_origin[:3] + right * (across.min() + across.max()) / 2)
+        extent += float(np.ptp(across)) + _GAP
+        posed.append(PosedHand(hand, at_origin, covering=covering))
+    points = np.concatenate([hand.vertices() for hand in posed])
+    tall = float(np.ptp(points[:, 0])) / (extent - _GAP)
+    size = (width, round(width * min(1.0, tall) * 1.04))
+    # A narrow view from far away shows all hands at one scale, and not the sides of the outer ones.
+    view = view_along(ahead, FINGERS_UP, points, size, field_of_view=np.deg2rad(4.0), margin=0.015)
+    picture = render_rgb(HandScene(view, tuple(posed)), size)
+    pixels = view.project(np.array(centers), size)[:, 0]
+    return captioned(picture, [(float(x), hand[0]) for x, hand in zip(pixels, hands, strict=True)])
+
+
+def draw_sizes() -> Picture:
+    """The five sizes from the back, at one scale."""
+    models = {size: HandModel.named(size) for size in SIZES}
+    spread = join_qpos(gesture("spread")[None])[0]
+    return draw_row(
+        [
+            (f"{size}: {1e3 * model.shape.length:.0f} x {1e3 * model.shape.breadth:.0f} mm", model, spread)
+            for size, model in models.items()
+        ]
+    )
+
+
+def draw_gloves(fits: Sequence[GloveFit]) -> Picture:
+    """Gloves (one at least) on flat hands from the back, with name and number of markers, in rows."""
+    spread = join_qpos(gesture("spread")[None])[0]
+    cells = [(f"{fit.layout.name}: {fit.layout.num_markers}", fit, spread) for fit in fits]
+    rows = [
+        draw_row(
+            cells[start : start + _COLUMNS],
+            covering="glove",
+            width=_WIDTH * min(_COLUMNS, len(cells) - start) // _COLUMNS,
+        )
+        for start in range(0, len(cells), _COLUMNS)
+    ]
+    return np.concatenate([pad(row, (0, 0), (0, _WIDTH - row.shape[1])) for row in rows])
+
+
+def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:
+    """Gestures of one hand, seen obliquely from the thumb's side of the palm."""
+    poses = join_qpos(make_valid(model, np.stack([gesture(name) for name in names])))
+    captions = [name.replace("_", " ") for name in names]
+    rows = list(zip(captions, [model] * len(names), poses, strict=True))
+    return draw_row(rows, direction=(0.0, -0.75, 1.0))
+
+
+def draw_glove(
+    fit: GloveFit,
+    *,
+    sides: Sequence[str] = tuple(SIDES_OF_HAND),
+) -> Picture:
+    """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows."""
+    colors = marker_colors(fit.layout)
+    hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
+    vertices, markers = hand.vertices(), hand.markers()
+    mirror = np.array([1.0, 1.0 if fit.side == "right" else -1.0, 1.0])
+    pictures = []
+    for side in sides:
+        ahead = mirror * SIDES_OF_HAND[side]
+        across = np.cross(ahead, FINGERS_UP) / np.linalg.norm(ahead)
+        shape = float(np.ptp(vertices @ across) / np.ptp(vertices[:, 0]))
+        size = (round(_HEIGHT * max(0.45, shape)), _HEIGHT)
+        view = view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
+        scene = HandScene(view, (hand,))
+        radius = fit.layout.radius
+        shown = unoccluded(render_depth(scene, size), view, markers, slack=1.5 * radius)
+        pixels = np.where(shown[:, None], view.project(markers, size), np.nan)
+        picture = with_names(render_rgb(scene, size), pixels, fit.layout.names, colors)
+        pictures.append(titled(picture, side))
+    return side_by_side(pictures, gap=40)
+
+
+def draw_camera(
+    fit: GloveFit,
+    qpos: Float[np.ndarray, "27"],
+    rig: CameraRig,
+    camera: int,
+) -> tuple[Picture, Bool[np.ndarray, "M"]]:
+    """The view of a camera of a rig, zoomed in, and which markers it sees: green, the others red rings."""
+    size = _CAMERA_SIZE
+    transforms = fit.model.forward_kinematics(qpos[None])
+    markers, normals = fit.attachment.markers(fit.model, transforms)
+    capsules = fit.model.capsules
+    seen = visible_cameras(markers, normals, rig, capsules.posed(transforms), capsules.radii)[0, :, camera]
+    colors = np.where(seen[:, None], SEEN_COLOR, HIDDEN_COLOR)
+    hand = PosedHand(fit, qpos, "glove", colors)
+    vertices = hand.vertices()
+    towards = vertices.mean(axis=0) - rig.positions[camera]
+    up = np.array([0.0, 0.0, 1.0])
+    view = view_along(towards, up, vertices, size, field_of_view=zoom(towards, vertices, up, size))
+    picture = render_rgb(HandScene(view, (hand,)), size)
+    pixels = view.project(markers[0], size)
+    for x, y in np.rint(pixels[~seen]).astype(int):
+        cv2.circle(picture, (x, y), 13, byte_color(HIDDEN_COLOR), 3, cv2.LINE_AA)
+    return with_names(picture, pixels, fit.layout.names, colors * 0.8), seen
+
+
+def zoom(
+    towards: NDArray[np.float64], points: NDArray[np.float64], up: NDArray[np.float64], size: tuple[int, int]
+) -> float:
+    """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
+    angle = 0.2
+    for _ in range(
+        20
+    ):  # the nearest position for an angle is known; find the angle whose position is the camera's
+        view = view_along(towards, up, points, size, field_of_view=angle)
+        distance = float(np.linalg.norm(points.mean(axis=0) - view.T_world_camera[:3, 3]))
+        angle = 2 * np.arctan(np.tan(angle / 2) * distance / float(np.linalg.norm(towards)))
+    return float(angle)
+
+
+def draw_labels(
+    hand: PosedHand,
+    points: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    layout: MarkerLayout,
+) -> Picture:
+    """A frame's points [m] without labels, and beside them with their labels (-1: a ghost) and the hand."""
+    size = _LABELS_SIZE
+    ghost = labels < 0
+    palette = np.concatenate([marker_colors(layout), [HIDDEN_COLOR]])
+    names = [*layout.names, "ghost"]
+    vertices = hand.vertices()
+    T_world_wrist = hand.model.forward_kinematics(hand.qpos[None])[0, 0]
+    ahead, up = -T_world_wrist[:3, 2], T_world_wrist[:3, 0]
+    view = view_along(ahead, up, np.concatenate([vertices, points]), size)
+    radius = 1.2 * layout.radius
+    gray = render_rgb(HandScene(view, balls=(Balls(points, radius, UNLABELED_COLOR),)), size)
+    bare = PosedHand(hand.model, hand.qpos, covering=hand.covering)
+    faint = render_rgb(HandScene(view, (bare,)), size).astype(np.float32)
+    faint += 0.72 * (255 * np.array(BACKGROUND, dtype=np.float32) - faint)
+    balls = HandScene(view, balls=(Balls(points[~ghost], radius, palette[labels[~ghost]]),))
+    colored = render_rgb(balls, size, behind=np.rint(faint).astype(np.uint8))
+    pixels = view.project(points, size)
+    for x, y in np.rint(pixels[ghost]).astype(int):
+        cv2.circle(colored, (x, y), 9, byte_color(HIDDEN_COLOR), 2, cv2.LINE_AA)
+    named = with_names(colored, pixels, [names[label] for label in labels], palette[labels])
+    margin = (named.shape[0] - size[1]) // 2
+    return side_by_side(
+        [titled(pad(gray, (margin, margin), (0, 0)), "as it comes"), titled(named, "labeled")], gap=20
+    )
+
+
+def marker_colors(layout: MarkerLayout) -> Float[np.ndarray, "M 3"]:
+    """Color (sRGB) of each marker's digit."""
+    bones = [BONE_NAMES.index(marker.bone) for marker in layout.markers]
+    return bone_colors()[bones]
+
+
+def byte_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
+    """The color with 0 to 255 per channel."""
+    red, green, blue = (round(255 * level) for level in color)
+    return red, green, blue

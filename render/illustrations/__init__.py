@@ -1,1 +1,0 @@
-"""Ready-made pictures for pages, drawn without OpenGL."""

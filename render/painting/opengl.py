@@ -1,0 +1,246 @@
+"""Colors by OpenGL through pyrender and EGL, with one off-screen renderer per process."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+
+from handsim._plugins import EGL_PACKAGES
+from handsim.errors import HandSimError
+
+if TYPE_CHECKING:
+    from handsim.space.camera import Camera
+    from render.painting.figures import Drawn, Material
+    from render.scenery.lights import Lighting
+
+_BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
+_EGL_EXTENSIONS: Final = 0x3055
+_MOST_DEVICES: Final = 32
+_SECONDS: Final = 60.0  # a first start of pyrender from a slow disk takes some seconds
+_SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
+_NAME_OF_RENDERER: Final = (
+    "from render.painting.opengl import offscreen_renderer\n"
+    "offscreen_renderer(16, 16)\n"
+    "from OpenGL.GL import GL_RENDERER, glGetString\n"
+    "print('GL_RENDERER', glGetString(GL_RENDERER).decode())\n"
+)
+
+
+def load_pyrender() -> Any:
+    """The pyrender module, which draws without a screen unless PYOPENGL_PLATFORM asks for something else."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    try:
+        import pyrender
+    except ModuleNotFoundError as error:
+        raise HandSimError(
+            f"drawing needs pyrender, and {error}; run `pip install pyrender-maintained`"
+        ) from error
+    except Exception as error:  # PyOpenGL raises errors of many types
+        raise _no_driver(error) from error
+    if pyrender.__version__ == _BROKEN_PYRENDER:
+        raise HandSimError(
+            f"pyrender {_BROKEN_PYRENDER} cannot draw beside today's NumPy; run "
+            "`pip uninstall pyrender pyrender-maintained`, then `pip install pyrender-maintained`"
+        )
+    return pyrender
+
+
+def offscreen_renderer(width: int, height: int) -> Any:
+    """This process's renderer, set to a picture size [px].
+
+    EGL contexts fail when they are made again and again, so there is one, kept until the process ends.
+    """
+    if not (1 <= width <= 8192 and 1 <= height <= 8192):
+        raise HandSimError(f"picture size is {width} x {height}, expected 1 to 8192 pixels each way")
+    renderer = _renderer_of(os.getpid())  # a context does not survive a fork
+    renderer.viewport_width, renderer.viewport_height = width, height
+    return renderer
+
+
+@functools.cache
+def _renderer_of(_process: int) -> Any:
+    pyrender = load_pyrender()
+    try:
+        return pyrender.OffscreenRenderer(64, 64)
+    except Exception as error:  # PyOpenGL raises errors of many types
+        raise _no_driver(error) from error
+
+
+def _no_driver(error: Exception) -> HandSimError:
+    reason = " ".join(str(error).split())[:120] or type(error).__name__
+    platform = os.environ["PYOPENGL_PLATFORM"]
+    return HandSimError(
+        f"drawing without a screen failed ({platform}: {reason}); run `apt-get install {EGL_PACKAGES}` as "
+        "root or install your system's counterparts"
+    )
+
+
+@functools.cache
+def opengl_has_hardware() -> bool:
+    """Whether `render.painting.opengl` would draw on hardware; False where anything fails.
+
+    A list of EGL's devices rules out most machines without hardware within milliseconds. Where there is such
+    a device, another process starts OpenGL and reports its renderer, so that a broken driver cannot end this
+    process.
+    """
+    try:
+        return _some_hardware_device() and is_hardware(_renderer_name())
+    except Exception:  # drivers fail in many ways; our own painter always works
+        return False
+
+
+def is_hardware(renderer: str) -> bool:
+    """Whether a string of `GL_RENDERER` names hardware; an empty one does not."""
+    name = renderer.lower()
+    return bool(name) and not any(software in name for software in _SOFTWARE)
+
+
+def _some_hardware_device() -> bool:
+    """Whether EGL lists a device that is not Mesa's software rasterizer."""
+    if os.environ.get("PYOPENGL_PLATFORM", "egl") != "egl":
+        return True  # the user's own platform: only its renderer can tell
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+    list_devices = ctypes.CFUNCTYPE(
+        ctypes.c_uint, ctypes.c_int, ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
+    )(egl.eglGetProcAddress(b"eglQueryDevicesEXT"))
+    device_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)(
+        egl.eglGetProcAddress(b"eglQueryDeviceStringEXT")
+    )
+    devices, count = (ctypes.c_void_p * _MOST_DEVICES)(), ctypes.c_int(0)
+    if not list_devices(_MOST_DEVICES, devices, ctypes.byref(count)):
+        return False
+    extensions = (device_string(device, _EGL_EXTENSIONS) or b"" for device in devices[: count.value])
+    return any(b"EGL_MESA_device_software" not in names.split() for names in extensions)
+
+
+def _renderer_name() -> str:
+    """`GL_RENDERER` of a new process, empty where OpenGL does not start."""
+    done = subprocess.run(
+        [sys.executable, "-c", _NAME_OF_RENDERER],
+        capture_output=True,
+        text=True,
+        timeout=_SECONDS,
+        check=False,
+    )
+    lines = [line for line in done.stdout.splitlines() if line.startswith("GL_RENDERER ")]
+    return lines[-1].removeprefix("GL_RENDERER ") if done.returncode == 0 and lines else ""
+
+
+OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
+_NEAR, _FAR = 0.01, 30.0  # [m]
+_GL_LINEAR: Final = 0x2601
+_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
+_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
+
+
+def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
+    """See `render.painting.painter.paint`.
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the message says what to install.
+    """
+    pyrender = load_pyrender()
+    renderer = offscreen_renderer(*camera.size)
+    scene = pyrender.Scene(bg_color=[0.0, 0.0, 0.0, 0.0])
+    for one in drawn:
+        primitive = pyrender.Primitive(
+            positions=one.triangles.vertices,
+            normals=one.triangles.normals,
+            indices=one.triangles.faces,
+            texcoord_0=one.uv,
+            color_0=one.colors,
+            material=pyrender_material(one.material()),
+        )
+        scene.add(pyrender.Mesh([primitive]))
+    lens = pyrender.IntrinsicsCamera(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], znear=_NEAR, zfar=_FAR)
+    scene.add(lens, pose=camera.T_world_camera @ OPENGL_FROM_OPENCV)
+    add_lights(pyrender, scene, lighting, camera.T_world_camera)
+    flags = pyrender.RenderFlags
+    painted: NDArray[np.uint8] = renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0]
+    return painted
+
+
+@functools.lru_cache(maxsize=16)
+def pyrender_material(material: Material) -> Any:
+    """A material for pyrender; cached, so that textures are uploaded once.
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the message says what to install.
+    """
+    pyrender, textures = load_pyrender(), {}
+    if material.texels is not None:
+        # No smaller copies of the texture: they would mix tiles that are no neighbors on the hand.
+        sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
+        rough = np.zeros((*material.texels.shape[:2], 3), dtype=np.uint8)
+        rough[..., 0] = material.texels[..., 3]  # its shader reads roughness from red and metal from green
+        sources = {
+            "baseColorTexture": np.ascontiguousarray(material.texels[..., :3]),
+            "normalTexture": np.ascontiguousarray(material.texels[..., 4:7]),
+            "metallicRoughnessTexture": rough,
+        }
+        textures = {
+            name: pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
+            for name, source in sources.items()
+        }
+    return pyrender.MetallicRoughnessMaterial(
+        baseColorFactor=[*material.color, 1.0],
+        metallicFactor=0.0,
+        roughnessFactor=material.roughness,
+        emissiveFactor=np.sqrt(material.glow * material.color),  # its shader squares it
+        **textures,
+    )
+
+
+def add_lights(
+    pyrender: Any,
+    scene: Any,
+    lighting: Lighting,
+    T_world_camera: Float[np.ndarray, "4 4"],
+) -> None:
+    """Light a pyrender scene that holds its meshes already; its ambient light is replaced.
+
+    The lamps' directions are in the axes of the camera.
+    """
+    rotation = T_world_camera[:3, :3]
+    scene.ambient_light = np.array(lighting.ambient)
+    for number, lamp in enumerate(lighting.lamps):
+        towards = rotation @ (np.array(lamp.direction) / np.linalg.norm(lamp.direction))
+        pose = np.eye(4)
+        color, intensity = np.array(lamp.color), np.pi * lamp.strength
+        if number == 0:
+            pose[:3, :3] = frame_with_z(towards)
+            light = pyrender.DirectionalLight(color=color, intensity=intensity)
+            _cast_shadows(pyrender, light, float(scene.scale))
+        else:
+            pose[:3, 3] = T_world_camera[:3, 3] + towards * _DISTANCE
+            light = pyrender.PointLight(color=color, intensity=intensity * _DISTANCE**2)
+        scene.add(light, pose=pose)
+
+
+def _cast_shadows(pyrender: Any, light: Any, extent: float) -> None:
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; depth adds bias.
+    # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
+    diagonal = max(extent, 1e-3)  # an empty scene has none
+    light._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
+        xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
+    )
+
+
+def frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Any rotation whose z axis is `direction`."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)

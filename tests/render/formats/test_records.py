@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from handsim.errors import ArgumentError, HandSimError
+from handsim.hand.model import KEYPOINT_NAMES
+from handsim.space.camera import Camera, Lens
+from render.formats.records import (
+    ABSENT,
+    JOINT_ORDERS,
+    METERS_PER_UNIT,
+    encode_depth,
+    encode_ids,
+    encode_jpeg,
+    encode_normals,
+    encode_pictures,
+    hand_mask,
+    joint_order,
+    linear_light,
+    run_lengths,
+    to_json,
+    to_order,
+    write_exr,
+)
+from render.frames import FOREARM, PARTS_A_HAND, Pictures
+from tests.render.formats.reading import depth_of, exr_content
+
+
+@given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
+def test_run_lengths_spell_the_mask(mask: np.ndarray) -> None:
+    counts = run_lengths(mask)
+    values = np.arange(len(counts)) % 2 == 1
+    np.testing.assert_array_equal(np.repeat(values, counts).reshape(mask.shape, order="F"), mask)
+    assert all(counts[1:])
+
+
+@given(hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12))))
+def test_pycocotools_reads_run_lengths(mask: np.ndarray) -> None:
+    coco_mask = pytest.importorskip("pycocotools.mask")
+    record = {"size": list(mask.shape), "counts": run_lengths(mask)}
+    decoded = coco_mask.decode(coco_mask.frPyObjects(record, *mask.shape))
+    np.testing.assert_array_equal(decoded.astype(bool), mask)
+
+
+def test_a_hand_is_masked_without_its_forearm(make_frame) -> None:
+    frame = make_frame(sides=("right", "left"))
+    parts, instances = frame.ideal.parts, frame.ideal.instances
+    parts[:6, :6], instances[:6, :6] = 1 + PARTS_A_HAND + FOREARM, 2
+    instances[:3, 90:] = 2  # a marker, which is no bone's
+    mask = hand_mask(frame, 1)
+    assert not mask[:6, :6].any()
+    assert mask[:3, 90:].all()
+    np.testing.assert_array_equal(
+        mask & (parts > 0), (parts > PARTS_A_HAND) & (parts < 1 + PARTS_A_HAND + FOREARM)
+    )
+    assert not (mask & hand_mask(frame, 0)).any()
+
+
+def test_nan_becomes_null() -> None:
+    text = to_json({"a": np.array([1.5, np.nan]), 3: (np.int64(2), float("inf")), "t": np.bool_(True)})
+    assert json.loads(text) == {"a": [1.5, None], "3": [2, None], "t": True}
+
+
+# Names as the formats' own documents list them, in our words.
+THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")
+
+
+def finger(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}_{part}" for part in ("MCP", "PIP", "DIP", "tip"))
+
+
+INDEX, MIDDLE, RING, LITTLE = (finger(name) for name in ("index", "middle", "ring", "little"))
+PUBLISHED = {
+    "freihand": ("wrist", *THUMB, *INDEX, *MIDDLE, *RING, *LITTLE),
+    "mano": (
+        "wrist",
+        *INDEX[:3],
+        *MIDDLE[:3],
+        *LITTLE[:3],
+        *RING[:3],
+        *THUMB[:3],
+        *(THUMB[3], INDEX[3], MIDDLE[3], RING[3], LITTLE[3]),
+    ),
+    "interhand": (*THUMB[::-1], *INDEX[::-1], *MIDDLE[::-1], *RING[::-1], *LITTLE[::-1], "wrist"),
+    "hands17": (
+        *("wrist", THUMB[0], INDEX[0], MIDDLE[0], RING[0], LITTLE[0]),
+        *(*THUMB[1:], *INDEX[1:], *MIDDLE[1:], *RING[1:], *LITTLE[1:]),
+    ),
+    "openxr": (None, "wrist", *THUMB, None, *INDEX, None, *MIDDLE, None, *RING, None, *LITTLE),
+    "webxr": ("wrist", *THUMB, None, *INDEX, None, *MIDDLE, None, *RING, None, *LITTLE),
+    "umetrack": (
+        *(THUMB[3], INDEX[3], MIDDLE[3], RING[3], LITTLE[3], "wrist", *THUMB[1:3]),
+        *(*INDEX[:3], *MIDDLE[:3], *RING[:3], *LITTLE[:3]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_orders_are_the_published_ones(name: str) -> None:
+    names = [None if place == ABSENT else KEYPOINT_NAMES[place] for place in joint_order(name)]
+    assert names == list(PUBLISHED[name])
+
+
+def test_mano_undoes_the_table_of_ho3d() -> None:
+    """HO-3D publishes the places in MANO's order of joints in the plain one."""
+    table = [0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20]
+    points = np.arange(21.0)[:, None]
+    np.testing.assert_array_equal(to_order(points, "mano")[table], points)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("openxr", 26), ("webxr", 25), ("hot3d", 20), ("umetrack21", 21)]
+)
+def test_counts(name: str, count: int) -> None:
+    assert to_order(np.zeros((21, 3)), name).shape == (count, 3)
+
+
+@pytest.mark.parametrize("name", JOINT_ORDERS)
+def test_points_go_where_the_order_says(name: str, rng: np.random.Generator) -> None:
+    points, order = rng.standard_normal((2, 21, 3)).astype(np.float32), np.array(joint_order(name))
+    ordered = to_order(points, name)
+    assert ordered.dtype == np.float32
+    np.testing.assert_array_equal(ordered[:, order != ABSENT], points[:, order[order != ABSENT]])
+    assert np.isnan(ordered[:, order == ABSENT]).all()
+
+
+def test_every_order_has_each_joint_at_most_once() -> None:
+    for order in JOINT_ORDERS.values():
+        known = [place for place in order if place != ABSENT]
+        assert len(set(known)) == len(known)
+
+
+def test_mistakes_are_told() -> None:
+    with pytest.raises(ArgumentError, match=r"unknown joint order 'open_xr' \(did you mean 'openxr'"):
+        to_order(np.zeros((21, 3)), "open_xr")
+    with pytest.raises(ArgumentError, match=r"expected \(\.\.\., 21, k\)"):
+        to_order(np.zeros((20, 3)), "mano")
+
+
+@settings(deadline=None)  # the first call compiles
+@given(hnp.arrays(np.float32, (3, 5), elements=st.floats(0.0, 6.5, width=32)))
+def test_depth_comes_back_to_half_a_unit(depth: np.ndarray) -> None:
+    np.testing.assert_allclose(depth_of(encode_depth(depth)), depth, atol=METERS_PER_UNIT / 2 + 1e-6)
+
+
+def test_what_is_too_far_is_a_hole() -> None:
+    depth = np.array([[6.5535, 6.56, np.inf], [np.nan, -1.0, 0.0]], dtype=np.float32)
+    np.testing.assert_allclose(depth_of(encode_depth(depth)), [[6.5535, 0, 0], [0, 0, 0]], atol=1e-6)
+
+
+def test_others_read_depth_and_its_unit() -> None:
+    image = pytest.importorskip("PIL.Image")
+    data = encode_depth(np.full((2, 3), 0.5, dtype=np.float32))
+    picture = image.open(io.BytesIO(data))
+    assert float(picture.text["metres_per_unit"]) == 1e-4
+    np.testing.assert_array_equal(np.asarray(picture), np.full((2, 3), 5000))
+    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert raw.dtype == np.uint16
+    assert (raw == 5000).all()
+
+
+def test_the_same_depth_gives_the_same_bytes(rng: np.random.Generator) -> None:
+    depth = rng.random((8, 9)).astype(np.float32)
+    assert encode_depth(depth) == encode_depth(depth.copy())
+
+
+def test_ids_and_normals_come_back(make_frame) -> None:
+    pictures = make_frame(sides=("right", "left")).ideal
+    ids = cv2.imdecode(np.frombuffer(encode_ids(pictures), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    for layer, wanted in zip(
+        np.moveaxis(ids, -1, 0), (pictures.parts, pictures.instances, pictures.markers), strict=True
+    ):
+        np.testing.assert_array_equal(layer, wanted)
+    levels = cv2.imdecode(np.frombuffer(encode_normals(pictures.normals), np.uint8), cv2.IMREAD_COLOR)
+    levels = levels[..., ::-1].astype(float)
+    there = levels.any(axis=-1)
+    np.testing.assert_array_equal(there, pictures.instances > 0)
+    np.testing.assert_allclose((levels[there] - 128) / 127, pictures.normals[there], atol=0.5 / 127 + 1e-6)
+
+
+def test_jpeg_keeps_the_colors_in_order() -> None:
+    picture = np.full((16, 16, 3), (200, 100, 20), dtype=np.uint8)
+    back = cv2.imdecode(np.frombuffer(encode_jpeg(picture), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_allclose(back.astype(int), picture, atol=4)
+
+
+def test_pictures_are_the_sensor_s(make_frame) -> None:
+    plain, noisy = make_frame(), make_frame(noisy=True)
+    assert set(encode_pictures(plain, lossless=True)) == {".png", ".depth.png", ".normals.png", ".ids.png"}
+    files = encode_pictures(noisy, lossless=False)
+    assert set(files) == {".jpg", ".depth.png", ".depth_ideal.png", ".normals.png", ".ids.png"}
+    np.testing.assert_allclose(depth_of(files[".depth.png"]), noisy.noisy.depth, atol=1e-4)
+    np.testing.assert_allclose(depth_of(files[".depth_ideal.png"]), noisy.ideal.depth, atol=1e-4)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_frame_comes_back(make_frame, camera: Camera, tmp_path: Path, noisy: bool) -> None:
+    bent = Camera("bent", camera.size, camera.K, camera.T_world_camera, Lens("brown", (0.1, 0, 0, 0.01, 0)))
+    frame = make_frame(sides=("right", "left"), camera=bent, noisy=noisy)
+    write_exr(tmp_path / "new" / "a.exr", frame)
+    header, channels = exr_content(tmp_path / "new" / "a.exr")
+    assert header["camera"] == "bent" and json.loads(header["lens"]) == bent.record()["lens"]
+    same(channels, "", frame.ideal)
+    same(channels, "sensor.", frame.noisy)
+
+
+def same(channels: dict[str, np.ndarray], layer: str, pictures: Pictures) -> None:
+    names = {"depth": ("Z",), "parts": ("id.part",), "instances": ("id.instance",), "markers": ("id.marker",)}
+    names |= {"rgb": ("R", "G", "B"), "normals": ("N.X", "N.Y", "N.Z")}
+    for picture, parts in names.items():
+        wanted = getattr(pictures, picture)
+        found = [channels.get(layer + name) for name in parts]
+        if wanted is None:
+            assert found == [None] * len(parts)
+            continue
+        stacked = np.stack(found, axis=-1).reshape(wanted.shape)
+        if picture == "rgb":
+            stacked = np.rint(255.0 * srgb(stacked.astype(np.float64)))
+        tolerance = 1e-3 if picture == "normals" else 0.0
+        np.testing.assert_allclose(stacked, wanted, rtol=0.0, atol=tolerance)
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def test_middle_gray_is_half_the_light() -> None:
+    assert linear_light(np.array([188], np.uint8))[0] == pytest.approx(0.5, abs=0.005)
+
+
+def test_every_level_of_srgb_comes_back_from_half() -> None:
+    levels = np.arange(256, dtype=np.uint8)
+    halves = linear_light(levels).astype(np.float16).astype(np.float64)
+    np.testing.assert_array_equal(np.rint(255.0 * srgb(halves)), levels)
+
+
+def test_openexr_reads_meters_and_linear_light(make_frame, tmp_path: Path) -> None:
+    frame = make_frame()
+    write_exr(tmp_path / "a.exr", frame)
+    header, channels = exr_content(tmp_path / "a.exr")
+    assert header["units"] == "m"
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+    assert channels["Z"].dtype == np.float32
+    assert channels["R"].dtype == channels["N.X"].dtype == channels["id.part"].dtype == np.float16
+    np.testing.assert_array_equal(channels["Z"], frame.ideal.depth)
+    np.testing.assert_allclose(header["K"], frame.camera.K)
+    np.testing.assert_allclose(header["T_world_camera"], frame.camera.T_world_camera)
+    # A pixel and its depth are a point in the world, which is on the skin to the size of a drawn square.
+    row, column = np.argwhere(channels["id.instance"] == 1)[0]
+    ray = frame.camera.rays()[row, column]
+    point = frame.camera.T_world_camera @ np.array([*(ray / ray[2] * channels["Z"][row, column]), 1.0])
+    square = 3 * channels["Z"][row, column] / frame.camera.K[0, 0]
+    assert np.linalg.norm(point[:3] - frame.hands[0].vertices, axis=1).min() < square * np.sqrt(0.5)
+    assert channels["R"].max() == np.float16(linear_light(frame.ideal.rgb).max(axis=(0, 1))[0])
+
+
+def test_the_same_frame_gives_the_same_bytes(make_frame, tmp_path: Path) -> None:
+    for name in ("a.exr", "b.exr"):
+        write_exr(tmp_path / name, make_frame(3))
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_a_wrong_name_or_place_is_told(make_frame, tmp_path: Path) -> None:
+    with pytest.raises(HandSimError, match=r"ends in \.exr"):
+        write_exr(tmp_path / "a.png", make_frame())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError):
+        write_exr(tmp_path / "file" / "a.exr", make_frame())

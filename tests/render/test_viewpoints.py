@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from gloves.takes.take import LOST, Take
+from handsim.errors import ArgumentError, HandSimWarning, RigError
+from handsim.hand.model import hand_keypoints
+from handsim.space.camera import look_at, pinhole
+from handsim.space.transforms import quaternion_matrix
+from render.subject import subject_of_poses
+from render.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, check_hands_in_view, hand_centers
+from train.simulation.takes import SimulatedKind, simulate_take
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    return simulate_take(kind="hand-controller", num_frames=60)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_every_placement_sees_the_hands(take, placement):
+    config = ViewConfig(placement, "vga_wide", views=2)
+    viewpoints = Viewpoints(config, take, rng=np.random.default_rng(1))
+    centers = hand_centers(take)
+    for frame in range(0, 60, 7):
+        cameras = viewpoints.cameras(frame)
+        assert len(cameras) == (6 if placement == "rig" else 2)
+        assert len({camera.name for camera in cameras}) == len(cameras)
+        for camera in cameras:
+            pixels = camera.project(centers[frame])
+            assert (pixels > 0).all() and (pixels < camera.size).all()
+
+
+def test_the_same_seed_gives_the_same_places(take):
+    config = ViewConfig("anywhere", views=2)
+    first, second = (Viewpoints(config, take, rng=np.random.default_rng(3)).cameras(5) for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
+
+
+def test_cameras_anywhere_keep_their_distance(take):
+    config = ViewConfig("anywhere", distance=(0.5, 0.6))
+    viewpoints, centers = Viewpoints(config, take, rng=np.random.default_rng(0)), hand_centers(take)
+    away = [np.linalg.norm(viewpoints.cameras(n)[0].T_world_camera[:3, 3] - centers[n]) for n in range(60)]
+    assert min(away) >= 0.5 - 1e-9 and max(away) <= 0.6 + 1e-9
+
+
+def test_cameras_anywhere_keep_clear_of_arms(take):
+    viewpoints = Viewpoints(ViewConfig("anywhere", views=8), take, rng=np.random.default_rng(3))
+    poses = take.qpos
+    for frame in range(take.num_frames):
+        for qpos in poses[frame][np.isfinite(poses[frame, :, 0])]:
+            arm = qpos[:3] - np.linspace(0.0, 0.5, 51)[:, None] * quaternion_matrix(qpos[None, 3:7])[0, :, 0]
+            for camera in viewpoints.cameras(frame):
+                assert np.linalg.norm(arm - camera.T_world_camera[:3, 3], axis=1).min() > 0.2
+
+
+def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
+    qpos, status = take.qpos.copy(), take.status.copy()
+    qpos[20:30], status[20:30] = np.nan, LOST
+    centers = hand_centers(dataclasses.replace(take, qpos=qpos, status=status))
+    assert np.isfinite(centers).all()
+    assert np.linalg.norm(centers[25] - hand_centers(take)[25]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"placement": "nowhere"}, "placement"),
+        ({"views": 0}, "0 views"),
+        ({"distance": (0.8, 0.5)}, "distances"),
+    ],
+)
+def test_what_is_no_view_is_refused(wrong, said):
+    with pytest.raises(ArgumentError, match=said):
+        ViewConfig(**wrong)
+
+
+def test_cameras_must_look_at_the_hands():
+    take = subject_of_poses(np.zeros((3, 20)), model="M").take
+    eye = np.array([0.0, -0.6, 0.0])
+    seeing = pinhole("seeing", (640, 480), 600.0).at(look_at(eye, np.zeros(3)))
+    blind = pinhole("blind", (640, 480), 600.0).at(look_at(eye, 2 * eye))
+    check_hands_in_view("c.toml", [seeing], take)
+    with pytest.warns(HandSimWarning, match="camera 'blind' has no hand"):
+        check_hands_in_view("c.toml", [seeing, blind], take)
+    with pytest.raises(RigError, match="no camera has a hand in its picture in any of 3 frames"):
+        check_hands_in_view("c.toml", [blind], take)
+
+
+FRAMES, STEP = 480, 8
+WHOLE, SIDE = 0.95, 0.30  # of pictures with all hands; a hand's longer side, of the height
+APART = ("single-hand", "calibration", "free")  # kinds of takes with hands half a meter from each other
+LEAST = {"rig": 0.2, "orbit": 0.25}  # of those, where cameras cannot stay where both are large
+PLACED = [name for name in PLACEMENTS if name != "head"]
+
+
+@functools.cache
+def a_take(kind: str) -> Take:
+    return simulate_take(kind=kind, num_frames=FRAMES, seed=5)
+
+
+def measured(take: Take, config: ViewConfig, seed: int = 0) -> tuple[float, float]:
+    """Share of pictures with all keypoints of all hands; median of a hand's longer side over the height."""
+    viewpoints = Viewpoints(config, take, rng=np.random.default_rng(seed))
+    whole, sides = [], []
+    for frame in range(0, take.num_frames, STEP):
+        hands = [
+            hand_keypoints(hand.model, qpos[None])[0]
+            for hand, qpos in zip(take.hands, take.qpos[frame], strict=True)
+            if np.isfinite(qpos).all()
+        ]
+        for camera in viewpoints.cameras(frame) if hands else ():
+            pixels = np.array([camera.project(points) for points in hands])
+            whole.append(((pixels >= 0.0) & (pixels < camera.size)).all())
+            sides += list(np.ptp(pixels, axis=1).max(axis=1) / camera.size[1])
+    return float(np.mean(whole)), float(np.median(sides))
+
+
+@pytest.mark.parametrize("placement", PLACED)
+@pytest.mark.parametrize("kind", get_args(SimulatedKind))
+def test_all_hands_are_in_the_picture_and_large(kind, placement):
+    whole, side = measured(a_take(kind), ViewConfig(placement))
+    assert whole >= WHOLE, f"{whole:.1%} of pictures show all hands"
+    least = LEAST.get(placement, SIDE) if kind in APART else SIDE
+    assert side >= least, f"a hand's longer side is {side:.1%} of the height"
+
+
+def test_one_lens_serves_a_rig_unless_hands_would_be_small():
+    for kind, zooms in (("hand-hand", False), ("single-hand", True)):
+        viewpoints = Viewpoints(ViewConfig("rig"), a_take(kind), rng=np.random.default_rng(0))
+        lenses = {
+            (number, camera.K[0, 0])
+            for frame in range(0, FRAMES, STEP)
+            for number, camera in enumerate(viewpoints.cameras(frame))
+        }
+        assert (len(lenses) > viewpoints.num_cameras) == zooms
+
+
+def test_a_share_is_kept():
+    take = a_take("hand-hand")
+    for share in (0.2, 0.4):
+        whole, side = measured(take, ViewConfig("anywhere", share=share))
+        assert whole == 1.0 and share <= side <= 1.4 * share
+
+
+def test_a_still_camera_stays_where_that_is_enough():
+    quiet = subject_of_poses(np.linspace(np.zeros(20), np.full(20, 0.1), 30), model="M").take
+    for take, moves in ((quiet, False), (a_take("free"), True)):
+        viewpoints = Viewpoints(ViewConfig(), take, rng=np.random.default_rng(0))
+        places = np.array([viewpoints.cameras(n)[0].T_world_camera for n in (0, take.num_frames - 1)])
+        assert (places[0] != places[1]).any() == moves
+
+
+def test_a_distance_is_kept_though_hands_leave_the_picture():
+    whole, side = measured(a_take("hand-hand"), ViewConfig("orbit", distance=(0.3, 0.3)))
+    assert whole < 1.0 and side > 1.5 * SIDE

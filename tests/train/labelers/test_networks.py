@@ -1,0 +1,226 @@
+"""The networks: what leaves their scores unchanged, what they learn, where they compute."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.held_out import held_out_markers
+from train.data.batches import Corruption, corrupt
+from train.labelers import networks
+from train.labelers.networks import (
+    LayoutNetwork,
+    LayoutNetworkConfig,
+    SetLabeler,
+    distance_features,
+    labeler_of,
+    labeling_loss,
+    layout_loss,
+    new_network,
+)
+from train.labelers.storage import load_labeler
+from train.settings import CNNConfig, SetLabelerConfig
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    return SetLabeler(SetLabelerConfig(num_labels=5, width=32, gates=8, depth=2)).double().eval()
+
+
+def cloud(seed: int, count: int = 7) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(-0.08, 0.08, size=(1, count, 3)))
+
+
+def run(network, points):
+    with torch.inference_mode():
+        return network(points, torch.ones(points.shape[:2], dtype=torch.bool))
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_turning_moving_and_mirroring_change_nothing(network, seed):
+    points = cloud(seed)
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))  # reflections among them
+    moved = points @ torch.from_numpy(rotation) + torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
+    for before, after in zip(run(network, points), run(network, moved), strict=True):
+        torch.testing.assert_close(before, after, atol=1e-6, rtol=1e-6)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_order_only_reorders(network, seed):
+    points = cloud(seed)
+    order = torch.from_numpy(np.random.default_rng(seed).permutation(7))
+    before, after = run(network, points), run(network, points[:, order])
+    torch.testing.assert_close(before.points[:, order], after.points)
+    torch.testing.assert_close(before.labels[..., [*order.tolist(), 7]], after.labels)
+
+
+def test_padding_changes_nothing(network):
+    points = cloud(1)
+    padded = torch.cat([points, torch.full((1, 4, 3), 0.5, dtype=torch.float64)], dim=1)
+    present = torch.arange(11)[None] < 7
+    with torch.inference_mode():
+        scores = network(padded, present)
+    alone = run(network, points)
+    torch.testing.assert_close(scores.points[:, :7], alone.points)
+    torch.testing.assert_close(scores.labels[..., [*range(7), 11]], alone.labels)
+
+
+def test_outputs_are_log_probabilities(network):
+    scores = run(network, cloud(2))
+    assert scores.points.shape == (1, 7, 6)
+    assert scores.labels.shape == (1, 5, 8)
+    torch.testing.assert_close(scores.points.exp().sum(-1), torch.ones(1, 7, dtype=torch.float64))
+    torch.testing.assert_close(scores.labels.exp().sum(-1), torch.ones(1, 5, dtype=torch.float64))
+
+
+def test_loss_is_least_at_the_truth():
+    truth, present = torch.tensor([[0, 2, -1]]), torch.ones(1, 3, dtype=torch.bool)
+
+    def loss_of(by_point, by_label):
+        from train.labelers.networks import LabelScores
+
+        points, labels = torch.full((1, 3, 4), -20.0), torch.full((1, 3, 4), -20.0)
+        points[0, range(3), by_point] = 0.0
+        labels[0, range(3), by_label] = 0.0
+        return float(labeling_loss(LabelScores(points, labels), truth, present))
+
+    right = loss_of([0, 2, 3], [0, 3, 1])  # marker 1 is occluded, point 2 a ghost
+    assert right == pytest.approx(0.0)
+    assert loss_of([0, 1, 3], [0, 3, 1]) > 5.0
+    assert loss_of([0, 2, 3], [0, 2, 1]) > 5.0
+
+
+CONFIG = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=2)
+
+
+@pytest.fixture(scope="module")
+def layouts_network():
+    torch.manual_seed(0)
+    return LayoutNetwork(CONFIG).double().eval()
+
+
+def cloud_of_layouts(seed: int, count: int = 7) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(-0.08, 0.08, size=(1, count, 3)))
+
+
+def layout(seed: int, count: int = 5) -> torch.Tensor:
+    """Mean features of a layout of markers that scatter around their places."""
+    rng = np.random.default_rng([7, seed])
+    poses = rng.uniform(-0.08, 0.08, size=(count, 3)) + 0.005 * rng.normal(size=(20, count, 3))
+    return distance_features(torch.from_numpy(poses), CONFIG).mean(0, keepdim=True)
+
+
+def run_on(layouts_network, points, layouts):
+    with torch.inference_mode():
+        return layouts_network(points, torch.ones(points.shape[:2], dtype=torch.bool), layouts)
+
+
+def same(before, after) -> None:
+    for one, other in zip(before, after, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-6)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_turning_moving_and_mirroring_change_nothing_of_layouts(layouts_network, seed):
+    points = cloud_of_layouts(seed)
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))  # reflections among them
+    moved = points @ torch.from_numpy(rotation) + torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
+    for before, after in zip(
+        run_on(layouts_network, points, layout(seed)),
+        run_on(layouts_network, moved, layout(seed)),
+        strict=True,
+    ):
+        same(before, after)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_the_order_of_points_and_of_markers_only_reorders(layouts_network, seed):
+    points, known, rng = cloud_of_layouts(seed), layout(seed), np.random.default_rng(seed)
+    of_points, of_markers = rng.permutation(7), rng.permutation(5)
+    before = run_on(layouts_network, points, known)[-1]
+    after = run_on(layouts_network, points[:, of_points], known[:, of_markers][:, :, of_markers])[-1]
+    same(
+        (
+            before.points[:, of_points][..., [*of_markers, 5]],
+            before.labels[:, of_markers][..., [*of_points, 7]],
+        ),
+        after,
+    )
+
+
+def test_padding_changes_nothing_of_layouts(layouts_network):
+    points = cloud_of_layouts(1)
+    padded = torch.cat([points, torch.full((1, 4, 3), 0.5, dtype=torch.float64)], dim=1)
+    with torch.inference_mode():
+        scores = layouts_network(padded, torch.arange(11)[None] < 7, layout(1))[-1]
+    alone = run_on(layouts_network, points, layout(1))[-1]
+    same((scores.points[:, :7], scores.labels[..., [*range(7), 11]]), alone)
+
+
+def test_layouts_of_a_batch_do_not_meet(layouts_network):
+    points = torch.cat([cloud_of_layouts(seed) for seed in range(4)])
+    both = run_on(layouts_network, points, torch.cat([layout(0), layout(1)]))[-1]
+    first, second = (
+        run_on(layouts_network, points[:2], layout(0))[-1],
+        run_on(layouts_network, points[2:], layout(1))[-1],
+    )
+    same(both, (torch.cat([first.points, second.points]), torch.cat([first.labels, second.labels])))
+
+
+def test_scores_are_probabilities_and_the_loss_falls_with_the_truth(layouts_network):
+    found = run_on(layouts_network, cloud_of_layouts(3), layout(3))
+    for scores in found:
+        for table in scores:
+            torch.testing.assert_close(table.exp().sum(-1), torch.ones_like(table[..., 0]))
+    present = torch.ones(1, 7, dtype=torch.bool)
+    best = found[-1].points.argmax(-1)
+    likely = torch.where(best == 5, -1, best)
+    worst = found[-1].points[..., :-1].argmin(-1)
+    assert layout_loss(found, likely, present) < layout_loss(found, worst, present)
+
+
+NAMES = tuple(f"m{number}" for number in range(19))
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    cloud = corrupt(held_out_markers("dense19", 60, seed=0), Corruption(), rng=np.random.default_rng(0))
+    return [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
+
+
+def same_labels(batched, single):
+    different = sum((one.labels != two.labels).any() for one, two in zip(batched, single, strict=True))
+    off = max(np.abs(one.confidence - two.confidence).max() for one, two in zip(batched, single, strict=True))
+    return different == 0 and off < 1e-3
+
+
+def test_batches_give_the_labels_of_clouds_alone(clouds):
+    labeler = load_labeler("dense19")
+    assert same_labels(labeler.label_frames(clouds), [labeler.label_frames([one])[0] for one in clouds])
+
+
+def test_a_copy_on_another_device_gives_the_same(clouds, monkeypatch):
+    expected = drawn_cnn().label_frames(clouds[:8])
+    other = torch.device("cpu", 0)  # which is another name than that of the network's device
+    monkeypatch.setattr(networks, "batch_device", lambda: other)
+    assert same_labels(drawn_cnn().label_frames(clouds[:8]), expected)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_gives_the_labels_of_the_cpu(clouds, monkeypatch):
+    on_gpu = drawn_cnn().label_frames(clouds)
+    monkeypatch.setattr(networks, "batch_device", lambda: torch.device("cpu"))
+    assert same_labels(on_gpu, drawn_cnn().label_frames(clouds))
+
+
+def drawn_cnn():
+    torch.manual_seed(0)
+    return labeler_of(new_network(CNNConfig()), NAMES)

@@ -1,0 +1,166 @@
+"""The pose prior: what it says of hands, and how it is learned."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+from handsim.errors import WeightsError
+from train.labelers.pose_prior import PosePrior, align_all, learn_pose_prior
+
+MARKERS, RANK = 7, 5
+
+
+def prior(rng, components):
+    return PosePrior(
+        rng.normal(scale=0.05, size=(components, MARKERS, 3)).astype(np.float32),
+        rng.normal(scale=0.003, size=(components, MARKERS, 3, RANK)).astype(np.float32),
+        rng.uniform(0.001, 0.002, size=components).astype(np.float32),
+        np.log(rng.dirichlet(np.ones(components))).astype(np.float32),
+    )
+
+
+def expected(prior, points, labels):
+    """Logarithm of the mixture, by scipy's rotation and normal density."""
+    terms = []
+    for mean, directions, spread, weight in zip(
+        prior.means, prior.directions, prior.spreads, prior.log_weights, strict=True
+    ):
+        there = mean[labels].astype(float)
+        off, target = points - points.mean(axis=0), there - there.mean(axis=0)
+        aligned = Rotation.align_vectors(target, off)[0].apply(off)
+        rows = directions[labels].reshape(-1, RANK).astype(float)
+        covariance = rows @ rows.T + float(spread) ** 2 * np.eye(len(rows))
+        terms.append(weight + multivariate_normal.logpdf((aligned - target).ravel(), cov=covariance))
+    return np.logaddexp.reduce(terms)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    components=st.integers(1, 3),
+    count=st.integers(4, MARKERS),
+    left=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_density_is_that_of_the_mixture_wherever_the_hand_is(seed, components, count, left):
+    rng = np.random.default_rng(seed)
+    known = prior(rng, components)
+    labels = rng.permutation(MARKERS)[:count]
+    points = known.means[rng.integers(components)][labels] + rng.normal(scale=0.004, size=(count, 3))
+    moved = Rotation.random(rng=rng).apply(points) + rng.normal(size=3)
+    if left:
+        moved = moved * [1.0, -1.0, 1.0]
+    found = known.log_density(moved, labels, mirrored=left)
+    assert found == pytest.approx(expected(known, points, labels), rel=1e-4, abs=1e-3)
+
+
+def test_the_nearest_components_are_those_that_scipy_aligns_best(rng):
+    many, labels = prior(rng, 30), np.arange(MARKERS)
+    for left in (False, True):
+        points = rng.normal(scale=0.05, size=(MARKERS, 3))
+        seen = points * ([-1.0, 1.0, 1.0] if left else 1.0)
+        off = seen - seen.mean(axis=0)
+        misses = [
+            Rotation.align_vectors(mean - mean.mean(axis=0), off)[1] for mean in many.means.astype(float)
+        ]
+        near = many.nearest(points, labels, mirrored=left, count=9)
+        np.testing.assert_array_equal(near, np.argsort(misses)[:9])
+        among = many.log_density(points, labels, mirrored=left, among=near)
+        assert among == many.log_density(points, labels, mirrored=left)  # four of them count
+
+
+def test_three_points_fit_any_hand(rng):
+    assert prior(rng, 2).log_density(np.zeros((3, 3)), np.arange(3), mirrored=False) == -np.inf
+
+
+def test_tables_survive_a_file(rng):
+    known = prior(rng, 2)
+    again = PosePrior.of_tensors(known.tensors())
+    np.testing.assert_array_equal(again.means, known.means)
+    np.testing.assert_allclose(again.directions, known.directions, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"means": np.zeros((2, MARKERS, 2), np.float32)},
+        {"means": np.full((2, MARKERS, 3), np.nan, np.float32)},
+        {"spreads": np.zeros(2, np.float32)},
+        {"directions": np.zeros((2, MARKERS, 3, 0), np.float32)},
+        {"log_weights": np.zeros(3, np.float32)},
+    ],
+)
+def test_damaged_tables_are_refused(damage, rng):
+    with pytest.raises(WeightsError, match="pose prior is damaged"):
+        dataclasses.replace(prior(rng, 2), **damage)
+
+
+def test_missing_tables_are_refused(rng):
+    tables = prior(rng, 2).tensors()
+    del tables["means"]
+    with pytest.raises(WeightsError, match="has the tables directions, log_weights, spreads"):
+        PosePrior.of_tensors(tables)
+
+
+def bent(rng, count):
+    """Points of a chain that bends in one place by up to a right angle, anywhere [m]."""
+    rest = np.array([[0, 0, 0], [2, 1, 0], [4, 0, 1], [6, 0, 0], [8, 1, 0], [10, 0, 0]]) / 100.0
+    angles = rng.uniform(0.0, np.pi / 2, size=count)
+    hands = np.tile(rest, (count, 1, 1))
+    turns = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0])
+    for marker in (3, 4, 5):
+        hands[:, marker] = rest[2] + turns.apply(rest[marker] - rest[2])
+    hands += rng.normal(scale=0.0005, size=hands.shape)
+    anywhere = Rotation.random(count, rng=rng)
+    return np.stack([anywhere.apply(hands[:, m]) for m in range(6)], axis=1) + rng.normal(size=(count, 1, 3))
+
+
+def test_hands_are_likelier_than_what_is_none(rng):
+    prior = learn_pose_prior(bent(rng, 6000), rng=rng)
+    assert prior is not None and prior.num_markers == 6
+    labels = np.arange(6)
+    others = bent(rng, 200)
+    exchanged = others[:, [0, 1, 2, 4, 3, 5]]
+    right = [prior.log_density(hand, labels, mirrored=False) for hand in others]
+    wrong = [prior.log_density(hand, labels, mirrored=False) for hand in exchanged]
+    mirrored = [prior.log_density(hand, labels, mirrored=True) for hand in others]
+    assert np.mean(np.array(right) > np.array(wrong) + 5.0) == 1.0
+    assert np.mean(np.array(right) > np.array(mirrored)) > 0.95
+    assert np.exp(prior.log_weights).sum() == np.float32(1.0)
+
+
+def test_few_frames_or_markers_give_no_prior(rng):
+    assert learn_pose_prior(bent(rng, 1000), rng=rng) is None
+    assert learn_pose_prior(bent(rng, 6000)[:, :2], rng=rng) is None
+
+
+def test_frames_with_missing_markers_are_left_out(rng):
+    hands = bent(rng, 5500)
+    gaps = np.concatenate([hands, np.full((10, 6, 3), np.nan)])
+    whole, with_gaps = (learn_pose_prior(each, rng=np.random.default_rng(0)) for each in (hands, gaps))
+    np.testing.assert_array_equal(whole.means, with_gaps.means)
+
+
+@given(seed=st.integers(0, 10_000), flat=st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_alignment_is_scipys(seed, flat):
+    rng = np.random.default_rng(seed)
+    hands, target = rng.normal(size=(4, 5, 3)), rng.normal(size=(5, 3))
+    if flat:
+        hands[..., 2] = 0.0
+    aligned = align_all(hands, target)
+    for hand, found in zip(hands, aligned, strict=True):
+        centered, there = hand - hand.mean(axis=0), target - target.mean(axis=0)
+        turned = Rotation.align_vectors(there, centered)[0].apply(centered) + target.mean(axis=0)
+        np.testing.assert_allclose(
+            np.linalg.norm(found - target), np.linalg.norm(turned - target), rtol=1e-6, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            np.linalg.norm(found[0] - found[1]), np.linalg.norm(hand[0] - hand[1]), rtol=1e-6
+        )

@@ -1,0 +1,265 @@
+"""How right labelers are, counted by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from train.data.batches import Corruption
+from train.evaluation import (
+    BINS,
+    History,
+    LabelCounts,
+    error_without,
+    evaluate_labeler,
+    expected_calibration_error,
+    macro_f1,
+    percent,
+    print_figures,
+    reliability,
+)
+from train.labelers.protocol import Labeling
+
+
+def _one_each(pairs):
+    """Labels and truth of a frame in which no marker is there, or said, twice."""
+    kept = []
+    for said, true in pairs:
+        if not any((said == other >= 0) or (true == same >= 0) for other, same in kept):
+            kept.append((said, true))
+    table = np.array(kept, dtype=int).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+def test_a_frame_counted_by_hand():
+    counts = LabelCounts()
+    # Points: marker 0, marker 2, a ghost. Marker 1 is hidden. The labeler takes the ghost for marker 1.
+    counts.add(np.array([0, 2, 1]), np.array([0, 2, -1]), num_labels=3)
+    figures = counts.figures()
+    assert figures["slot_accuracy"] == pytest.approx(2 / 3)
+    assert figures["point_accuracy"] == pytest.approx(2 / 3)
+    assert figures["frame_accuracy"] == 0.0
+    assert figures["occlusion_recall"] == 0.0
+    assert figures["ghost_recall"] == 0.0
+    assert np.isnan(figures["ghost_precision"])
+    counts.add(np.array([1, 0, -1]), np.array([1, 0, -1]), num_labels=3)
+    figures = counts.figures()
+    assert figures["frame_accuracy"] == 0.5
+    assert figures["occlusion_recall"] == 0.5
+    assert figures["occlusion_precision"] == 1.0
+    assert figures["ghost_recall"] == 0.5
+    assert figures["ghost_precision"] == 1.0
+
+
+def test_an_empty_frame_is_all_occluded():
+    counts = LabelCounts()
+    counts.add(np.zeros(0, dtype=int), np.zeros(0, dtype=int), num_labels=19)
+    assert counts.figures()["slot_accuracy"] == 1.0
+    assert counts.figures()["occlusion_recall"] == 1.0
+
+
+def test_confusion_and_macro_f1_by_hand():
+    counts = LabelCounts()
+    assert np.isnan(counts.figures()["macro_f1"])
+    # Marker 3 neither occurs nor is said: it is no class of these frames.
+    counts.add(np.array([0, 1, -1, 2]), np.array([0, 2, -1, -1]), num_labels=4)
+    counts.add(np.array([0, -1]), np.array([0, 2]), num_labels=4)
+    wanted = np.zeros((5, 5), dtype=int)
+    wanted[0, 0], wanted[2, 1], wanted[2, 4], wanted[4, 4], wanted[4, 2] = 2, 1, 1, 1, 1
+    np.testing.assert_array_equal(counts.confusion, wanted)
+    # F1 is 1 for marker 0, 0 for 1 (said, never there) and 2 (there, never said right), 1/2 for ghosts.
+    assert counts.figures()["macro_f1"] == pytest.approx(1.5 / 4)
+
+
+@given(
+    st.lists(
+        st.lists(st.tuples(st.integers(-1, 6), st.integers(-1, 6)), max_size=9).map(_one_each), max_size=5
+    )
+)
+def test_confusion_agrees_with_the_counts(frames):
+    counts = LabelCounts()
+    for labels, truth in frames:
+        counts.add(labels, truth, num_labels=7)
+    confusion, figures = counts.confusion, counts.figures()
+    assert confusion.sum() == counts.points
+    assert confusion.trace() == counts.points_right
+    if frames:
+        assert confusion[-1].sum() == counts.ghosts and confusion[:, -1].sum() == counts.ghosts_given
+    if counts.points:
+        assert (figures["macro_f1"] == 1.0) == (figures["point_accuracy"] == 1.0)
+
+
+def test_macro_f1_of_nothing_and_of_chance():
+    assert np.isnan(macro_f1(np.zeros((4, 4), dtype=int)))
+    assert macro_f1(np.full((4, 4), 3)) == pytest.approx(0.25)
+    assert macro_f1(np.diag([5, 0, 1])) == 1.0
+
+
+def test_percent():
+    assert percent(0.98765) == "98.77" and percent(float("nan")) == "-"
+
+
+def test_figures_are_printed_in_percent(capsys):
+    print_figures({"clean": {"macro_f1": 0.98765, "ghost_recall": float("nan")}}, title="Figures")
+    said = capsys.readouterr().out
+    assert "macro f1" in said and "98.77" in said and "-" in said
+
+
+class ByHeight:
+    """Names points by the centimeter they lie at; of the third it is unsure, and takes it for the second."""
+
+    marker_names = ("A", "B", "C", "D")
+
+    def label_frames(self, frames):
+        return [self._label(np.rint(100 * points[:, 2]).astype(int)) for points in frames]
+
+    def _label(self, height):
+        labels = np.where(height == 2, 1 if 1 not in height else -1, height)
+        return Labeling(labels, np.where(height == 2, 0.25, 1.0))
+
+
+def column(frames, missing=()):
+    markers = np.zeros((frames, 4, 3))
+    markers[..., 2] = 0.01 * np.arange(4)
+    for frame, marker in missing:
+        markers[frame, marker] = np.nan
+    return markers
+
+
+def test_points_are_told_in_order_with_their_confidence(rng):
+    report = evaluate_labeler(ByHeight(), column(2, missing=[(1, 1)]), Corruption(0, 0), rng=rng)
+    # The first frame's third point is called a ghost, the second's, where no second is, the second.
+    wanted = np.zeros((5, 5), dtype=int)
+    wanted[range(4), range(4)] = [2, 1, 0, 2]
+    wanted[2, 4] = wanted[2, 1] = 1
+    np.testing.assert_array_equal(report.confusion, wanted)
+    assert report.right.shape == report.confidences.shape == (7,)
+    np.testing.assert_array_equal(report.confidences, np.where(report.right, 1.0, 0.25))
+    assert (~report.right[:4]).sum() == (~report.right[4:]).sum() == 1
+    figures = report.figures
+    assert figures["point_accuracy"] == pytest.approx(5 / 7)
+    assert figures["calibration_error"] == pytest.approx(2 * 0.25 / 7)
+    assert figures["error_without_least_sure"] == pytest.approx(2 / 7)  # 2 % of seven points is none
+    assert figures["macro_f1"] == pytest.approx((1 + 2 / 3 + 0 + 1 + 0) / 5)
+    np.testing.assert_array_equal(report.slot_accuracy_by_marker, [1.0, 0.5, 0.0, 1.0])
+
+
+def test_leaving_two_percent_out_takes_the_least_sure_first(rng):
+    markers = column(100)
+    markers[3:, 2] = np.nan  # three wrong of 303 points, all of them unsure: six are left out
+    figures = evaluate_labeler(ByHeight(), markers, Corruption(0, 0), rng=rng).figures
+    assert figures["point_accuracy"] == pytest.approx(300 / 303)
+    assert figures["error_without_least_sure"] == 0.0
+
+
+def test_no_frames_and_no_points(rng):
+    for markers in (np.zeros((0, 4, 3)), np.full((3, 4, 3), np.nan)):
+        report = evaluate_labeler(ByHeight(), markers, Corruption(0, 0), rng=rng)
+        assert report.confusion.shape == (5, 5)
+        assert report.right.size == report.confidences.size == report.confusion.sum() == 0
+        for figure in ("point_accuracy", "macro_f1", "calibration_error", "error_without_least_sure"):
+            assert np.isnan(report.figures[figure])
+
+
+points = st.integers(1, 60).flatmap(
+    lambda count: st.tuples(
+        arrays.arrays(float, count, elements=st.floats(0.0, 1.0, allow_subnormal=False)),
+        arrays.arrays(bool, count),
+    )
+)
+
+
+def test_a_calibrated_source_has_no_error(rng):
+    confidence = rng.uniform(size=200_000)
+    right = rng.uniform(size=confidence.size) < confidence
+    assert expected_calibration_error(confidence, right) < 0.01
+    bins = reliability(confidence, right)
+    np.testing.assert_allclose(bins.right, bins.confidence, atol=0.02)
+    np.testing.assert_allclose(bins.confidence, (np.arange(BINS) + 0.5) / BINS, atol=0.005)
+
+
+def test_always_sure_and_half_wrong():
+    right = np.arange(1000) % 2 == 0
+    assert expected_calibration_error(np.ones(1000), right) == 0.5
+    assert expected_calibration_error(np.zeros(1000), right) == 0.5
+    assert expected_calibration_error(np.full(1000, 0.5), right) == 0.0
+    assert reliability(np.ones(1000), right).count.tolist() == [0] * (BINS - 1) + [1000]
+
+
+def test_bins_are_weighted_by_their_points():
+    # Three points are said 0.9 and right, one is said 0.1 and right: 3/4 x 0.1 + 1/4 x 0.9.
+    error = expected_calibration_error(np.array([0.9, 0.1, 0.9, 0.9]), np.ones(4, dtype=bool))
+    assert error == pytest.approx(0.3)
+
+
+@given(points)
+def test_the_error_is_at_least_the_mean_gap_and_at_most_one(drawn):
+    confidence, right = drawn
+    error = expected_calibration_error(confidence, right)
+    assert abs(confidence.mean() - right.mean()) - 1e-12 <= error <= 1.0
+    bins = reliability(confidence, right)
+    assert bins.count.sum() == len(right)
+    assert np.nansum(bins.right * bins.count) == pytest.approx(right.sum())
+
+
+def test_leaving_the_least_sure_out():
+    confidence, right = np.array([0.9, 0.2, 0.8, 0.4, 0.6]), np.array([True, False, True, True, False])
+    assert error_without(confidence, right, 0.0) == pytest.approx(2 / 5)
+    assert error_without(confidence, right, 0.2) == pytest.approx(1 / 4)  # without the one of 0.2
+    assert error_without(confidence, right, 0.4) == pytest.approx(
+        1 / 3
+    )  # nor the one of 0.4, which was right
+    assert error_without(confidence, right, 0.6) == 0.0
+    assert np.isnan(error_without(confidence, right, 1.0))
+
+
+def test_two_percent_of_fifty_is_one():
+    confidence, right = np.linspace(0.5, 1.0, 50), np.ones(50, dtype=bool)
+    right[[0, 7]] = False
+    assert error_without(confidence, right) == pytest.approx(1 / 49)
+
+
+@given(points, st.floats(0.0, 1.0, allow_subnormal=False), st.randoms(use_true_random=False))
+def test_the_order_of_points_has_no_say(drawn, share, random):
+    confidence, right = np.round(drawn[0], 1), drawn[1]  # rounded, so that there are ties
+    order = list(range(len(right)))
+    random.shuffle(order)
+    np.testing.assert_allclose(
+        error_without(confidence[order], right[order], share), error_without(confidence, right, share)
+    )
+
+
+def test_ties_count_by_the_mean_over_all_choices():
+    right = np.array([True, False, True, True])
+    # Of four alike two go; whichever they are, the one mistake stays half of the time.
+    assert error_without(np.full(4, 0.7), right, 0.5) == pytest.approx(0.5 * 1 / 2)
+
+
+def test_nothing_to_measure():
+    none = np.zeros(0)
+    assert np.isnan(expected_calibration_error(none, none.astype(bool)))
+    assert np.isnan(error_without(none, none.astype(bool)))
+
+
+def test_an_entry_is_the_mean_since_the_one_before():
+    history = History()
+    for loss in (4.0, 2.0, 3.0):
+        history.add(loss)
+    assert history.close(768, 0.1) == 3.0
+    history.add(1.0)
+    assert history.close(1024, 0.05) == 1.0
+    assert history.losses == [(768, 3.0, 0.1), (1024, 1.0, 0.05)]
+
+
+def test_steps_that_wait_are_kept():
+    history = History()
+    history.add(4.0)
+    again = History(**dataclasses.asdict(history))
+    again.add(2.0)
+    assert again.close(512, 0.1) == 3.0
+    assert history.losses == []

@@ -1,1 +1,0 @@
-"""Rigid bodies with markers of their own, tracked beside the hands."""

@@ -1,0 +1,561 @@
+"""Rigid bodies with markers, tracked beside the hands: labels of their points, and their pose.
+
+Labels go from frame to frame by ID. A point with a new ID is assigned where the pose predicts a missing
+marker. A lost body is searched among all points by the distances between its markers. A body of more than
+three markers is initialized from four or more, and tracked by three or more; near its last pose three are
+enough.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from gloves.captures.capture import Capture, check_unit
+from gloves.takes.points import Status
+from gloves.takes.take import RigidBody
+from handsim._checks import check_array, check_type
+from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices
+from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import SIDES
+from handsim.space.objects import RigidObject, named_object, object_names
+from track.constellation import (
+    FEWEST,
+    assign_by_id,
+    assign_remaining,
+    fit_inliers,
+    predict_pose,
+    search_constellation,
+    shift_to_points,
+    track_by_ids,
+    transform_markers,
+    velocity_between,
+    write_labels,
+    write_transform,
+)
+from track.streams.frame_source import StreamedFrame, capture_frames
+
+GATE: Final = 0.003
+"""Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
+_TIGHT: Final = 0.001  # [m], the same for points that determine the pose, and in a search
+_TIGHTEST: Final = 0.0005  # [m], the same in a search that finds three points, which may fit by chance
+_THINNEST: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
+_CLOSEST: Final = 2.0 * GATE  # [m]: markers nearer to each other than this could exchange labels
+_LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
+_VELOCITY_FITS: Final = 5  # consecutive fits from which the velocity is known
+_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
+_LONGEST_PREDICTION: Final = 0.25  # [s] without a fit, after which the body may be anywhere
+_FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius without a known velocity
+_RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with one
+_CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers are accepted at once
+_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
+_MOST_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
+_FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidTemplate(RigidBody):
+    """A rigid body whose markers determine its pose: the markers in its own frame.
+
+    Raises:
+        ArgumentError: `positions` have another shape, or `template_fault` finds a fault.
+    """
+
+    def __post_init__(self) -> None:
+        positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")
+        object.__setattr__(self, "positions", positions)
+        fault = template_fault(self.name, self.marker_names, positions)
+        if fault is not None:
+            raise ArgumentError(fault)
+
+    @classmethod
+    def of(cls, thing: RigidObject) -> RigidTemplate:
+        """The markers of an object.
+
+        Raises:
+            ArgumentError: They do not make a rigid body; most objects carry too few.
+        """
+        return cls(thing.name, thing.marker_names, thing.markers)
+
+    @property
+    def distances(self) -> Float[np.ndarray, "Q Q"]:
+        """Distances between markers [m]."""
+        return _distances_between(self.positions)
+
+
+def template_fault(
+    name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
+) -> str | None:
+    """Why these markers are not a body that can be tracked, as a sentence; None if they are.
+
+    Args:
+        marker_names: Names of its Q markers.
+        positions: Markers in the body's frame [m].
+    """
+    if positions.ndim != 2 or len(positions) < FEWEST:
+        return f"{name}: {positions.shape[-2]} markers, expected at least {FEWEST}, which determine a pose"
+    if len(set(marker_names)) < len(marker_names):
+        return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
+    distances = _distances_between(positions)
+    apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
+    if apart.min() < _CLOSEST:
+        first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
+        return (
+            f"{name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
+            f"{1e3 * _CLOSEST:.0f} mm"
+        )
+    off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
+    if off_line < _THINNEST * np.sqrt(len(positions)):
+        return f"{name}: its markers lie on one line, expected three that do not"
+    order = _symmetry(positions, distances)
+    if order is not None:
+        moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
+        return (
+            f"{name}: its markers look the same from two sides ({', '.join(moved)}), expected positions "
+            "whose distances differ by some millimeters"
+        )
+    return None
+
+
+def _distances_between(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    distances: NDArray[np.float64] = np.linalg.norm(positions[:, None] - positions, axis=2)
+    return distances
+
+
+def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
+    """Another order of all markers that fits the body after a rotation, if there is one.
+
+    A part of the markers may still be symmetric; then the body is not found while only these are seen.
+    """
+    count = len(positions)
+    orders: list[tuple[int, ...]] = [()]
+    for marker in range(count):  # orders that keep all distances so far
+        orders = [
+            (*order, to)
+            for order in orders
+            for to in range(count)
+            if to not in order
+            and all(abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _TIGHT for k in range(marker))
+        ]
+    for order in orders:
+        if order != tuple(range(count)):
+            agree, _ = fit_inliers(positions, positions, np.array(order), np.empty(7), _TIGHT, _TIGHT)
+            if agree == count:  # rotated, not mirrored
+                return order
+    return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyFrame:
+    """Status, pose and labels of a body in one frame."""
+
+    status: Status
+    """`found` in the first frame after it was lost, `tracked` from then on, `coasting` for a few frames where
+    fewer than three markers are seen and the pose is a prediction, `lost`."""
+    T_world_body: Float[np.ndarray, "4 4"] | None
+    """The body's frame in the world [m]; None when lost."""
+    labels: Int[np.ndarray, "N"]
+    """Index of each point's marker in the template, -1 for all others."""
+    rms: float
+    """RMS distance of the labeled points from their markers [m]; NaN without any."""
+
+
+class BodyTracker:
+    """Tracks one rigid body through a stream of points.
+
+    Args:
+        template: The body's markers.
+    """
+
+    def __init__(self, template: RigidTemplate) -> None:
+        self.template = template
+        self._positions, self._distances = template.positions, template.distances
+        self._reset()
+        for number in range(18):  # loads all kernels before the first frame of a stream
+            there = self._positions if number < 17 else self._positions[:0]
+            self.step(there, np.arange(len(there)), number / 120.0)
+        self._reset()
+
+    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
+        """Track the body in the next frame; any content of a stream ends in a status.
+
+        Args:
+            points: All points of the frame [m], in any order, with those of hands and ghosts. Points with
+                coordinates that are not finite are ignored.
+            ids: The system's ID of each point, negative where it gives none.
+
+        Raises:
+            ArgumentError: `points` and `ids` do not fit together.
+        """
+        # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
+        points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
+        if points.shape != (len(ids), 3):
+            raise ArgumentError(
+                f"points have shape {points.shape}, expected ({len(ids)}, 3) for {len(ids)} IDs"
+            )
+        with np.errstate(invalid="ignore"):
+            usable = np.abs(points).max(axis=1, initial=0.0) < _FARTHEST  # which NaN is not
+        if usable.all():
+            return self._step(points, ids, time)
+        frame = self._step(points[usable], ids[usable], time)
+        labels = np.full(len(points), -1)
+        labels[usable] = frame.labels
+        return dataclasses.replace(frame, labels=labels)
+
+    def _step(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> BodyFrame:
+        elapsed = time - self._time
+        if self._status != Status.LOST:
+            frame = self._track(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
+            if frame is not None:
+                return frame
+            self._lose()
+        return self._initialize(points, ids, time, elapsed)
+
+    def _reset(self) -> None:
+        self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
+        self._most_markers, self._fits = 0, 0  # since initialization: most markers in one fit, number of fits
+        self._lose()
+
+    def _lose(self) -> None:
+        self._status: Status = Status.LOST
+        self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
+        self._candidate, self._confirmed = np.full(7, np.nan), 0
+
+    def _track(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame | None:
+        """The body by the IDs of its points, or near its predicted pose."""
+        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        count, rms = track_by_ids(
+            self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
+        )
+        if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
+            predicted = predict_pose(self._pose, self._velocity, elapsed)
+            count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
+        if count < FEWEST:
+            return None
+        if max(self._most_markers, count) <= FEWEST < len(self._positions):
+            # Three points may match three markers by chance: a larger match elsewhere is the body.
+            other, other_assignment = np.empty(7), np.empty_like(assignment)
+            more, spread = self._match(points, None, np.inf, other_assignment, other)
+            if more > FEWEST:
+                return self._accept(Status.INITIALIZED, other, spread, other_assignment, ids, time)
+        return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
+
+    def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
+        """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
+        if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
+            return None
+        pose = predict_pose(self._pose, self._velocity, elapsed)
+        assignment = np.empty(len(self._positions), dtype=np.int64)
+        assign_by_id(points, ids, self._last_ids, assignment)
+        _, rms = shift_to_points(points, assignment, pose, transform_markers(self._positions, pose), GATE)
+        self._status = Status.COASTING
+        return self._result(pose, rms, assignment, ids)
+
+    def _initialize(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame:
+        """The body near its predicted pose, or anywhere."""
+        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        if 0.0 < elapsed <= _LONGEST_PREDICTION:
+            radius, predicted = (
+                self._search_radius(elapsed),
+                predict_pose(self._pose, self._velocity, elapsed),
+            )
+            count, rms = self._match(points, predicted, radius, assignment, pose)
+            if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
+                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
+        count, rms = self._match(points, None, np.inf, assignment, pose)
+        if count >= FEWEST:
+            there = transform_markers(self._positions, pose)
+            before = transform_markers(self._positions, self._candidate)
+            moved = np.linalg.norm(there - before, axis=1).max()
+            self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
+            self._candidate = pose
+            if self._confirmed >= _frames_to_confirm(count, len(self._positions)):
+                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
+        else:
+            self._confirmed = 0
+        return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
+
+    def _search_radius(self, elapsed: float) -> float:
+        """Largest distance of a marker from its predicted position [m]."""
+        if self._fits < _VELOCITY_FITS:
+            return _FIRST_RADIUS + _MOST_SPEED * elapsed
+        return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
+
+    def _match(
+        self,
+        points: NDArray[np.float64],
+        near: NDArray[np.float64] | None,
+        radius: float,
+        assignment: NDArray[np.int64],
+        pose: NDArray[np.float64],
+    ) -> tuple[int, float]:
+        """The unique match of the markers within a radius of a pose, or anywhere; fills the last two arrays.
+
+        Returns the number of markers that match, 0 if there is no unique match, and their RMS distance [m].
+        """
+        if len(points) > _MOST_POINTS:
+            return 0, np.nan
+        expected = self._positions if near is None else transform_markers(self._positions, near)
+        count, _, rival = search_constellation(
+            self._positions, self._distances, points, expected, radius, _TIGHT, assignment, pose
+        )
+        if count < FEWEST or rival >= count:
+            return 0, np.nan
+        if count == FEWEST:
+            kept, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
+            if kept < FEWEST:
+                return 0, np.nan
+        return assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+
+    def _accept(
+        self,
+        status: Status,
+        pose: NDArray[np.float64],
+        rms: float,
+        assignment: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        time: float,
+    ) -> BodyFrame:
+        """Update pose and velocity by a fit."""
+        elapsed = time - self._time
+        if status == Status.INITIALIZED:
+            self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
+        elif 0.0 < elapsed <= _LONGEST_PREDICTION:
+            weight = _SMOOTHING if self._fits > 1 else 1.0
+            self._velocity += weight * (velocity_between(self._pose, pose, elapsed) - self._velocity)
+        self._fits += 1
+        self._pose, self._time, self._status = pose, time, status
+        self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
+        return self._result(pose, rms, assignment, ids)
+
+    def _result(
+        self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> BodyFrame:
+        """The result of a fit; the IDs are kept for the next frame."""
+        labels, transform = np.full(len(ids), -1), np.eye(4)
+        write_labels(assignment, ids, labels, self._last_ids)
+        write_transform(pose, transform)
+        return BodyFrame(self._status, transform, labels, rms)
+
+
+def _frames_to_confirm(count: int, markers: int) -> float:
+    """Frames that a match of `count` of a body's markers must last before it is accepted without a pose.
+
+    Three markers of a larger body are never accepted: markers on the back of a hand keep their distances for
+    minutes, and in up to one of twenty frames some three markers of two hands match three of an object. Four
+    match in one of a thousand.
+    """
+    if count == FEWEST:
+        return 10 if markers == FEWEST else np.inf
+    return 2 if count == FEWEST + 1 < markers else 1
+
+
+SUFFIX: Final = ".toml"
+AnyBody = RigidTemplate | str | Path
+"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
+_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
+_BODY_KEYS: Final = ("name", "description", "marker")
+_MARKER_KEYS: Final = ("name", "place_mm")
+
+
+class BodyError(HandSimError):
+    """A body's file that cannot be read or written."""
+
+
+def load_body(name_or_path: AnyBody) -> RigidTemplate:
+    """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
+
+    A body itself is given back.
+    """
+    check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
+    if isinstance(name_or_path, RigidTemplate):
+        return name_or_path
+    path = Path(name_or_path)
+    if str(name_or_path) in object_names():
+        return RigidTemplate.of(named_object(str(name_or_path)))
+    if path.suffix.lower() != SUFFIX:
+        ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
+        unknown = choices(str(name_or_path), ours, noun="body")
+        raise ArgumentError(f"{unknown}, or the path of a .toml file")
+    table = read_toml(path, error=BodyError)
+    try:
+        return _parse_body(table)
+    except HandSimError as error:
+        raise BodyError(f"{path}: {error}") from error
+
+
+def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
+    """Bodies that are tracked together, or one.
+
+    Raises:
+        ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
+        BodyError: A file cannot be loaded.
+    """
+    if isinstance(names_or_paths, AnyBody):
+        names_or_paths = (names_or_paths,)
+    check_type("bodies", names_or_paths, Iterable, _EXPECTED)
+    bodies: list[RigidTemplate] = []
+    for name_or_path in names_or_paths:
+        body = load_body(name_or_path)
+        taken = (*SIDES, *(other.name for other in bodies))
+        if body.name in taken:
+            owner = "" if body is name_or_path else f"{name_or_path}: "
+            raise ArgumentError(
+                f"{owner}a body is named '{body.name}', expected a name of its own; taken are "
+                f"{', '.join(taken)}"
+            )
+        bodies.append(body)
+    return tuple(bodies)
+
+
+def save_body(path: str | Path, body: RigidTemplate) -> None:
+    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again."""
+    lines = [f"name = {quoted(body.name)}"]
+    for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
+        numbers_mm = ", ".join(written(value) for value in position.tolist())
+        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    except OSError as error:
+        raise BodyError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
+    check_keys(table, "the file", _BODY_KEYS, optional=("description", "marker"))
+    text_of(table, "description", default="")
+    name = _printable("the body's name", text_of(table, "name"))
+    markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
+    positions = np.array([position for _, position in markers]).reshape(-1, 3)
+    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * positions)
+
+
+def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
+    name = table.get("name")
+    owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
+    check_keys(table, owner, _MARKER_KEYS)
+    name = _printable("marker name", text_of(table, "name", f"{owner}: "))
+    expected = "three numbers [x, y, z] in millimeters"
+    return name, numbers(f"{owner}: place_mm", table["place_mm"], (3,), expected).tolist()
+
+
+def _printable(what: str, name: str) -> str:
+    """A name that marker files can hold."""
+    if not name or name != name.strip() or not name.isprintable():
+        raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
+    return name
+
+
+_MOST_MARKERS: Final = 20
+_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
+_CANDIDATES: Final = 5  # frames that are tried as the first template
+_ROUNDS: Final = 3  # of averaging the markers over all frames
+_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
+_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
+
+
+def learn_body(capture: Capture, name: str) -> RigidTemplate:
+    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers.
+
+    A first template is taken from one frame and tracked through all frames. Then each marker moves to its
+    median over the frames.
+
+    Args:
+        capture: A capture of the body in motion; gaps and a few false points are allowed. Marker names are
+            not used.
+
+    Raises:
+        ArgumentError: The capture is not in meters.
+        CalibrationError: Most of the points are not of one rigid body, or the body cannot be tracked.
+    """
+    frames = list(capture_frames(capture))
+    check_unit([frame.points for frame in frames])
+    counts = np.array([len(frame.points) for frame in frames])
+    body, tracked = _best_template(name, frames, counts)
+    labeled = _num_labeled(tracked)
+    if labeled < _LABELED_SHARE * counts.sum():
+        raise CalibrationError(
+            f"{100.0 * labeled / counts.sum():.0f} % of the points keep their positions on one rigid body, "
+            "expected a capture with nothing else in it"
+        )
+    for _ in range(_ROUNDS):
+        positions = _median_positions(body, frames, tracked)
+        fault = _fault(name, positions)
+        if fault is not None:
+            raise CalibrationError(fault)
+        body = _template(name, positions)
+        tracked = _track(body, frames)
+    return body
+
+
+def _best_template(
+    name: str, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
+) -> tuple[RigidTemplate, list[BodyFrame]]:
+    """Of several frames' points the template that labels most points, and its track through all frames."""
+    count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
+    if not 3 <= count <= _MOST_MARKERS:
+        raise CalibrationError(
+            f"a capture of {count} points per frame, expected 3 to {_MOST_MARKERS}: one body and nothing else"
+        )
+    chosen = np.flatnonzero(counts == count)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, _CANDIDATES).round().astype(int)]
+    candidates = []
+    faults = {number: _fault(name, frames[number].points) for number in np.unique(chosen)}
+    for number, fault in faults.items():
+        if fault is None:
+            body = _template(name, frames[number].points)
+            candidates.append((body, _track(body, frames)))
+    if not candidates:
+        raise CalibrationError(f"{list(faults.values())[-1]}")
+    return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
+
+
+def _marker_names(positions: NDArray[np.float64]) -> tuple[str, ...]:
+    return tuple(f"Marker{number + 1}" for number in range(len(positions)))
+
+
+def _fault(name: str, positions: NDArray[np.float64]) -> str | None:
+    """What is wrong with a body of markers at these positions (Q, 3), if anything."""
+    return template_fault(name, _marker_names(positions), positions - positions.mean(axis=0))
+
+
+def _template(name: str, positions: NDArray[np.float64]) -> RigidTemplate:
+    """A body of markers at these positions (Q, 3), moved to its own frame."""
+    return RigidTemplate(name, _marker_names(positions), positions - positions.mean(axis=0))
+
+
+def _track(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:
+    tracker = BodyTracker(body)
+    return [tracker.step(frame.points, frame.ids, frame.time) for frame in frames]
+
+
+def _num_labeled(tracked: Sequence[BodyFrame]) -> int:
+    return sum(int((frame.labels >= 0).sum()) for frame in tracked)
+
+
+def _median_positions(
+    body: RigidTemplate, frames: Sequence[StreamedFrame], tracked: Sequence[BodyFrame]
+) -> NDArray[np.float64]:
+    """Median position (Q, 3) of each marker in the body's frame [m]; rarely seen markers are dropped."""
+    seen = np.full((len(frames), len(body.positions), 3), np.nan)
+    for number, (frame, one) in enumerate(zip(frames, tracked, strict=True)):
+        if one.T_world_body is not None:
+            labeled = one.labels >= 0
+            rotation, translation = one.T_world_body[:3, :3], one.T_world_body[:3, 3]
+            seen[number, one.labels[labeled]] = (frame.points[labeled] - translation) @ rotation
+    present = np.isfinite(seen[..., 0])
+    kept = present.sum(axis=0) >= _SEEN_SHARE * present.any(axis=1).sum()
+    median: NDArray[np.float64] = np.nanmedian(seen[:, kept], axis=0)
+    return median

@@ -1,0 +1,487 @@
+"""How right labelers are: known markers are corrupted as in the paper, labeled, and counted.
+
+The figures are those of Han et al. 2018. Slot accuracy: over frames and label slots, a slot is right when it
+holds the right point, or rightly none (Tables 2, 4 and 6 on synthetic data). Point accuracy: over the points
+of the input, ghosts among them. Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as
+the positive class. Macro F1 is over points too: the mean F1 of the markers and of "ghost", the null class, as
+SOMA (Ghorbani and Black 2021) counts it. Calibration compares the confidence of labels with the share of them
+that is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gloves.captures.capture import Capture, select_hands
+from gloves.captures.formats import find_captures, read_markers
+from gloves.layout import MarkerLayout
+from gloves.optics.ghosts import GHOST_REACH
+from gloves.takes.take import Take, load_take
+from handsim._checks import check_count, check_rng, check_type
+from handsim.errors import ArgumentError, CaptureError
+from train.data.batches import Cloud, Corruption, OwnCorruption, draw_cloud, paper_corruption
+from train.data.shards import MANIFEST, Dataset, load_dataset
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+
+BINS: Final = 15
+"""Equally wide bins of confidence."""
+LEAST_SURE: Final = 0.02
+"""Share of the points that a person might check by hand."""
+
+
+@dataclass(slots=True)
+class LabelCounts:
+    """Running counts; every figure is a share in [0, 1], NaN where there was nothing to count.
+
+    Precision is NaN also where nothing was hidden, or no point a ghost: whatever was said is wrong then, and
+    its number says more than its share, zero.
+    """
+
+    frames: int = 0
+    frames_right: int = 0
+    slots: int = 0
+    slots_right: int = 0
+    points: int = 0
+    points_right: int = 0
+    occluded: int = 0
+    occluded_given: int = 0
+    occluded_right: int = 0
+    ghosts: int = 0
+    ghosts_given: int = 0
+    ghosts_right: int = 0
+    confusion: Int[np.ndarray, "M+1 M+1"] = field(
+        default_factory=lambda: np.zeros((0, 0), dtype=np.int64), compare=False
+    )
+    """Points by true label (rows) and given label (columns): markers in label order, then ghost.
+    Empty before the first frame."""
+
+    def add(
+        self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
+    ) -> Bool[np.ndarray, "M"]:
+        """Count one frame by given and true labels, -1 for a ghost; which label slots are right."""
+        given, true = _slots(labels, num_labels), _slots(truth, num_labels)
+        right: np.ndarray = given == true
+        slots_right, points_right = int(right.sum()), int((labels == truth).sum())
+        self.frames += 1
+        self.frames_right += slots_right == num_labels and points_right == len(truth)
+        self.slots += num_labels
+        self.slots_right += slots_right
+        self.points += len(truth)
+        self.points_right += points_right
+        self.occluded += int((true < 0).sum())
+        self.occluded_given += int((given < 0).sum())
+        self.occluded_right += int(((given < 0) & (true < 0)).sum())
+        self.ghosts += int((truth < 0).sum())
+        self.ghosts_given += int((labels < 0).sum())
+        self.ghosts_right += int(((labels < 0) & (truth < 0)).sum())
+        if not self.confusion.size:
+            self.confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
+        np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
+        return right
+
+    def figures(self) -> dict[str, float]:
+        """All figures by name."""
+        return {
+            "slot_accuracy": _share(self.slots_right, self.slots),
+            "point_accuracy": _share(self.points_right, self.points),
+            "frame_accuracy": _share(self.frames_right, self.frames),
+            "occlusion_ratio": _share(self.occluded, self.slots),
+            "occlusion_precision": _precision(self.occluded_right, self.occluded_given, self.occluded),
+            "occlusion_recall": _share(self.occluded_right, self.occluded),
+            "ghost_ratio": _share(self.ghosts, self.slots),
+            "ghost_precision": _precision(self.ghosts_right, self.ghosts_given, self.ghosts),
+            "ghost_recall": _share(self.ghosts_right, self.ghosts),
+            "macro_f1": macro_f1(self.confusion),
+        }
+
+    def numbers(self) -> dict[str, int]:
+        """What the shares of occlusions and ghosts come from."""
+        names = ("occluded", "occluded_given", "occluded_right", "ghosts", "ghosts_given", "ghosts_right")
+        return {name: getattr(self, name) for name in ("slots", "points", *names)}
+
+
+def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
+    """Mean F1 of the classes that occur, as true or given labels; NaN where none does.
+
+    Args:
+        confusion: Counts, rows the truth.
+    """
+    occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
+    there = occurs > 0
+    if not there.any():
+        return float("nan")
+    return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reliability:
+    """Points in equally wide bins of confidence; NaN in bins that hold none."""
+
+    confidence: Float[np.ndarray, "15"]
+    """Mean confidence."""
+    right: Float[np.ndarray, "15"]
+    """Share that is right."""
+    count: Int[np.ndarray, "15"]
+
+
+def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> Reliability:
+    """Share of right labels by confidence.
+
+    Args:
+        confidence: Confidence of each label, 0 to 1; a bin includes its lower edge, the last one also 1.
+    """
+    index = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
+    count = np.bincount(index, minlength=BINS)
+    sums = [np.bincount(index, weights, minlength=BINS) for weights in (confidence, right)]
+    with np.errstate(invalid="ignore"):
+        return Reliability(sums[0] / count, sums[1] / count, count)
+
+
+def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> float:
+    """Mean difference of a bin's confidence and its share of right labels, weighted by points; NaN if empty.
+
+    Args:
+        confidence: Confidence of each label, 0 to 1.
+    """
+    if not len(confidence):
+        return float("nan")
+    bins = reliability(confidence, right)
+    return float(np.nansum(np.abs(bins.confidence - bins.right) * bins.count) / len(confidence))
+
+
+def error_without(
+    confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
+) -> float:
+    """Share of points labeled wrongly after a share of least confidence is left out; NaN when none is kept.
+
+    Where only some points of one confidence are left out, the result is the mean over all choices, so that
+    the order of the points does not matter.
+    """
+    kept = len(confidence) - round(share * len(confidence))
+    if not kept:
+        return float("nan")
+    least = np.partition(confidence, -kept)[-kept]  # the least confidence that is kept
+    above, tied = confidence > least, confidence == least
+    from_tied = (kept - above.sum()) * (~right[tied]).mean()
+    return float(((~right[above]).sum() + from_tied) / kept)
+
+
+@dataclass(slots=True)
+class History:
+    """Loss, learning rate and held-out accuracy of a training run; it is kept in the checkpoint."""
+
+    losses: list[tuple[int, float, float]] = field(default_factory=list)
+    """Samples done, mean loss of the steps since the previous entry, learning rate of the last of them."""
+    accuracies: list[tuple[int, float, float]] = field(default_factory=list)
+    """Samples done, minutes of steps until then, slot accuracy on some held-out frames with the paper's
+    corruption."""
+    minutes: float = 0.0
+    """Time of all steps."""
+    waiting: float = 0.0
+    """Sum of the losses of the steps that are in no entry yet."""
+    steps: int = 0
+    """Number of those steps."""
+
+    def add(self, loss: float) -> None:
+        """Count a step."""
+        self.waiting += loss
+        self.steps += 1
+
+    def close(self, done: int, rate: float) -> float:
+        """Make an entry of the steps since the last one (at least one) and return their mean loss."""
+        mean = self.waiting / self.steps
+        self.losses.append((done, mean, rate))
+        self.waiting, self.steps = 0.0, 0
+        return mean
+
+
+def percent(share: float) -> str:
+    """A share in percent with two decimals, a dash for NaN."""
+    return "-" if np.isnan(share) else f"{100 * share:.2f}"
+
+
+def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:
+    """Which point each label slot holds, -1 for none."""
+    slots = np.full(num_labels, -1)
+    labeled = np.flatnonzero(labels >= 0)
+    slots[labels[labeled]] = labeled
+    return slots
+
+
+def _precision(right: int, given: int, there: int) -> float:
+    return _share(right, given) if there else float("nan")
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
+    """Print figures as a table in percent, a column each."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("figure")
+    for name in columns:
+        table.add_column(f"{name} [%]", justify="right")
+    for figure in next(iter(columns.values())):
+        table.add_row(
+            figure.replace("_", " "), *map(percent, (column[figure] for column in columns.values()))
+        )
+    Console().print(table)
+
+
+_CHUNK: Final = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelingReport:
+    """The result of an evaluation."""
+
+    figures: dict[str, float]
+    """Shares in [0, 1], see `train.evaluation`; and from `train.evaluation` the expected
+    calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
+    slot_accuracy_by_marker: Float[np.ndarray, "M"]
+    num_frames: int
+    confusion: Int[np.ndarray, "M+1 M+1"]
+    """Points by true label (rows) and given label (columns): markers in label order, then ghost."""
+    confidences: Float[np.ndarray, "N"]
+    """Confidence of each point's label, the points of all frames in order."""
+    right: Bool[np.ndarray, "N"]
+    """Whether that label is right."""
+    numbers: dict[str, int] = field(default_factory=dict)
+    """Slots, points, occlusions and ghosts counted, see `train.evaluation.LabelCounts.numbers`."""
+
+
+def evaluate_markers(
+    labeler: Labeler,
+    markers: Float[np.ndarray, "T M 3"],
+    corruption: Corruption | OwnCorruption | str,
+    *,
+    rng: np.random.Generator,
+) -> LabelingReport:
+    """Corrupt known markers [m], NaN where missing, label them and count errors."""
+    count = LabelingCount(labeler)
+    count.add_markers(markers, corruption, rng=rng)
+    return count.report()
+
+
+def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> LabelingReport:
+    """Label clouds whose truth is known, and count errors."""
+    count = LabelingCount(labeler)
+    count.add_cloud(cloud)
+    return count.report()
+
+
+def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
+    """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
+    markers = rows["markers"].astype(np.float64)
+    corruption = paper_corruption(markers.shape[1])
+    return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
+
+
+def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
+    """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
+
+    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of a body
+    with three or more are left out, since the system tracks it, as are those of the other hand.
+    """
+    nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
+    mine, labels = take.hand_labels[hand], take.point_list.labels
+    own = (labels >= mine.start) & (labels < mine.stop)
+    ghost = (labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
+    here = take.point_list.without(~(own | ghost))
+    truth = np.where(here.labels >= 0, here.labels - mine.start, -1)
+    clouds, truths = (np.split(values, here.starts[1:-1]) for values in (here.points, truth))
+    return clouds, truths
+
+
+def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
+    """Distance of every point from the nearest marker seen of one hand [m]; inf where none is seen."""
+    markers, points = take.observed(label), take.point_list
+    distance = np.full(len(points.labels), np.inf)
+    for frame, every in enumerate(markers):
+        there, seen = points.of(frame), every[np.isfinite(every[:, 0])]
+        if len(seen) and there.stop > there.start:
+            distance[there] = cKDTree(seen).query(points.points[there])[0]
+    return distance
+
+
+class LabelingCount:
+    """Labels clouds and counts errors."""
+
+    def __init__(self, labeler: Labeler) -> None:
+        self.labeler = labeler
+        self.num_labels = len(labeler.marker_names)
+        classes = self.num_labels + 1
+        self.counts = LabelCounts(confusion=np.zeros((classes, classes), dtype=np.int64))
+        self.right_by_marker = np.zeros(self.num_labels)
+        self.confidences: list[NDArray[np.float64]] = [np.zeros(0)]
+        self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
+
+    def add_cloud(self, cloud: Cloud) -> None:
+        """Label clouds [m] and count."""
+        self.add(
+            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
+            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
+        )
+
+    def add_markers(
+        self,
+        markers: Float[np.ndarray, "T M 3"],
+        corruption: Corruption | OwnCorruption | str,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        """Corrupt markers [m], label the clouds and count."""
+        for first in range(0, len(markers), _CHUNK):
+            self.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
+
+    def add_take(self, take: Take) -> None:
+        """Label every hand of every frame of a take, separated by the truth."""
+        for hand in range(len(take.hands)):
+            clouds, truths = hand_clouds(take, hand)
+            for first in range(0, len(clouds), _CHUNK):
+                self.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+
+    def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
+        """Label points [m] and count; a truth is the marker of each, -1 for a ghost."""
+        for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
+            self.right_by_marker += self.counts.add(labeling.labels, truth, self.num_labels)
+            self.confidences.append(labeling.confidence)
+            self.right.append(labeling.labels == truth)
+
+    def report(self) -> LabelingReport:
+        """Figures of all that was counted."""
+        frames = self.counts.frames
+        confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
+        figures = {
+            **self.counts.figures(),
+            "calibration_error": expected_calibration_error(confidences, right),
+            "error_without_least_sure": error_without(confidences, right),
+        }
+        by_marker = self.right_by_marker / max(1, frames)
+        numbers = self.counts.numbers()
+        return LabelingReport(figures, by_marker, frames, self.counts.confusion, confidences, right, numbers)
+
+
+CLEAN: Final = Corruption(occlude=0, ghosts=0)
+"""No corruption but the order of points."""
+Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
+"""Markers whose labels are known: [m] in the labeler's order, a training set, a take with its truth, a
+labeled capture, the path of one of the three, or a folder of captures."""
+
+
+def evaluate_labeler(
+    labeler: MarkerLayout | Labeler | str | Path,
+    truth: Truth | Sequence[Truth],
+    corruption: Corruption | OwnCorruption | str = CLEAN,
+    *,
+    every: int = 1,
+    rng: np.random.Generator | None = None,
+) -> LabelingReport:
+    """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
+
+    Args:
+        labeler: The labeler to evaluate, its name or path, or a glove whose labeler it is.
+        truth: True markers (T, M, 3) [m] in the labeler's order, NaN where missing; a training set, a labeled
+            capture or a take with its truth; the path of one of these or of a folder of captures; or several.
+            Each hand is counted by itself.
+        corruption: Occlusion, ghosts and jitter to draw; none when not given. Or a corruption of your own, as
+            `CloudStream` takes it.
+        every: Take one frame of this many; 1 takes all.
+        rng: Source of all randomness; one of seed 0 when not given.
+
+    Returns:
+        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
+        of a take are those within 0.1 [m] of its markers.
+
+    Raises:
+        ArgumentError: An argument is of another type, or markers are not in meters.
+        CaptureError: A file cannot be read, its glove has other markers than the labeler knows, takes are
+            given with others or to be corrupted, or there is nothing to count.
+    """
+    network = load_labeler(labeler)
+    check_count("every", every, 1)
+    rng = np.random.default_rng(0) if rng is None else rng
+    check_rng(rng)
+    several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
+    given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
+    count, takes = LabelingCount(network), [one for one in given if _is_take(one)]
+    if len(takes) < len(given) and takes:
+        raise CaptureError(
+            f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
+        )
+    for one in takes:
+        take = one if isinstance(one, Take) else load_take(one)
+        if take.made_by_tracker:
+            raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
+        if corruption != CLEAN or every > 1:
+            raise CaptureError(
+                "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
+                "(--occlude, --ghosts) and every (--every), which labeled captures take"
+            )
+        for hand in take.hands:
+            _check_markers("the take's glove", hand.layout.names, network.marker_names)
+        count.add_take(take)
+    if not takes:
+        count.add_markers(_markers(given, network.marker_names)[::every], corruption, rng=rng)
+    report = count.report()
+    if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
+        raise CaptureError(
+            f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
+            "captures"
+        )
+    return report
+
+
+def _shown(take: Any) -> str:
+    """A take as sentences name it."""
+    return str(take) if isinstance(take, str | Path) else "the take"
+
+
+def _is_take(truth: Any) -> bool:
+    return isinstance(truth, Take) or (isinstance(truth, str | Path) and Path(truth).suffix == ".npz")
+
+
+def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:
+    """The markers of all that was given [m], in the labeler's order."""
+    parts = []
+    for one in truth:
+        if isinstance(one, np.ndarray):
+            count = len(names)
+            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
+                raise ArgumentError(
+                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
+                )
+            parts.append(one.astype(np.float64))
+        elif isinstance(one, Capture):
+            parts += select_hands(one, names)
+        elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
+            dataset = load_dataset(one)
+            _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
+            markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
+            parts.append(markers)
+        else:
+            expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
+            check_type("truth", one, (str, Path), expected)
+            parts.append(read_markers(find_captures([Path(one)]), names))
+    if not parts:
+        raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
+    return np.concatenate(parts)
+
+
+def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:
+    """Refuse markers that the labeler does not know."""
+    if tuple(has) != tuple(knows):
+        raise CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")

@@ -1,0 +1,328 @@
+"""A labeler for any layout, without a training set: one network that takes the layout as an input.
+
+What it must know of a layout comes from a few seconds of simulation: the distribution of the distance between
+every two markers over people and poses, and the pose prior (`train.labelers.pose_prior`). A minute of
+training makes it better. Such a labeler is kept in the user's cache folder, under a digest of all that
+decides it: the layout, the cameras, the shipped weights and the version.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gloves.layout import MarkerLayout
+from handsim import __version__
+from handsim.errors import WeightsError
+from handsim.files.inputs import checksum
+from handsim.files.json_files import save_json
+from handsim.files.outputs import atomic_write, written_together
+from handsim.hand.shape import SIDES
+from handsim.space.rig import CameraRig, as_rig
+from train.data.batches import draw_batch
+from train.data.shards import row_dtype
+from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.labelers.pose_prior import PosePrior, learn_pose_prior
+from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.storage import LEARNED, learned_folder, learned_gloves
+from train.settings import TrainSettings, batch_recipe
+from train.simulation.scenes import sample_hands, wear_gloves
+from train.simulation.training_frames import (
+    GenerateSettings,
+    sample_single_hand,
+    simulate_frames,
+)
+from train.threads import labeling_threads, torch_threads
+
+NUM_POSES: Final = 40_000
+"""Poses from which a layout is known; fewer make a coarser pose prior."""
+WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
+SHIPPED: Final = Path(__file__).parents[1] / "weights"
+_NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
+_CHUNK: Final = 500  # poses
+_POSES_EACH: Final = 100  # of a person
+
+
+class LayoutLabeler:
+    """Labels a glove that no network was trained on.
+
+    Args:
+        distances: What the network gets of the layout, see `mean_features`.
+        prior: What it knows of hands as wholes.
+    """
+
+    def __init__(
+        self,
+        layout: MarkerLayout,
+        network: LayoutNetwork,
+        distances: Float[Tensor, "1 M M K"],
+        prior: PosePrior | None,
+    ) -> None:
+        self.network, self.distances, self.prior = network.eval(), distances, prior
+        self.marker_names = layout.names
+
+    @classmethod
+    def at_once(cls, layout: MarkerLayout, *, num_poses: int = NUM_POSES, seed: int = 0) -> Self:
+        """The shipped network with what a few seconds of simulation tell of a layout.
+
+        Args:
+            num_poses: Poses from which the layout is known.
+            seed: Of those poses.
+
+        Raises:
+            LayoutError: A marker misses the skin.
+        """
+        rng = np.random.default_rng(seed)
+        markers = sample_worn_markers(layout, num_poses, rng=rng)
+        network, prior = shipped_network(), learn_pose_prior(markers, rng=rng)
+        return cls(layout, network, mean_features(markers, network.config)[None], prior)
+
+    def tensors(self) -> dict[str, NDArray[np.generic]]:
+        """All that it has learned, by name, for a file."""
+        parts = {f"{_NETWORK}{name}": value.numpy() for name, value in self.network.state_dict().items()}
+        prior = {} if self.prior is None else self.prior.tensors()
+        parts |= {f"{_PRIOR}{name}": value for name, value in prior.items()}
+        return parts | {_DISTANCES: self.distances.numpy()}
+
+    @classmethod
+    def of_tensors(cls, layout: MarkerLayout, tensors: Mapping[str, NDArray[np.generic]]) -> Self:
+        """The labeler out of a file's tensors."""
+        network = LayoutNetwork(LayoutNetworkConfig())
+        parts, prior = (
+            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+            for prefix in (_NETWORK, _PRIOR)
+        )
+        try:
+            distances = torch.from_numpy(np.array(tensors[_DISTANCES]))
+            network.load_state_dict({name: torch.from_numpy(np.array(one)) for name, one in parts.items()})
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise WeightsError(f"not a labeler of glove '{layout.name}': {error}") from error
+        if distances.shape[:3] != (1, layout.num_markers, layout.num_markers):
+            raise WeightsError(f"not a labeler of the {layout.num_markers} markers of glove '{layout.name}'")
+        return cls(layout, network, distances, PosePrior.of_tensors(prior) if prior else None)
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return label_in_batches(frames, self._label)
+
+    @torch.inference_mode()
+    def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        points, present = pad_clouds(clouds)
+        with labeling_threads():
+            scores = self.network(torch.from_numpy(points), torch.from_numpy(present), self.distances)[-1]
+        return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy(), self.prior)
+
+
+def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConfig) -> Float[Tensor, "M M K"]:
+    """Mean over poses of the distance features between a layout's markers [m]."""
+    centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
+    sums = [
+        distance_features(centered[first : first + _CHUNK], config).sum(0)
+        for first in range(0, len(centered), _CHUNK)
+    ]
+    return torch.stack(sums).sum(0) / len(markers)
+
+
+@cache
+def shipped_network() -> LayoutNetwork:
+    """The network that comes with handsim."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    network = LayoutNetwork(LayoutNetworkConfig())
+    try:
+        tensors = load_file(SHIPPED / WEIGHTS)
+        network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    except (SafetensorError, OSError, RuntimeError) as error:
+        raise WeightsError(
+            f"{SHIPPED / WEIGHTS} is missing or damaged; install handsim again ({error})"
+        ) from error
+    return network
+
+
+def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -> None:
+    """Write the network in half precision, and its card."""
+    from safetensors.torch import save
+
+    tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    card = {
+        "network": dataclasses.asdict(network.config),
+        "clouds": num_clouds,
+        "trained_on": "simulated poses in random layouts",
+        "handsim": __version__,
+        "license": "apache-2.0",
+    }
+    with written_together():
+        with atomic_write(folder / WEIGHTS) as temporary:
+            temporary.write_bytes(save(tensors))
+        save_json(folder / CARD, card)
+
+
+def sample_worn_markers(
+    layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T M 3"]:
+    """Markers [m] of right hands in valid poses; every hundred are another person, whose glove has slipped.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    config = GenerateSettings()
+    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
+    parts = []
+    for first in range(0, num_frames, _POSES_EACH):
+        count = min(_POSES_EACH, num_frames - first)
+        right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
+        scene = sample_single_hand(right, count, config, rng=rng)
+        (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
+        parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
+    return np.concatenate(parts)
+
+
+MOST: Final = 32
+"""Labelers that are kept; one takes about four megabytes."""
+NUM_CLOUDS: Final = 15_000
+_BATCH: Final = 64
+_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
+_FRAMES_EACH: Final = 100  # of a person
+_MOST_GRADIENT: Final = 1.0
+
+
+def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
+    """Whether a glove was learned before."""
+    return _file_of(layout, rig).exists()
+
+
+def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
+    """The labeler of a glove, learned within a minute the first time and read within a second from then on.
+
+    Args:
+        rig: Cameras that see it while it is learned.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    file = _file_of(layout, rig)
+    found = _read(file, layout)
+    if found is not None:
+        return found
+    learned = fine_tuned_labeler(layout, rig)
+    try:
+        _write(file, learned)
+    except OSError:
+        return learned  # a cache that cannot be written costs time, no labels
+    return _read(file, layout) or learned
+
+
+def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+    return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
+
+
+@functools.lru_cache(maxsize=MOST)
+def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
+    """Of all that decides a labeler."""
+    decides = {
+        "layout": dataclasses.asdict(layout),
+        "rig": as_rig(rig).record(),
+        "weights": checksum(SHIPPED / WEIGHTS),
+        "version": __version__,
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
+    """A kept labeler; None where there is none, or a damaged one, which is removed."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        stored = file.read_bytes()
+    except OSError:
+        return None
+    try:
+        labeler = LayoutLabeler.of_tensors(layout, load(stored))
+        os.utime(file)
+    except (OSError, SafetensorError, WeightsError):
+        file.unlink(missing_ok=True)
+        return None
+    return labeler
+
+
+def _write(file: Path, labeler: LayoutLabeler) -> None:
+    from safetensors.numpy import save
+
+    tensors: dict[str, NDArray[np.generic]] = labeler.tensors()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(file) as temporary:
+        temporary.write_bytes(save(dict(tensors)))
+    for old in learned_gloves()[MOST:]:
+        old.unlink(missing_ok=True)
+
+
+def fine_tuned_labeler(
+    layout: MarkerLayout,
+    rig: CameraRig | str = "figure5",
+    *,
+    num_clouds: int = NUM_CLOUDS,
+    seed: int = 0,
+) -> LayoutLabeler:
+    """A labeler for any layout that has learned more of this one.
+
+    Args:
+        rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
+        num_clouds: Clouds to learn from, of two thirds as many frames.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    rng = np.random.default_rng(seed)
+    labeler = LayoutLabeler.at_once(layout, seed=seed)
+    rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
+    network = copy.deepcopy(labeler.network).train()
+    recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
+    steps = -(-num_clouds // _BATCH)
+    with torch_threads(1):
+        for step in range(steps):
+            rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
+            for group in optimizer.param_groups:
+                group["lr"] = float(_PEAK_RATE * rate)
+            cloud = draw_batch(rows, recipe, rng=rng).cloud
+            points, present = (
+                torch.from_numpy(cloud.points.astype(np.float32)),
+                torch.from_numpy(cloud.present),
+            )
+            loss = layout_loss(
+                network(points, present, labeler.distances), torch.from_numpy(cloud.truth), present
+            )
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(network.parameters(), _MOST_GRADIENT)
+            optimizer.step()
+    labeler.network = network.eval()
+    return labeler
+
+
+def _simulated_rows(
+    layout: MarkerLayout, rig: CameraRig, num_frames: int, rng: np.random.Generator
+) -> np.ndarray:
+    source = FrameSource(GenerateSettings(), layout, rig)
+    config = GenerateSettings()
+    rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
+    for first in range(0, num_frames, _FRAMES_EACH):
+        models = sample_hands(config.population, rng=rng)
+        simulate_frames(rows[first : first + _FRAMES_EACH], models, source, rng=rng)
+    return rows

@@ -1,0 +1,312 @@
+"""Training of the network for any layout: every batch holds new random layouts, none of them twice.
+
+python -m train.labelers.layout_training FOLDER [--steps N]
+
+A layout is a choice among many places on the skin, whose positions in many poses of many people are known.
+It writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and goes on from the
+checkpoint there. The figures of the shipped weights are in train/weights/README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import io
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Int
+
+from gloves.fit import attach_markers, wear
+from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
+from handsim.errors import LayoutError
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import HandModel
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
+from handsim.space.transforms import MIRROR
+from train.data.batches import Cloud, Corruption, corrupt, stretched
+from train.labelers.layout_labeler import save_layout_network
+from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import GenerateSettings, sample_frame_scene
+from train.threads import torch_threads
+
+_MOST_MISSED: Final = 500  # draws in a row without a free place
+_APART: Final = 0.0025  # [m] between two places of a bank, at least
+_PALM_SHARE: Final = 5.0  # of places, against a finger's bone
+_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
+_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)
+_AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [deg]
+_MOST_AROUND: Final = 100.0  # [deg]
+_RADIUS: Final = 0.0032  # of the markers [m]
+_POSES_EACH: Final = 64  # of a person
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinBank:
+    """Places on the back and the sides of right hands, and where they are in poses."""
+
+    places: tuple[MarkerPlace, ...]
+    positions: Float16[np.ndarray, "T C 3"]
+    """[m], around their mean; left hands are mirrored."""
+
+    @property
+    def bones(self) -> Int[np.ndarray, "C"]:
+        """Index of each place's bone."""
+        return np.array([BONE_NAMES.index(place.bone) for place in self.places])
+
+    def mean_distances(self, num_poses: int = 1000) -> Float[np.ndarray, "C C"]:
+        """Mean distance between every two places [m], over some poses."""
+        some = self.positions[:: max(1, len(self.positions) // num_poses)].astype(np.float32)
+        total = np.zeros((len(self.places), len(self.places)), dtype=np.float32)
+        for points in some:
+            total += np.linalg.norm(points[:, None] - points, axis=-1)
+        return total / len(some)
+
+
+def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generator) -> SkinBank:
+    """Poses of random people as training sets have them, alone, together and holding something.
+
+    Args:
+        num_places: Places on the skin.
+        num_people: People, of whom each strikes up to 64 poses with one slip of every marker.
+    """
+    places = sample_places(num_places, rng=rng)
+    gloves = [
+        MarkerLayout("places", places[first : first + MOST_MARKERS], _RADIUS)
+        for first in range(0, len(places), MOST_MARKERS)
+    ]
+    parts: list[Float16[np.ndarray, "T C 3"]] = []
+    while len(parts) < num_people:
+        positions = _positions(gloves, rng)
+        if positions is not None:
+            parts.append(positions)
+    return SkinBank(places, np.concatenate(parts))
+
+
+def sample_places(
+    num_places: int, *, rng: np.random.Generator, apart: float = _APART
+) -> tuple[MarkerPlace, ...]:
+    """Random places on the skin of the back and the sides of the hand.
+
+    Args:
+        num_places: Number of places; there are fewer where no more fit.
+        apart: Least distance between two of them on the flat hand [m].
+    """
+    model = HandModel.named("M")
+    share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
+    places: list[MarkerPlace] = []
+    points: list[Float[np.ndarray, "3"]] = []
+    missed = 0
+    while len(places) < num_places and missed < _MOST_MISSED:
+        bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
+        name = BONE_NAMES[bone]
+        if bone == PALM:
+            along, around = rng.uniform(*_PALM_ALONG), 0.0
+            across = rng.uniform(-_PALM_ACROSS, _PALM_ACROSS)
+        else:
+            along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
+            around, across = np.clip(_AROUND * rng.standard_normal(), -_MOST_AROUND, _MOST_AROUND), 0.0
+        place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
+        point = _point_of(place, model)
+        if point is not None and all(np.linalg.norm(point - other) > apart for other in points):
+            places.append(place)
+            points.append(point)
+            missed = 0
+        else:
+            missed += 1
+    return tuple(places)
+
+
+def _point_of(place: MarkerPlace, model: HandModel) -> Float[np.ndarray, "3"] | None:
+    """Where a place is on the flat hand [m]; None where it meets no skin."""
+    copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
+    try:
+        point: Float[np.ndarray, "3"] = attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[
+            0
+        ]
+    except LayoutError:
+        return None
+    return point
+
+
+def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
+    """Places of one person in some poses; None where a place misses the skin of the hand."""
+    config = GenerateSettings()
+    models = sample_hands(config.population, rng=rng)
+    scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
+    model = scene.hands[0]
+    bones = model.forward_kinematics(scene.qpos[0])
+    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
+    try:
+        worn = [wear(glove, model, along=slip, around=roll, rng=rng) for glove in gloves]
+    except LayoutError:
+        return None
+    points = np.concatenate([one.centers(model, bones) for one in worn], axis=1)
+    if model.shape.side == SIDES[0]:
+        points = points @ MIRROR
+    centered: Float16[np.ndarray, "T C 3"] = (points - points.mean(axis=1, keepdims=True)).astype(np.float16)
+    return centered
+
+
+PLACES, PEOPLE = 480, 1600
+_LAYOUTS, _CLOUDS = 8, 24  # of a batch; clouds of each layout
+_MARKERS: Final = (5, 31)  # of a layout: least, and one more than most
+_PEAK_RATE, _WARM_UP = 2e-3, 200  # learning rate; steps until it is reached
+_STRETCH: Final = 0.03  # anisotropy of a hand
+_JITTER: Final = 0.0015  # of a batch, at most [m]
+_GAP: Final = (0.006, 0.014)  # least distance of two markers [m]
+_HIDDEN: Final = 0.3  # share of batches in which neighbors are lost together
+_HIDDEN_RADIUS: Final = 0.05  # [m]
+_LEAST_SEEN: Final = 4  # markers
+_CONFIG: Final = LayoutNetworkConfig()
+_FEATURE_POSES: Final = 3000
+_SAVED_EVERY, _TOLD_EVERY = 500, 100  # steps
+
+
+class LayoutBatches:
+    """Draws random layouts on a bank of places, and corrupted clouds of them."""
+
+    def __init__(self, bank: SkinBank, rng: np.random.Generator) -> None:
+        self._bank, self._rng = bank, rng
+        self._spacing = bank.mean_distances()
+        some = bank.positions[:: max(1, len(bank.positions) // _FEATURE_POSES)].astype(np.float32)
+        total = torch.zeros(len(bank.places), len(bank.places), _CONFIG.num_distances)
+        for points in some:
+            total += distance_features(torch.from_numpy(points)[None], _CONFIG)[0]
+        self._features = (total / len(some)).numpy().astype(np.float16)
+        self._bones = bank.bones
+
+    def draw(self) -> tuple[Cloud, Float[np.ndarray, "G M M K"]]:
+        """Clouds [m] of some layouts with equally many markers, and what is known of each layout."""
+        rng = self._rng
+        count = int(rng.integers(*_MARKERS))
+        layouts = [self._layout(count) for _ in range(_LAYOUTS)]
+        frames = rng.integers(len(self._bank.positions), size=(_LAYOUTS, _CLOUDS))
+        markers = np.concatenate(
+            [
+                self._bank.positions[rows][:, layout].astype(np.float64)
+                for rows, layout in zip(frames, layouts, strict=True)
+            ]
+        )
+        markers = stretched(markers, _STRETCH, rng=rng)
+        if rng.random() < _HIDDEN:
+            markers = self._hide_neighbors(markers)
+        occlude = (0, round(count / 4), round(count / 4), round(count / 3))[int(rng.integers(4))]
+        ghosts = (0, 2, 2, 3)[int(rng.integers(4))]
+        cloud = corrupt(markers, Corruption(occlude, ghosts, _JITTER * rng.uniform()), rng=rng)
+        return cloud, np.array([self._features[np.ix_(layout, layout)] for layout in layouts], np.float32)
+
+    def _layout(self, count: int) -> Int[np.ndarray, "M"]:
+        """Places of a random layout, evenly or unevenly over the bones, and not too near to each other."""
+        rng, bones = self._rng, self._bones
+        while True:
+            share = rng.dirichlet(np.full(bones.max() + 1, rng.choice([0.3, 1.0, 4.0])))
+            share[PALM] *= rng.uniform(1.0, 6.0)
+            weight = np.maximum((share / np.maximum(np.bincount(bones), 1))[bones], 1e-9)
+            gap = rng.uniform(*_GAP)
+            chosen: list[int] = []
+            for place in rng.choice(len(bones), len(bones), replace=False, p=weight / weight.sum()):
+                if all(self._spacing[place, other] > gap for other in chosen):
+                    chosen.append(int(place))
+                if len(chosen) == count:
+                    return np.array(chosen)
+
+    def _hide_neighbors(self, markers: Float[np.ndarray, "B M 3"]) -> Float[np.ndarray, "B M 3"]:
+        """Most markers around a random one are lost, as behind another hand."""
+        rng, (batch, count, _) = self._rng, markers.shape
+        center = markers[np.arange(batch), rng.integers(count, size=batch)][:, None]
+        radius = rng.uniform(0.0, _HIDDEN_RADIUS, size=(batch, 1))
+        lost = (np.linalg.norm(markers - center, axis=-1) < radius) & (rng.random((batch, count)) < 0.8)
+        lost[lost.sum(axis=1) > count - _LEAST_SEEN] = False
+        return np.where(lost[..., None], np.nan, markers)
+
+
+class LayoutTraining:
+    """Network and optimizer of a run.
+
+    Args:
+        steps: Steps of the run.
+    """
+
+    def __init__(self, steps: int, config: LayoutNetworkConfig = _CONFIG) -> None:
+        torch.manual_seed(0)
+        self.steps, self.done = steps, 0
+        self.network = LayoutNetwork(config)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True
+        )
+
+    def step(self, cloud: Cloud, layouts: Float[np.ndarray, "G M M K"]) -> tuple[float, float]:
+        """Make one gradient step; returns the loss before it, and the share of markers labeled right."""
+        progress = self.done / self.steps
+        rate = min(1.0, (self.done + 1) / _WARM_UP) * (0.01 + 0.495 * (1.0 + np.cos(np.pi * progress)))
+        for group in self.optimizer.param_groups:
+            group["lr"] = float(_PEAK_RATE * rate)
+        points = torch.from_numpy(cloud.points.astype(np.float32))
+        present, truth = torch.from_numpy(cloud.present), torch.from_numpy(cloud.truth)
+        found = self.network(points, present, torch.from_numpy(layouts))
+        loss = layout_loss(found, truth, present)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        self.done += 1
+        markers = present & (truth >= 0)
+        right = (found[-1].points.argmax(-1) == truth)[markers].float().mean()
+        return float(loss.detach()), float(right)
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        buffer = io.BytesIO()
+        torch.save(
+            {
+                "network": self.network.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "done": self.done,
+            },
+            buffer,
+        )
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
+
+    def restore(self, path: Path) -> None:
+        """Go on from a checkpoint, if there is one."""
+        if path.is_file():
+            content: dict[str, Any] = torch.load(path, weights_only=True)
+            self.network.load_state_dict(content["network"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.done = int(content["done"])
+
+
+def main() -> None:
+    """Train until the last step."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--steps", type=int, default=9000, help=f"of {_LAYOUTS * _CLOUDS} clouds")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    training, checkpoint = LayoutTraining(options.steps), options.out / "checkpoint.pt"
+    training.restore(checkpoint)
+    bank = sample_skin_bank(PLACES, PEOPLE, rng=np.random.default_rng(11))
+    batches = LayoutBatches(bank, np.random.default_rng([11, training.done]))
+    figures, began = [], time.monotonic()
+    with torch_threads(1):
+        while training.done < options.steps:
+            figures.append(training.step(*batches.draw()))
+            if training.done % _TOLD_EVERY == 0:
+                loss, right = np.mean(figures, axis=0)
+                print(f"{training.done}: loss {loss:.3f}, {100.0 * right:.2f} % right, "
+                      f"{time.monotonic() - began:.0f} s", flush=True)  # fmt: skip
+                figures = []
+            if training.done % _SAVED_EVERY == 0 or training.done == options.steps:
+                training.save(checkpoint)
+    save_layout_network(options.out, training.network, training.steps * _LAYOUTS * _CLOUDS)
+
+
+if __name__ == "__main__":
+    main()

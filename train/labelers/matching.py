@@ -1,0 +1,484 @@
+"""From scores or distances to labels: one point per label, one label per point, with a reject option.
+
+Labels are verified by a pose: labelings near the likeliest one compete by the network's scores and the prior
+of hands. A network judges each point by itself. Where it is unsure, the likeliest labeling may be no hand: a
+neighbor's marker may stand in the place of an occluded one, or a chain of labels may be shifted by one.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numpy.typing import NDArray
+
+from handsim.kernels import kernel
+from train.labelers.pose_prior import (
+    NEAREST,
+    PosePrior,
+    errors_of_products,
+    factor_of,
+    log_density,
+    log_normal,
+    means_by_marker,
+    procrustes_errors,
+    products_with_means,
+    residual_of,
+    seen_as_right,
+    table_of,
+)
+
+GHOST = -1
+"""Label of a point that is not a marker."""
+_SCORE_WEIGHT: Final = 0.65
+"""Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
+_SINKHORN_ROUNDS: Final = 20
+_NEVER: Final = 1e-30  # a probability whose logarithm is still a number
+SINKHORN: Final = {
+    "score_weight": _SCORE_WEIGHT,
+    "sinkhorn_rounds": _SINKHORN_ROUNDS,
+    "least_probability": _NEVER,
+}
+"""What `pair_probabilities` goes by, for other programs that do the same."""
+IMPOSSIBLE: Final = 1e6
+"""Cost of a pair that cannot be."""
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def pair_probabilities(
+    point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
+) -> Float[np.ndarray, "N+1 M+1"]:
+    """Probability of each label for each point when no two points may share one.
+
+    Both scores are weighted, added and normalized over rows and columns in turn, so that every point and
+    every label is used once (Sinkhorn's iteration; ghosts and occluded labels are outside of it).
+
+    Args:
+        point_scores: Log-probability of each label, and last of ghost, for each point.
+        label_scores: Log-probability of each point, and last of occluded, for each label.
+
+    Returns:
+        Probabilities; the last column is "a ghost", the last row "occluded". Rows of points sum to 1.
+    """
+    return balance(
+        point_scores.astype(np.float64), label_scores.astype(np.float64), _SCORE_WEIGHT, _SINKHORN_ROUNDS
+    )
+
+
+def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
+    """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
+    costs, reject = assignment_costs(probabilities)
+    return assign(costs, reject)[1]
+
+
+def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
+    """One-to-one labeling of a cloud with the least total distance.
+
+    The paper's equation 1, with the reject option that its results imply: a point may stay without a label at
+    the cost of `reject`, so no point is matched over a larger distance.
+
+    Args:
+        distances: Distance of each point from the predicted position of each marker [m].
+        reject: Cost of a point without a label [m].
+
+    Returns:
+        Label of each point, `GHOST` where none.
+    """
+    return assign(distances.astype(np.float64), np.full(len(distances), reject))[1]
+
+
+@kernel
+def assignment_costs(probabilities: Float[np.ndarray, "N+1 M+1"]) -> tuple[FloatArray, FloatArray]:
+    """What each pair of a point and a label costs (N, M), and each point as a ghost (N,), in logarithms.
+
+    A pair assigns a point and a label, which then is not occluded.
+    """
+    count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
+    costs, reject = np.empty((count, num_labels)), np.empty(count)
+    for i in range(count):
+        for j in range(num_labels):
+            pair = np.log(max(probabilities[i, j], _NEVER))
+            costs[i, j] = np.log(max(probabilities[count, j], _NEVER)) - 2.0 * pair
+        reject[i] = -np.log(max(probabilities[i, num_labels], _NEVER))
+    return costs, reject
+
+
+@kernel
+def assign(costs: Float[np.ndarray, "N M"], reject: Float[np.ndarray, "N"]) -> tuple[float, IntArray]:
+    """The least cost of a labeling, and its labels (N,): a point per label, `GHOST` at the cost of a reject.
+
+    The shortest augmenting paths of Jonker and Volgenant (1987); only a path's own end may be a reject,
+    because a point that is a ghost takes no label from another.
+    """
+    count, num_labels = costs.shape
+    labels, owner = np.full(count, GHOST), np.full(num_labels, -1)
+    row_dual, column_dual = np.zeros(count), np.zeros(num_labels)
+    shortest, before = np.empty(num_labels), np.empty(num_labels, dtype=np.int64)
+    reached, columns = np.empty(num_labels, dtype=np.bool_), np.empty(num_labels, dtype=np.int64)
+    for start in range(count):
+        length, steps, end, rejected = _shortest_path(
+            start, costs, reject, row_dual, column_dual, owner, shortest, before, reached, columns
+        )
+        row_dual[start] += length
+        for step in range(steps):
+            column = columns[step]
+            if owner[column] >= 0:
+                row_dual[owner[column]] += length - shortest[column]
+            column_dual[column] -= length - shortest[column]
+        if end < 0:  # a point gives its label up and is a ghost
+            end = labels[rejected]
+            labels[rejected] = GHOST
+        while end >= 0:  # each point on the path passes its label on
+            row = before[end]
+            owner[end] = row
+            end, labels[row] = labels[row], end
+    total = 0.0
+    for row in range(count):
+        total += reject[row] if labels[row] < 0 else costs[row, labels[row]]
+    return total, labels
+
+
+@kernel
+def _shortest_path(
+    start: int,
+    costs: Float[np.ndarray, "N M"],
+    reject: Float[np.ndarray, "N"],
+    row_dual: Float[np.ndarray, "N"],
+    column_dual: Float[np.ndarray, "M"],
+    owner: Int[np.ndarray, "M"],
+    shortest: Float[np.ndarray, "M"],
+    before: Int[np.ndarray, "M"],
+    reached: Bool[np.ndarray, "M"],
+    columns: Int[np.ndarray, "M"],
+) -> tuple[float, int, int, int]:
+    """The shortest path by reduced costs from a point to a free label, or to a point that may be a ghost.
+
+    Returns its length, the number of reached labels, the free label or -1, and the point that is a ghost
+    then. The last four arrays are overwritten: length to each label, the point before it, whether it was
+    reached, and the reached labels in their order.
+    """
+    shortest[:] = np.inf
+    reached[:] = False
+    row, length, steps = start, 0.0, 0
+    least_reject, rejected = np.inf, start
+    while True:
+        off = length - row_dual[row]
+        if off + reject[row] < least_reject:
+            least_reject, rejected = off + reject[row], row
+        nearest, least = -1, np.inf
+        for j in range(len(owner)):
+            if reached[j]:
+                continue
+            path = off + costs[row, j] - column_dual[j]
+            if path < shortest[j]:
+                shortest[j], before[j] = path, row
+            if shortest[j] < least:
+                nearest, least = j, shortest[j]
+        if least_reject <= least:
+            return least_reject, steps, -1, rejected
+        length = least
+        reached[nearest] = True
+        columns[steps] = nearest
+        steps += 1
+        if owner[nearest] < 0:
+            return length, steps, nearest, -1
+        row = owner[nearest]
+
+
+@kernel
+def balance(
+    point_scores: NDArray[np.float64], label_scores: NDArray[np.float64], weight: float, rounds: int
+) -> NDArray[np.float64]:
+    """Sinkhorn's iteration on the weighted sum of log-probabilities by point (N, M + 1) and label (M, N + 1).
+
+    Returns probabilities (N + 1, M + 1), the last column "a ghost", the last row "occluded".
+    """
+    count, num_labels = len(point_scores), len(label_scores)
+    plan = np.zeros((count + 1, num_labels + 1))
+    for i in range(count):
+        for j in range(num_labels):
+            plan[i, j] = np.exp(weight * (point_scores[i, j] + label_scores[j, i])) + _NEVER
+        plan[i, num_labels] = np.exp(2.0 * weight * point_scores[i, num_labels]) + _NEVER
+    for j in range(num_labels):
+        plan[count, j] = np.exp(2.0 * weight * label_scores[j, count]) + _NEVER
+    totals = np.empty(num_labels)
+    for _ in range(rounds):
+        totals[:] = 0.0
+        for i in range(count + 1):
+            for j in range(num_labels):
+                totals[j] += plan[i, j]
+        for j in range(num_labels):
+            totals[j] = 1.0 / totals[j]
+        for i in range(count + 1):
+            total = plan[i, num_labels]
+            for j in range(num_labels):
+                plan[i, j] *= totals[j]
+                total += plan[i, j]
+            if i < count:
+                scale = 1.0 / total
+                for j in range(num_labels + 1):
+                    plan[i, j] *= scale
+    return plan
+
+
+_SURE: Final = 0.95  # a pair of this probability is not taken back
+_MOST_UNSURE: Final = 8  # pairs that are taken back, one at a time; the least sure
+_ROUNDS: Final = 3  # how many pairs are taken back in turn
+_WIDTH: Final = 3  # labelings of a round that the next one starts from
+_MOST: Final = 1 + _MOST_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)  # labelings
+_FARTHEST: Final = 14.0  # cost of a labeling above that of the likeliest [nats, twice]
+_PRIOR_WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
+_GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
+_NEAR: Final = 40  # components that count for the labelings around the likeliest one
+_TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
+_LEAST: Final = 4  # labeled points of a hand
+_LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
+
+
+def matching_constants() -> dict[str, float]:
+    """What `match_scores` goes by, for other programs that do the same: docs/how_to/onnx.md has one."""
+    return {
+        **SINKHORN,
+        "impossible": IMPOSSIBLE,
+        "sure": _SURE,
+        "most_unsure": _MOST_UNSURE,
+        "rounds": _ROUNDS,
+        "width": _WIDTH,
+        "farthest": _FARTHEST,
+        "prior_weight": _PRIOR_WEIGHT,
+        "ghost": _GHOST,
+        "near": _NEAR,
+        "nearest": NEAREST,
+        "least_points": _LEAST,
+        "least_density": _LEAST_DENSITY,
+    }
+
+
+def match_scores(
+    points: Float[np.ndarray, "N 3"],
+    point_scores: Float[np.ndarray, "N M+1"],
+    label_scores: Float[np.ndarray, "M N+1"],
+    prior: PosePrior | None,
+) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Most likely one-to-one labeling of one cloud.
+
+    A point may stay a ghost and a label occluded, each at its own cost, so nothing is forced (the paper's
+    equation 1 with a reject option).
+
+    Args:
+        point_scores: Log-probability of each label, and last of ghost, for each point.
+        label_scores: Log-probability of each point, and last of occluded, for each label.
+        prior: What hands look like; None to believe the scores alone.
+
+    Returns:
+        Label of each point (`GHOST` where none), and its probability.
+    """
+    probabilities = pair_probabilities(point_scores, label_scores)
+    labels = match_probabilities(probabilities)
+    confidence = probabilities[np.arange(len(labels)), labels]  # GHOST, -1, is the last column
+    num_labels = probabilities.shape[1] - 1
+    if (
+        prior is None
+        or confidence.min(initial=1.0) > _SURE
+        or np.count_nonzero(labels >= 0) < _LEAST
+        or len(points) > 2 * num_labels  # more than a hand: somebody has to divide them first
+    ):
+        return labels, confidence
+    tables = table_of(prior), prior.means, prior.directions, prior.spreads, prior.log_weights
+    return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, *tables)
+
+
+@kernel
+def _verify(
+    points: Float[np.ndarray, "N 3"],
+    probabilities: Float[np.ndarray, "N+1 M+1"],
+    table: Float[np.ndarray, "M 3 K"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label."""
+    costs, reject = assignment_costs(probabilities)
+    least, labels = assign(costs, reject)
+    near, mirrored = _near_components(points, labels, table, means, directions, spreads, log_weights)
+    near_table = means_by_marker(means, near)
+    found = np.empty((_MOST, len(points)), dtype=np.int64)
+    scores, densities = np.empty(_MOST), np.empty(_MOST)
+    taken = np.full((_MOST, _ROUNDS), -1)  # points whose pairs were taken back for a labeling
+    columns = np.full((_MOST, _ROUNDS), -1)  # and their labels then
+    # Cholesky factors by component and by the set of markers, which most labelings share.
+    sets, stored = np.empty((_MOST, len(means[0])), dtype=np.bool_), np.full((_MOST, len(near)), -1)
+    rank = directions.shape[3]
+    factors, counts = np.empty((NEAREST * _MOST, rank, rank)), np.zeros(2, np.int64)
+    front, num_front, num_found = np.zeros(_MOST, dtype=np.int64), 1, 0
+    for step in range(_ROUNDS + 1):
+        first = num_found
+        for parent in front[: min(num_front, _WIDTH)]:
+            unsure = _least_sure(probabilities, found[parent]) if step else np.zeros(1, np.int64)
+            for point in unsure:
+                cost, fresh = least, labels
+                if step:
+                    taken[num_found], columns[num_found] = taken[parent], columns[parent]
+                    taken[num_found, step - 1], columns[num_found, step - 1] = point, found[parent, point]
+                    cost, fresh = _assign_without(costs, reject, taken[num_found], columns[num_found], step)
+                    if cost > least + _FARTHEST or _index_of(fresh, found, num_found) >= 0:
+                        continue
+                known = np.flatnonzero(fresh >= 0)
+                density = -np.inf
+                if len(known) >= _LEAST:
+                    cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
+                    density = _log_density_of_near(
+                        cloud, known_labels, near, near_table, means, directions, spreads, log_weights,
+                        sets, stored, factors, counts,
+                    )  # fmt: skip
+                found[num_found] = fresh
+                scores[num_found] = _PRIOR_WEIGHT * (density + _GHOST * (len(fresh) - len(known))) - cost
+                densities[num_found] = density / max(1, 3 * len(known))
+                num_found += 1
+        num_front = num_found - first
+        front[:num_front] = first + np.argsort(-scores[first:num_found], kind="mergesort")
+    return _elected(found[:num_found], scores[:num_found], densities[:num_found], probabilities)
+
+
+@kernel
+def _log_density_of_near(
+    cloud: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    near: Int[np.ndarray, "C"],
+    table: Float[np.ndarray, "M 3 C"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+    sets: Bool[np.ndarray, "L M"],
+    stored: Int[np.ndarray, "L C"],
+    factors: Float[np.ndarray, "F R R"],
+    counts: Int[np.ndarray, "2"],
+) -> float:
+    """Log-density of centered, labeled points [m] by those of some components that are nearest to them.
+
+    The last four arrays keep factors from labeling to labeling: the sets of markers, the number of each set's
+    and component's factor or -1, the factors, and how many sets and factors there are.
+    """
+    marked = np.zeros(sets.shape[1], dtype=np.bool_)
+    marked[labels] = True
+    group = _index_of(marked, sets, counts[0])
+    if group < 0:
+        group = counts[0]
+        sets[group] = marked
+        counts[0] += 1
+    density = -np.inf
+    for number in np.argsort(procrustes_errors(cloud, labels, table))[:NEAREST]:
+        component, spread = near[number], float(spreads[near[number]])
+        if stored[group, number] < 0:
+            stored[group, number] = counts[1]
+            factors[counts[1]] = factor_of(labels, directions[component], spread)
+            counts[1] += 1
+        lower = factors[stored[group, number]]
+        residual = residual_of(cloud, labels, means[component])
+        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
+        high = max(density, log)
+        density = high + np.log(np.exp(density - high) + np.exp(log - high))
+    return density
+
+
+@kernel
+def _near_components(
+    points: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    table: Float[np.ndarray, "M 3 K"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+) -> tuple[NDArray[np.int64], bool]:
+    """The components (C,) near to labeled points as those of the likelier side, and whether it is left."""
+    known = np.flatnonzero(labels >= 0)
+    known_labels = labels[known]
+    best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
+    products, squares = products_with_means(seen_as_right(points[known], False), known_labels, table)
+    for mirrored in (False, True):
+        cloud = seen_as_right(points[known], mirrored)
+        chosen = np.argsort(errors_of_products(products, squares, mirrored))[:_NEAR]
+        density = log_density(cloud, known_labels, chosen[:NEAREST], means, directions, spreads, log_weights)
+        if density > best or not len(near):
+            best, near, left = density, chosen, mirrored
+    return near, left
+
+
+@kernel
+def _least_sure(
+    probabilities: Float[np.ndarray, "N+1 M+1"], labels: Int[np.ndarray, "N"]
+) -> NDArray[np.int64]:
+    """The points of a labeling that may be taken back, the least sure first."""
+    confidence = np.empty(len(labels))
+    for point in range(len(labels)):
+        confidence[point] = probabilities[point, labels[point]]
+    order = np.argsort(confidence)[:_MOST_UNSURE]
+    return order[confidence[order] < _SURE]
+
+
+@kernel
+def _assign_without(
+    costs: Float[np.ndarray, "N M"],
+    reject: Float[np.ndarray, "N"],
+    points: Int[np.ndarray, "3"],
+    labels: Int[np.ndarray, "3"],
+    count: int,
+) -> tuple[float, NDArray[np.int64]]:
+    """The labeling of least cost without some pairs of a point and a label, or of a point and no label."""
+    rest, without = costs.copy(), reject.copy()
+    for number in range(count):
+        if labels[number] >= 0:
+            rest[points[number], labels[number]] = IMPOSSIBLE
+        else:
+            without[points[number]] = IMPOSSIBLE
+    return assign(rest, without)
+
+
+@kernel
+def _index_of(row: NDArray[np.generic], rows: NDArray[np.generic], count: int) -> int:
+    """Which of the first rows of a table (R, W) is equal to a row (W,); -1 if none."""
+    for number in range(count):
+        same = True
+        for column in range(len(row)):
+            if rows[number, column] != row[column]:
+                same = False
+                break
+        if same:
+            return number
+    return -1
+
+
+@kernel
+def _elected(
+    found: Int[np.ndarray, "L N"],
+    scores: Float[np.ndarray, "L"],
+    densities: Float[np.ndarray, "L"],
+    probabilities: Float[np.ndarray, "N+1 M+1"],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The best labeling (N,), and the confidence (N,) of each of its labels.
+
+    That is the geometric mean of the network's own and the share of the labelings that agree, by their odds;
+    the network's own where all agree. Points that are no hand in any labeling are labeled as the
+    network has it.
+    """
+    best, count = int(np.argmax(scores)), len(found)
+    if densities[best] < _LEAST_DENSITY:
+        best, count = 0, 1
+    odds = np.exp(_TEMPERATURE * (scores[:count] - scores[:count].max()))
+    odds /= odds.sum()
+    labels, confidence = found[best].copy(), np.empty(found.shape[1])
+    for point in range(found.shape[1]):
+        share, all_agree = 0.0, True
+        for number in range(count):
+            if found[number, point] == labels[point]:
+                share += odds[number]
+            else:
+                all_agree = False
+        own = probabilities[point, labels[point]]
+        confidence[point] = own if all_agree else np.sqrt(own * share)
+    return labels, confidence

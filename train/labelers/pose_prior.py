@@ -1,0 +1,477 @@
+"""How likely labeled points are as the markers of a hand: a mixture of poses, wherever the hand is.
+
+Each component is a mean hand with the directions in which markers move together around it (probabilistic
+principal components, Tipping and Bishop 1999), each learned from a cluster of frames. Missing markers are
+left out of mean and covariance, which is exact for a normal distribution. Points are turned and moved onto
+each mean hand first.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from numpy.typing import NDArray
+
+from handsim.errors import WeightsError
+from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
+
+NEAREST: Final = 4
+"""Components that count, of all those whose mean hand is compared with the points."""
+_LEAST_POINTS: Final = 4  # fewer fit any hand
+_NEWTON_STEPS: Final = 60  # most, of a polynomial of fourth degree, from above its largest root
+_ROUGH, _EXACT = 1e-9, 1e-14  # last step, relative to the bound above the root
+_MOST_COMPONENTS, _MOST_DIRECTIONS = 10_000, 100
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePrior:
+    """Density of the markers of right hands, up to a rigid motion.
+
+    Raises:
+        WeightsError: The shapes do not agree, or something is not finite.
+    """
+
+    means: Float32[np.ndarray, "K M 3"]
+    """Mean hand of each component [m]."""
+    directions: Float32[np.ndarray, "K M 3 R"]
+    """Directions in which it varies, with their standard deviations as lengths [m]."""
+    spreads: Float32[np.ndarray, "K"]
+    """Standard deviation of each coordinate around them [m]."""
+    log_weights: Float32[np.ndarray, "K"]
+    """Logarithm of each component's share."""
+
+    def __post_init__(self) -> None:
+        count, markers = self.means.shape[:2] if self.means.ndim == 3 else (0, 0)
+        rank = self.directions.shape[-1] if self.directions.ndim == 4 else 0
+        shapes = ((count, markers, 3), (count, markers, 3, rank), (count,), (count,))
+        found = tuple(getattr(self, field.name) for field in fields(self))
+        if (
+            tuple(one.shape for one in found) != shapes
+            or not 0 < count <= _MOST_COMPONENTS
+            or not 0 < rank <= _MOST_DIRECTIONS
+            or not all(np.isfinite(one).all() for one in found)
+            or not (self.spreads > 0.0).all()
+        ):
+            raise WeightsError("the pose prior is damaged: its tables do not agree or are not finite")
+
+    @property
+    def num_markers(self) -> int:
+        """Markers of the layout."""
+        return int(self.means.shape[1])
+
+    def log_density(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        labels: Int[np.ndarray, "N"],
+        *,
+        mirrored: bool,
+        among: Int[np.ndarray, "C"] | None = None,
+    ) -> float:
+        """Logarithm of the density of labeled points; -inf for fewer than four.
+
+        Args:
+            labels: Marker of each point, no marker twice.
+            mirrored: Whether the hand is a left one.
+            among: The components that count, see `nearest`; all when not given.
+        """
+        if len(points) < _LEAST_POINTS:
+            return -np.inf
+        nearest = self.nearest(points, labels, mirrored=mirrored, count=NEAREST, among=among)
+        tables = self.means, self.directions, self.spreads, self.log_weights
+        return float(log_density(seen_as_right(points, mirrored), labels, nearest, *tables))
+
+    def nearest(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        labels: Int[np.ndarray, "N"],
+        *,
+        mirrored: bool,
+        count: int,
+        among: Int[np.ndarray, "C"] | None = None,
+    ) -> Int[np.ndarray, "K"]:
+        """The components whose mean hands are nearest to labeled points, the nearest first.
+
+        Args:
+            labels: Marker of each point, no marker twice.
+            mirrored: Whether the hand is a left one.
+            count: How many, at most.
+            among: The components to choose from; all when not given.
+        """
+        chosen = np.arange(len(self.means)) if among is None else among
+        table = table_of(self) if among is None else means_by_marker(self.means, chosen)
+        errors = procrustes_errors(seen_as_right(points, mirrored), labels, table)
+        return chosen[np.argsort(errors)[:count]]
+
+    def tensors(self) -> dict[str, NDArray[np.generic]]:
+        """The tables by name, for a file; directions in half precision, which is enough for them."""
+        tables = {field.name: getattr(self, field.name) for field in fields(self)}
+        return tables | {"directions": self.directions.astype(np.float16)}
+
+    @classmethod
+    def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]]) -> PosePrior:
+        """The prior out of a file's tables."""
+        if set(tensors) != {field.name for field in fields(cls)}:
+            raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
+        return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
+
+
+@functools.lru_cache(maxsize=8)
+def table_of(prior: PosePrior) -> FloatArray:
+    """See `means_by_marker`, of all components; kept, because every cloud is compared with them."""
+    table: FloatArray = means_by_marker(prior.means, np.arange(len(prior.means)))
+    return table
+
+
+@kernel
+def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArray:
+    """Centered points (N, 3) [m] of what is a right hand then."""
+    centered = points.copy()
+    for axis in range(3):
+        centered[:, axis] -= points[:, axis].mean()
+    if mirrored:
+        centered[:, 0] *= -1.0
+    return centered
+
+
+@kernel
+def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray, "C"]) -> FloatArray:
+    """Mean hands (M, 3, C) of some components, the components next to one another in memory [m]."""
+    table = np.empty((means.shape[1], 3, len(chosen)))
+    for number in range(len(chosen)):
+        for marker in range(means.shape[1]):
+            for axis in range(3):
+                table[marker, axis, number] = means[chosen[number], marker, axis]
+    return table
+
+
+@kernel
+def procrustes_errors(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
+) -> FloatArray:
+    """Squared distances (C,) of centered points to mean hands that are moved and turned onto them [m^2]."""
+    return errors_of_products(*products_with_means(cloud, labels, table), False)
+
+
+@kernel
+def products_with_means(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
+) -> tuple[FloatArray, FloatArray]:
+    """Sums of outer products (9, C) of points and markers of mean hands, and of squares (C,) [m^2]."""
+    count, size = table.shape[2], 0.0
+    product, center, squares = np.zeros((9, count)), np.zeros((3, count)), np.zeros(count)
+    for number in range(len(cloud)):
+        x, y, z = cloud[number, 0], cloud[number, 1], cloud[number, 2]
+        size += x * x + y * y + z * z
+        for axis in range(3):
+            mean = table[labels[number], axis]
+            for one in range(count):
+                product[axis, one] += x * mean[one]
+                product[3 + axis, one] += y * mean[one]
+                product[6 + axis, one] += z * mean[one]
+                center[axis, one] += mean[one]
+                squares[one] += mean[one] * mean[one]
+    for one in range(count):
+        off = center[0, one] ** 2 + center[1, one] ** 2 + center[2, one] ** 2
+        squares[one] = size + squares[one] - off / len(cloud)
+    return product, squares
+
+
+@kernel
+def errors_of_products(
+    product: Float[np.ndarray, "9 C"], squares: Float[np.ndarray, "C"], mirrored: bool
+) -> FloatArray:
+    """See `procrustes_errors`; of the mirror image of the points where `mirrored`."""
+    errors = np.empty(len(squares))
+    for one in range(len(squares)):
+        largest = _largest_root(product[:, one], mirrored, 0.5 * squares[one], _ROUGH)
+        errors[one] = squares[one] - 2.0 * largest
+    return errors
+
+
+@kernel
+def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float, tolerance: float) -> float:
+    """Largest eigenvalue of Horn's matrix of a sum of outer products, from a bound above it (Theobald 2005).
+
+    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0; where `mirrored`, that of the product with the
+    other sign of its first row, which is the sign of c1.
+    """
+    a, b, c, d, e, f, g, h, i = product
+    xx, yy, zz = a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i
+    xy, xz, yz = a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i
+    total = xx + yy + zz
+    c2 = -2.0 * total
+    c1 = -8.0 * (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+    if mirrored:
+        c1 = -c1
+    c0 = 2.0 * (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) - total * total
+    root = above
+    for _ in range(_NEWTON_STEPS):
+        value = ((root * root + c2) * root + c1) * root + c0
+        slope = (4.0 * root * root + 2.0 * c2) * root + c1
+        if slope <= 0.0:
+            break
+        step = value / slope
+        root -= step
+        if abs(step) <= tolerance * above:
+            break
+    return root
+
+
+@kernel
+def log_density(
+    cloud: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    chosen: Int[np.ndarray, "C"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+) -> float:
+    """Of centered points by some components; tables as in `PosePrior`."""
+    total = -np.inf
+    for component in chosen:
+        spread = float(spreads[component])
+        lower = factor_of(labels, directions[component], spread)
+        residual = residual_of(cloud, labels, means[component])
+        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
+        high = max(total, log)
+        total = high + np.log(np.exp(total - high) + np.exp(log - high))
+    return total
+
+
+@kernel
+def factor_of(
+    labels: Int[np.ndarray, "N"], directions: Float32[np.ndarray, "M 3 R"], spread: float
+) -> FloatArray:
+    """Lower Cholesky factor (R, R) of D^T D + spread^2 I, D being the directions of some markers [m]."""
+    rank = directions.shape[2]
+    rows = np.empty((3 * len(labels), rank))
+    for number in range(len(labels)):
+        for axis in range(3):
+            for direction in range(rank):
+                rows[3 * number + axis, direction] = directions[labels[number], axis, direction]
+    inner = rows.T @ rows
+    for direction in range(rank):
+        inner[direction, direction] += spread * spread
+    return np.linalg.cholesky(inner).astype(np.float64)
+
+
+@kernel
+def residual_of(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], mean: Float32[np.ndarray, "M 3"]
+) -> FloatArray:
+    """Centered points (N, 3), turned onto the markers of a mean hand, minus these [m]."""
+    center, product, bound = np.zeros(3), np.zeros((3, 3)), 0.0
+    for number in range(len(cloud)):
+        for axis in range(3):
+            there = mean[labels[number], axis]
+            center[axis] += there / len(cloud)
+            bound += 0.5 * (there * there + cloud[number, axis] * cloud[number, axis])
+            for first in range(3):
+                product[first, axis] += cloud[number, first] * there
+    root = _largest_root(product.ravel(), False, bound, _EXACT)
+    w, x, y, z = _largest_eigenvector(horn_matrix(product), root)
+    rotation = np.empty((3, 3))
+    write_quaternion_matrix(rotation, w, x, y, z)
+    residual = np.empty_like(cloud)
+    for number in range(len(cloud)):
+        for axis in range(3):
+            turned = 0.0
+            for first in range(3):
+                turned += rotation[axis, first] * cloud[number, first]
+            residual[number, axis] = turned - mean[labels[number], axis] + center[axis]
+    return residual
+
+
+@kernel
+def _largest_eigenvector(k: Float[np.ndarray, "4 4"], root: float) -> FloatArray:
+    """Unit eigenvector (4,) of the largest eigenvalue of Horn's matrix.
+
+    The adjugate of k - root is a multiple of the outer product of the eigenvector with itself; its row with
+    the greatest diagonal element is the most exact one.
+    """
+    shifted = k.copy()
+    for axis in range(4):
+        shifted[axis, axis] -= root
+    best, most = 0, -1.0
+    for axis in range(4):
+        size = abs(_cofactor(shifted, axis, axis))
+        if size > most:
+            best, most = axis, size
+    vector = np.empty(4)
+    for axis in range(4):
+        vector[axis] = _cofactor(shifted, best, axis)
+    length = np.sqrt((vector * vector).sum())
+    if not length > 0.0:  # two eigenvalues are equal: each mixture of their eigenvectors is as good
+        vector, length = np.linalg.eigh(k)[1][:, 3], 1.0
+    unit: FloatArray = vector / length
+    return unit
+
+
+@kernel
+def _cofactor(m: Float[np.ndarray, "4 4"], row: int, column: int) -> float:
+    """Cofactor of an element of a matrix."""
+    a, b, c = (row + 1) % 4, (row + 2) % 4, (row + 3) % 4
+    d, e, f = (column + 1) % 4, (column + 2) % 4, (column + 3) % 4
+    minor: float = (
+        m[a, d] * (m[b, e] * m[c, f] - m[b, f] * m[c, e])
+        - m[a, e] * (m[b, d] * m[c, f] - m[b, f] * m[c, d])
+        + m[a, f] * (m[b, d] * m[c, e] - m[b, e] * m[c, d])
+    )
+    return minor if (row + column) % 2 == 0 else -minor
+
+
+@kernel
+def log_normal(
+    residual: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    directions: Float32[np.ndarray, "M 3 R"],
+    lower: Float[np.ndarray, "R R"],
+    spread: float,
+) -> float:
+    """Log-density of residuals [m] whose covariance is D D^T + spread^2 I, D being rows of directions.
+
+    The matrix of the directions (R, R), of which `lower` is the Cholesky factor, stands for that of the
+    residuals (Woodbury's identity).
+    """
+    count, rank = 3 * len(labels), directions.shape[2]
+    along, distance = np.zeros(rank), 0.0
+    for number in range(len(labels)):
+        for axis in range(3):
+            value = residual[number, axis]
+            distance += value * value
+            for direction in range(rank):
+                along[direction] += directions[labels[number], axis, direction] * value
+    log_determinant = 2.0 * (count - rank) * np.log(spread)
+    for direction in range(rank):
+        for earlier in range(direction):
+            along[direction] -= lower[direction, earlier] * along[earlier]
+        along[direction] /= lower[direction, direction]
+        distance -= along[direction] * along[direction]
+        log_determinant += 2.0 * np.log(lower[direction, direction])
+    distance /= spread * spread
+    log: float = -0.5 * (distance + log_determinant + count * np.log(2.0 * np.pi))
+    return log
+
+
+MOST_COMPONENTS: Final = 400
+_FRAMES_EACH: Final = 400  # of a component; fewer frames give fewer components
+_LEAST_COMPONENTS: Final = 12  # a prior of fewer knows less than the network
+_LEAST_MEMBERS: Final = 20  # of a component
+_DIRECTIONS: Final = 24  # about the degrees of freedom of a hand
+_NOISE: Final = 0.0012  # of a marker's coordinate in a capture [m], optics and skin
+_LENT: Final = 100.0  # frames' worth of its neighbors' covariance that each component is given
+_NEIGHBORS: Final = 8
+_CLUSTERINGS: Final = 4
+_RIGID: Final = 6  # directions that the alignment takes out
+_CHUNK: Final = 8192
+_MOST_FRAMES: Final = 200_000
+
+
+def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
+    """The prior of the hands in some frames; None where they are too few, or too few markers.
+
+    Args:
+        markers: Markers of right hands [m], anywhere; frames in which one is missing are left out.
+        rng: Chooses frames and first clusters.
+    """
+    markers = markers[np.isfinite(markers).all(axis=(1, 2))]
+    if len(markers) > _MOST_FRAMES:
+        markers = markers[np.sort(rng.permutation(len(markers))[:_MOST_FRAMES])]
+    count = min(MOST_COMPONENTS, len(markers) // _FRAMES_EACH)
+    rank = min(_DIRECTIONS, 3 * markers.shape[1] - _RIGID - 1)
+    if count < _LEAST_COMPONENTS or rank < 1:
+        return None
+    members = _clusters(markers.astype(np.float64), count, rng)
+    means, scatters, sizes = _moments(markers.astype(np.float64), members, count)
+    covariances = _lent(means, scatters, sizes)
+    values, vectors = np.linalg.eigh(covariances)  # in ascending order
+    spreads = np.sqrt(values[:, _RIGID:-rank].mean(axis=1) + _NOISE**2)
+    deviations = np.sqrt(np.maximum(values[:, -rank:] + _NOISE**2 - spreads[:, None] ** 2, 0.0))
+    directions = vectors[:, :, -rank:] * deviations[:, None]
+    return PosePrior(
+        means.astype(np.float32),
+        directions.reshape(*means.shape, rank).astype(np.float32),
+        spreads.astype(np.float32),
+        np.log(sizes / sizes.sum()).astype(np.float32),
+    )
+
+
+def align_all(
+    hands: Float[np.ndarray, "T M 3"], target: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "T M 3"]:
+    """Hands turned and moved onto one hand with the least squares of distances (Kabsch 1976)."""
+    centered = hands - hands.mean(axis=1, keepdims=True)
+    center = target.mean(axis=0)
+    left, _, right = np.linalg.svd(centered.swapaxes(1, 2) @ (target - center))
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    aligned: NDArray[np.float64] = centered @ (left @ right) + center
+    return aligned
+
+
+def _clusters(
+    markers: Float[np.ndarray, "T M 3"], count: int, rng: np.random.Generator
+) -> Int[np.ndarray, "T"]:
+    """The cluster of each frame, by k-means of the hands aligned with their mean."""
+    mean = markers[0]
+    for _ in range(_CLUSTERINGS):
+        mean = align_all(markers, mean).mean(axis=0)
+    flat = align_all(markers, mean).reshape(len(markers), -1)
+    centers = flat[rng.permutation(len(flat))[:count]]
+    members = _nearest(flat, centers)
+    for _ in range(_CLUSTERINGS):
+        sums = np.zeros_like(centers)
+        np.add.at(sums, members, flat)
+        sizes = np.bincount(members, minlength=count)
+        centers = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], centers)
+        members = _nearest(flat, centers)
+    return members
+
+
+def _nearest(flat: Float[np.ndarray, "T D"], centers: Float[np.ndarray, "K D"]) -> Int[np.ndarray, "T"]:
+    """The nearest center of each row."""
+    offsets = (centers**2).sum(axis=1)
+    parts = [
+        (offsets - 2.0 * flat[first : first + _CHUNK] @ centers.T).argmin(axis=1)
+        for first in range(0, len(flat), _CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
+def _moments(
+    markers: Float[np.ndarray, "T M 3"], members: Int[np.ndarray, "T"], count: int
+) -> tuple[Float[np.ndarray, "K M 3"], Float[np.ndarray, "K D D"], Int[np.ndarray, "K"]]:
+    """Mean hand, scatter matrix and size of each cluster, its hands aligned with that mean; no small ones."""
+    means, scatters, sizes = [], [], []
+    for cluster in range(count):
+        hands = markers[members == cluster]
+        if len(hands) < _LEAST_MEMBERS:
+            continue
+        mean = hands[0]
+        for _ in range(_CLUSTERINGS):
+            aligned = align_all(hands, mean)
+            mean = aligned.mean(axis=0)
+        off = (aligned - mean).reshape(len(hands), -1)
+        means.append(mean)
+        scatters.append(off.T @ off)
+        sizes.append(len(hands))
+    return np.array(means), np.array(scatters), np.array(sizes)
+
+
+def _lent(
+    means: Float[np.ndarray, "K M 3"], scatters: Float[np.ndarray, "K D D"], sizes: Int[np.ndarray, "K"]
+) -> Float[np.ndarray, "K D D"]:
+    """Covariances, each with some of its neighbors', because its own frames are few."""
+    flat = means.reshape(len(means), -1)
+    covariances = np.empty_like(scatters)
+    for cluster, mean in enumerate(flat):
+        near = np.argsort(((flat - mean) ** 2).sum(axis=1))[1 : _NEIGHBORS + 1]
+        around = scatters[near].sum(axis=0) / sizes[near].sum()
+        covariances[cluster] = (scatters[cluster] + _LENT * around) / (sizes[cluster] + _LENT)
+    return covariances

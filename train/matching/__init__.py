@@ -1,1 +1,0 @@
-"""From what a network says of points to one label per point, checked against hands that exist."""
