@@ -42,6 +42,7 @@ from train.labelers.storage import LEARNED, learned_folder, learned_gloves
 from train.settings import TrainSettings, batch_recipe
 from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import (
+    FrameSource,
     GenerateSettings,
     sample_single_hand,
     simulate_frames,
@@ -319,10 +320,10 @@ def fine_tuned_labeler(
 def _simulated_rows(
     layout: MarkerLayout, rig: CameraRig, num_frames: int, rng: np.random.Generator
 ) -> np.ndarray:
+    """Frames as a training set has them, see `train.data.shards.row_dtype`."""
     source = FrameSource(GenerateSettings(), layout, rig)
-    config = GenerateSettings()
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
     for first in range(0, num_frames, _FRAMES_EACH):
-        models = sample_hands(config.population, rng=rng)
+        models = sample_hands(source.settings.population, rng=rng)
         simulate_frames(rows[first : first + _FRAMES_EACH], models, source, rng=rng)
     return rows
