@@ -8,9 +8,16 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy.typing import NDArray
 
 from handsim.hand.shape import NUM_BONES, HandShape
 from handsim.space.camera import Camera
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""

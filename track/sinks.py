@@ -156,9 +156,7 @@ def open_sink(address: str) -> LiveSink:
     """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
-        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS)
-        if scheme != "ws" and parts.port == 0:
-            raise ArgumentError(f"'{address}' is not an address, expected a port from 1 to 65535")
+        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS, any_port=scheme == "ws")
         if scheme == "osc":
             return DatagramSink(parts.host, parts.port, osc_format())
         format = document_format(parts.options["format"], points=parts.options["points"] == "yes")

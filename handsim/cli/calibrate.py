@@ -45,15 +45,15 @@ def calibrate(
 
     check_ending(out, ".json")
     check_outputs((capture, glove, labeler), [out])
-    with progress_bar("") as (bar, task):
+    with progress_bar("") as bar:
         user = captures.calibrate(
             capture,
-            glove,
+            glove=glove,
             hands=hands,
             size=size,
             labeler=labeler,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-            on_step=lambda what: bar.update(task, description=what),
+            progress=bar,
+            on_step=bar.step,
         )
     user.save(out)
     print_line(f"{out}: {len(user)} hands in glove {glove}")

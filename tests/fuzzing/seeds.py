@@ -23,7 +23,8 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.rigid_body import RigidTemplate, save_body
-from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
+from track.streams.frame_source import StreamedFrame
+from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
 from track.user import User
 
 FRAMES, COLUMNS = 4, 24
@@ -243,7 +244,7 @@ def settings(folder: Path) -> list[Path]:
 
 def packets(folder: Path) -> list[Path]:
     rng = _rng()
-    frame = MarkerFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
+    frame = StreamedFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
     info = ServerInfo("Motive", (3, 1), 1511, "239.255.42.99")
     contents = {
         "frame-3.0": pack_frame(frame, (3, 0)),

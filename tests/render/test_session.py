@@ -145,7 +145,7 @@ def test_a_take_has_its_own_hands():
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
-    studio = open_studio(take.hands, RenderConfig(painter="compiled"), rng=np.random.default_rng(0))
+    studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
     pictures = 0
     for placement in PLACEMENTS:
         viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))

@@ -53,7 +53,7 @@ def load_poses(file, seed=0):
 
 
 def drawn(subject, config, frames, shard=0):
-    return Drawing(subject, config).frames(shard, enumerate(frames))
+    return Drawing(subject, config.resolved()).frames(shard, enumerate(frames))
 
 
 def saved(folder, **arrays):

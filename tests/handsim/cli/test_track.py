@@ -35,8 +35,8 @@ from track import captures
 from track.captures import track_capture
 from track.recorder import Recorder
 from track.rigid_body import load_body
-from track.streams.addresses import open_source
-from track.streams.natnet_server import ReplayServer
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer
 from track.user import load_user
 from track.viewer.corrector import Corrector
 from train.simulation.scenes import CalibrationTakeConfig

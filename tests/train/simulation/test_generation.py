@@ -27,7 +27,7 @@ from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
-from train.simulation import frame_scenes, generation, people
+from train.simulation import generation, scenes, training_frames
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import NO_REST
 from train.simulation.training_frames import NO_GRASP, NO_TOUCH, GenerateSettings, SceneMix
@@ -153,8 +153,8 @@ def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):
     def no_touch(*args, **kwargs):
         raise PoseError("no valid pose of these two hands was found")
 
-    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", no_touch)
-    monkeypatch.setattr(frame_scenes, "settle_hold", no_touch)
+    monkeypatch.setattr(training_frames, "sample_two_hand_poses", no_touch)
+    monkeypatch.setattr(training_frames, "settle_hold", no_touch)
     config = GenerateSettings(
         num_frames=600,
         frames_per_hand=20,
@@ -174,7 +174,7 @@ def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monk
     def broken(*args, **kwargs):
         raise ArgumentError("qpos has shape (3,), expected (..., 27)")
 
-    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", broken)
+    monkeypatch.setattr(training_frames, "sample_two_hand_poses", broken)
     config = GenerateSettings(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
     with pytest.raises(ArgumentError, match="qpos has shape"):
         make_dataset(config, tmp_path / "set", workers=1)
@@ -184,9 +184,9 @@ def test_people_are_not_drawn_for_ever(rng, monkeypatch):
     def no_rest(model):
         raise PoseError("this hand's fingers overlap at rest")
 
-    monkeypatch.setattr(people, "resting_angles", no_rest)
+    monkeypatch.setattr(scenes, "resting_angles", no_rest)
     with pytest.raises(ArgumentError, match="the fingers of all 1000 people drawn"):
-        people.sample_hands(Population(), rng=rng)
+        scenes.sample_hands(Population(), rng=rng)
 
 
 def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):

@@ -155,7 +155,7 @@ def test_the_optics_have_options():
     clear = simulate_take(num_frames=60)
     assert blind.markers_present().mean() < 0.8 < clear.markers_present().mean()
     assert blind.settings["room"]["optics"]["blob_loss"] == 0.9 and "optics" not in clear.settings
-    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a chance"):
+    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a number from 0 to 1"):
         SimulateSettings(optics=OpticsOptions(blob_loss=2.0))
 
 
@@ -188,7 +188,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"kind": "hand-pn"}, "unknown kind of capture 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
+        ({"kind": "hand-pn"}, "unknown kind 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
         ({"num_frames": 0}, "num_frames is 0, expected at least 1"),
         ({"num_frames": -5}, "num_frames is -5, expected at least 1"),
         ({"seed": -1}, "seed is -1, expected 0 or more"),
@@ -222,7 +222,7 @@ def test_the_whole_hand_controller_twin_is_near_table_3():
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_one_hand_alone(kind, side):
     take = simulate_take(kind=kind, num_frames=FRAMES, hands=(side,))
-    assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == (side,)
+    assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == [side]
     assert take.num_frames == len(take.qpos) == FRAMES
     assert set(np.unique(take.labels)) <= {-1, *range(19)}
     assert np.isfinite(take.observed(take.hand_labels[0])).all(axis=-1).mean() > 0.8
