@@ -138,12 +138,9 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
 def vary_layout(
     layout: MarkerLayout, *, along: float, around: float, rng: np.random.Generator
 ) -> MarkerLayout:
-    """The same glove with its markers moved at random, as if put on less carefully.
+    """The same glove with its markers moved at random along [bone lengths] and around [rad] the bones.
 
-    Args:
-        layout: The glove as designed.
-        along: Standard deviation along the bones [bone lengths]; for the palm also across, at half of it.
-        around: Standard deviation around the bones [rad].
+    Both are standard deviations; on the palm markers move across too, at half of `along`.
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
@@ -165,9 +162,6 @@ def wear(
     """The glove put on with its markers slipped a little (`vary_layout`).
 
     It is drawn again if a marker is off the hand; after twenty draws it is put on as designed.
-
-    Raises:
-        LayoutError: A marker meets no skin even as designed.
     """
     for _ in range(_MOST_FITTINGS):
         try:
@@ -372,15 +366,7 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
 
 
 def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes, with its glove put on as designed.
-
-    Args:
-        size: XS, S, M, L or XL: 0.165 to 0.210 [m] of hand length.
-
-    Raises:
-        ArgumentError: There is no such size or side.
-        LayoutError: A marker meets no skin, and the message names it; or the glove is for the other hand.
-    """
+    """A hand of one of the five sizes XS to XL, with its glove put on as designed."""
     worn, model = load_layout(layout), HandModel.named(size, side=side)
     worn.check_side(side)
     return attach(worn, model)
@@ -410,15 +396,6 @@ def place_marker(
 
     The marker stays on its bone where that reaches the point, or else goes to the one that carries the skin
     there. On the palm it lies straight above or below its place in the palm's plane.
-
-    Args:
-        index: The marker to move.
-        model: The hand that the point is meant on.
-        point: Where the marker's center shall be, in the wrist's frame of the flat hand [m]. A marker on a
-            stalk keeps its height, and comes to stand where the stalk points at this.
-
-    Raises:
-        LayoutError: No marker can be put there.
     """
     height = layout.markers[index].height
     placed = _place_on_skin(_with_height(layout, index, 0.0), index, model, point)

@@ -451,10 +451,6 @@ def settle_hold(
     """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
 
     The hold is one of `hold_names`, a random one when not given.
-
-    Raises:
-        ArgumentError: The object has no hold of this name.
-        PoseError: This hand does not get hold of it in forty tries.
     """
     names = hold_names(obj) if hold is None else (hold,)
     scene = grasp_scene(model, obj)
@@ -585,9 +581,6 @@ def sample_held_poses(
     """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
 
     Returns joint angles [rad], and `T_wrist_object` [m].
-
-    Raises:
-        PoseError: The hold is not valid, such as one of another hand.
     """
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])

@@ -295,11 +295,7 @@ def count_frames(duration: float, config: MotionConfig) -> int:
 def angles_through(
     model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each.
-
-    Raises:
-        PoseError: No path leads out of a pose.
-    """
+    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each."""
     paths = [straight_path(start, target, config, rng) for start, target in pairwise(poses)]
     ends = np.cumsum([len(path) for path in paths])
     valid = np.split(is_valid(model, np.concatenate(paths)), ends[:-1])

@@ -52,10 +52,6 @@ def sample_object_motion(
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
     It has `round(duration * rate) + 1` frames.
-
-    Raises:
-        ArgumentError: The duration is not positive.
-        PoseError: This hand does not get hold of the object, or finds no valid path out of a hold.
     """
     config = MotionConfig()
     if not 0.0 < duration < np.inf:
@@ -164,13 +160,7 @@ def point_pen(
 ) -> tuple[HandMotion, BodyMotion]:
     """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
 
-    Args:
-        pen: Its tip is its first marker, its body goes from there along its z axis.
-        held: Motion of fingers and pen relative to the wrist; the wrist's own motion is computed here.
-        path: Poses of the pen with its tip at the origin, from `pointing_path`.
-
-    Raises:
-        PoseError: Something touches even when drawn back.
+    Fingers and pen move in the wrist's frame as they are `held`. The pen's tip is its first marker.
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
@@ -255,10 +245,7 @@ def pointing_path(
 ) -> Float[np.ndarray, "T 4 4"]:
     """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
 
-    Args:
-        positions: Possible targets, moving in the world [m].
-        outward: Unit directions from which each can be reached.
-        speed: Highest speed of the tip [m/s], see `SPEED`.
+    Targets [m] are reached from their outward unit directions, by a tip no faster than `speed` [m/s].
     """
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)

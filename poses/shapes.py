@@ -274,9 +274,6 @@ def make_valid(
     The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
     enough: a fist that was too tight ends as a fist whose fingers touch. A shape or the name of a size is a
     right hand.
-
-    Raises:
-        PoseError: This hand has no valid pose at rest.
     """
     model = load_model(model)
     resting = resting_angles(model)

@@ -35,14 +35,9 @@ def cameras_by_mirror(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T P C"]:
-    """Which cameras see which mirror image: in the patch, in view, and with both legs of the path free.
+    """Which cameras see which mirror image [m]: in the patch, in view, and with both legs of the path free.
 
-    Args:
-        images: Mirror images of the markers [m]; NaN where there is none.
-        plane_point: Middle of the patch in each frame [m].
-        plane_normal: Unit normal of its shiny side.
-        radius: Radius of the patch [m].
-        segments: Axes of the capsules that block the view, in the world [m].
+    The patch is a disc with a unit normal on its shiny side [m]; capsules of these axes [m] block the view.
     """
     seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
     _over_patch(images, plane_point, plane_normal, radius, rig.arrays, segments, radii, seen)
@@ -124,15 +119,9 @@ def sample_strays(
     num_cameras: int,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "T K 3"], Bool[np.ndarray, "T K C"]]:
-    """Strays carried by a hand, an object or the room.
+    """Positions [m] of strays around the middle [m] of a carrier, and which cameras each reflects to.
 
-    Args:
-        T_world_carrier: Pose of the carrier.
-        middle: Middle of the ball in which they lie, in the carrier's frame [m].
-        num_cameras: Cameras of the rig.
-
-    Returns:
-        Positions in the world [m], and which cameras each reflects to; occlusion is not tested here.
+    Occlusion is not tested here.
     """
     count = int(rng.poisson(config.number))
     directions = rng.standard_normal((count, 3))
@@ -195,12 +184,9 @@ def sample_ghosts(
     min_cameras: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 3"]:
-    """Ghosts [m] of every frame, NaN where there is none.
+    """Ghosts [m] of every frame, NaN where there is none, near markers [m] behind capsules of these axes [m].
 
-    Args:
-        markers: Marker centers in the world [m].
-        segments: Axes of the capsules that block the view, in the world [m].
-        min_cameras: Cameras that must see a mirror image before it is a point.
+    A mirror image is a point if at least `min_cameras` see it.
     """
     frames = len(markers)
     low, high = markers.min(axis=1), markers.max(axis=1)

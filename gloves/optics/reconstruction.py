@@ -410,13 +410,9 @@ def reconstruct(
     continuous: bool,
     rng: np.random.Generator,
 ) -> Reconstruction:
-    """Simulate detection and triangulation.
+    """Simulate detection and triangulation of sources of these radii [m], where cameras have seen them.
 
-    Args:
-        sources: True positions of markers, mirror images and strays [m]; NaN where there is none.
-        seen: Which cameras have a free view of each.
-        radii: Radius of each source, or of all [m].
-        continuous: Frames follow each other in time; otherwise each stands alone, and `min_rays` is enough.
+    Frames follow each other in time if `continuous`; otherwise each stands alone, and `min_rays` is enough.
     """
     frames, count = sources.shape[:2]
     positions = np.full((frames, count, 3), np.nan)
@@ -467,12 +463,8 @@ def pack_columns(
 ) -> tuple[Int[np.ndarray, "T S"], int]:
     """Pack many runs into few columns: an unbroken stretch of a column is one run, then a frame is empty.
 
-    Args:
-        present: Which source has a point in which frame.
-        rng: Decides the order of runs that begin together, so that columns do not reveal sources.
-
-    Returns:
-        The column of every point, -1 where there is none, and the number of columns.
+    Gives the column of every point, -1 where there is none, and their number. Runs that begin together have
+    random columns, which do not reveal sources.
     """
     ids = number_runs(present)
     first, source = np.nonzero(present & np.vstack([np.ones_like(present[:1]), ~present[:-1]]))

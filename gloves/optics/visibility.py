@@ -138,13 +138,6 @@ class MeshTree:
 
     Nodes are stored in depth-first order, a left child right after its parent, and `skip` is the node that
     follows when a branch is left out: a search needs no stack, and a refit is one backward pass.
-
-    Args:
-        vertices: Rest positions [m].
-        faces: Triangles of either winding.
-
-    Raises:
-        ArgumentError: There is no triangle, an array has another shape, or a face names no vertex.
     """
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
@@ -344,13 +337,7 @@ def visible_cameras(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras see each marker: in view, facing, and not occluded by the hand.
-
-    Args:
-        markers: Marker centers in the world [m].
-        normals: Outward unit directions of the skin under the markers.
-        segments: Both ends of every capsule's axis in the world [m].
-    """
+    """Which cameras see each marker: in view, facing, and not occluded by the hand."""
     seen = facing_cameras(markers, normals, rig)
     _keep_free(markers, rig.positions, segments, radii, seen)
     return seen
@@ -359,12 +346,7 @@ def visible_cameras(
 def facing_cameras(
     markers: Float[np.ndarray, "T M 3"], normals: Float[np.ndarray, "T M 3"], rig: CameraRig
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras would see each marker without occlusion: in view, and on its outward side.
-
-    Args:
-        markers: Marker centers in the world [m].
-        normals: Outward unit directions of the surface under the markers.
-    """
+    """Which cameras would see each marker without occlusion: in view, and on its outward side."""
     seen: NDArray[np.bool_] = _facing(
         np.ascontiguousarray(markers, dtype=np.float64),
         np.ascontiguousarray(normals, dtype=np.float64),

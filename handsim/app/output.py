@@ -160,11 +160,7 @@ class Output:
 
 @contextmanager
 def open_output(out: str | Place) -> Iterator[Output]:
-    """Where the files of jobs go; what workers left that died or were ended is removed after the block.
-
-    Raises:
-        ArgumentError: There is no such place, or what an object store needs is not installed.
-    """
+    """Where the files of jobs go; what workers left that died or were ended is removed after the block."""
     place = place_of(out)
     if isinstance(place, Path):
         output = Output(place, place)

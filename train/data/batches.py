@@ -168,18 +168,7 @@ def draw_cloud(
 def own_cloud(
     corruption: OwnCorruption | str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
 ) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption.
-
-    Args:
-        corruption: A function like `OwnCorruption`; `module:name` of one or of a class whose instances are;
-            or an entry point of the group `handsim.corruptions`.
-        markers: Clean markers.
-
-    Raises:
-        ArgumentError: There is none of that name, it does not take these arguments, or what it returns has
-            another shape, labels that are none, or points that are half NaN or beyond 10 m.
-        HandSimError: It raised an error.
-    """
+    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption."""
     if isinstance(corruption, str):
         function = load_plugin(corruption, group=CORRUPTIONS, noun=_NOUN)
     else:
@@ -200,11 +189,7 @@ def own_cloud(
 
 
 def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
-    """Load a corruption and try it on two clouds, before the work.
-
-    Raises:
-        HandSimError: As `own_cloud`.
-    """
+    """Load a corruption and try it on two clouds, before the work."""
     rng = np.random.default_rng(0)
     own_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
@@ -305,12 +290,7 @@ class BatchRecipe:
 def draw_batch(
     rows: NDArray[np.void] | MappedRows, recipe: BatchRecipe, *, rng: np.random.Generator
 ) -> Batch:
-    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones.
-
-    Args:
-        rows: Rows of a training set, see `train.data.shards.row_dtype`.
-        recipe: Size of the batch, and how to corrupt it.
-    """
+    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones."""
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)
     center = markers.mean(axis=1, keepdims=True)

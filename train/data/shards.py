@@ -120,11 +120,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def load_manifest(path: Path) -> Manifest:
-    """The manifest of a finished training set; its files are not checked.
-
-    Args:
-        path: The folder that `handsim generate` wrote.
-    """
+    """The manifest of a finished training set; its files are not checked."""
     if not (path / MANIFEST).is_file():
         hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
         raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
@@ -278,12 +274,7 @@ class Dataset:
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:
-    """A training set as it is, or by its folder.
-
-    Raises:
-        ArgumentError: It is neither.
-        DatasetError: As of `Dataset`.
-    """
+    """A training set as it is, or by its folder."""
     if isinstance(dataset, Dataset):
         return dataset
     check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")

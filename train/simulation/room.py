@@ -245,11 +245,7 @@ class LightSources(NamedTuple):
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
-    """All that shines, and which cameras have a free view of it.
-
-    Raises:
-        ArgumentError: A camera stands in the hands.
-    """
+    """All that shines, and which cameras have a free view of it."""
     markers, _ = sight.markers
     check_outside(sight.rig, markers)
     labels = np.arange(markers.shape[1])
@@ -343,11 +339,7 @@ def record_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """What the optical system puts out of hands and an object in motion, with the truth and these settings.
-
-    Raises:
-        ArgumentError: A camera stands in the hands.
-    """
+    """What the optical system puts out of a scene in motion, with the truth and these settings."""
     sources = sample_light_sources(SceneSight(scene, rig), config, rng=rng)
     return pack_take(scene, sources, rig, config, settings, rng=rng)
 

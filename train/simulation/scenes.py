@@ -145,11 +145,7 @@ def wear_gloves(
 def sample_scene_motion(
     kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """Random motion of a right and a left hand, and of the object that the right hand holds.
-
-    Raises:
-        PoseError: These hands cannot do this: they do not grasp the object, say.
-    """
+    """Random motion of a right and a left hand, and of the object that the right hand holds."""
     right, left = fits
     if kind == "hand-hand":
         both = sample_two_hand_motion(
@@ -216,12 +212,7 @@ class CalibrationTakeConfig(Settings):
 def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
-
-    Raises:
-        ArgumentError: There are no hands or more than two.
-        PoseError: A hand finds no way from its touches to free motion.
-    """
+    """The motion of one hand or both in a calibration capture; without rounds, free motion alone."""
     if not 1 <= len(hands) <= len(SIDES):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
@@ -238,11 +229,7 @@ def sample_calibration_scene(
 def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
-
-    Raises:
-        PoseError: This hand finds no way from its touches to free motion.
-    """
+    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion."""
     touches = [pose for _ in range(config.rounds) for pose in _touch_fingers(model, rng)]
     free = _free_motion(model, config.free, rng)
     if not touches:
@@ -290,12 +277,7 @@ _SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # of a glove, as in training 
 
 
 def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
-    """Two hands of anybody, children included, that meet and part, in skin that moves.
-
-    Raises:
-        LayoutError: The glove does not fit.
-        PoseError: The person drawn cannot bring the hands together.
-    """
+    """Two hands of anybody, children included, that meet and part, in skin that moves."""
     models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
     fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)

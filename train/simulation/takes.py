@@ -134,12 +134,7 @@ def simulate_calibration(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """What cameras see of a certain user who makes a calibration capture with one hand or both.
-
-    Raises:
-        ArgumentError: There are no hands or more than two.
-        PoseError: A hand finds no way from its touches to free motion.
-    """
+    """What cameras see of a certain user who makes a calibration capture with one hand or both."""
     config = config or CalibrationTakeConfig()
     scene = sample_calibration_scene(hands, config, rng=rng)
     rig = as_rig(config.rig)
@@ -150,12 +145,7 @@ def simulate_calibration(
 def sample_scene(
     kind: Kind, layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """A random person in gloves who does what this kind of capture asks for, for frames at `RATE`.
-
-    Raises:
-        LayoutError: The glove does not fit.
-        PoseError: None of the people drawn can do this.
-    """
+    """A random person in gloves who does what this kind of capture asks for, for frames at `RATE`."""
     return _by_somebody(kind, layout, lambda fits: sample_scene_motion(kind, fits, num_frames, rng=rng), rng)
 
 

@@ -220,11 +220,7 @@ def sample_single_hand(
 def sample_holding_hand(
     model: HandModel, num_frames: int, volume: float, *, rng: np.random.Generator
 ) -> FrameScene:
-    """Poses of a hand that holds a random object, in a cube of half side `volume` [m].
-
-    Raises:
-        PoseError: The hand does not grasp the object.
-    """
+    """Poses of a hand that holds a random object, in a cube of half side `volume` [m]."""
     names = object_names()
     rigid_object = named_object(names[rng.integers(len(names))])
     hold = settle_hold(model, rigid_object, rng=rng)
