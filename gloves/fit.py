@@ -71,8 +71,7 @@ class Attachment:
     @property
     def main_bones(self) -> Int[np.ndarray, "M"]:
         """The bone that carries most of each marker."""
-        main: np.ndarray = self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)]
-        return main
+        return np.asarray(self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)])
 
     def centers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
@@ -97,8 +96,7 @@ class Attachment:
         weights = np.zeros(local.shape[:2])
         np.add.at(weights, (np.arange(len(rest))[:, None], self.bone_indices), self.bone_weights)
         bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
-        carried: NDArray[np.float64] = (weights[..., None] * local).reshape(len(rest), -1) @ bones
-        return carried
+        return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
 
     def sites(self, model: HandModel) -> tuple[Site, ...]:
         """The markers as MuJoCo sites, each on the bone that carries most of it."""

@@ -313,8 +313,7 @@ def smooth_above(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
         return values
     kernel = np.hanning(window + 2)[1:-1]
     highest = maximum_filter1d(values, window, mode="nearest")
-    smooth: NDArray[np.float64] = convolve1d(highest, kernel / kernel.sum(), mode="nearest")
-    return smooth
+    return np.asarray(convolve1d(highest, kernel / kernel.sum(), mode="nearest"))
 
 
 def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:

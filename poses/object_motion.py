@@ -15,7 +15,7 @@ from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import axis_angle_matrix
+from handsim.space.transforms import axis_angle_matrix, pose_matrices, transform_poses
 from poses.grasps import (
     GraspScene,
     Held,
@@ -27,12 +27,10 @@ from poses.grasps import (
     hold_style,
     is_held_valid,
     object_penetration,
-    pose_to_qpos,
     rotation_between,
     sample_held_poses,
     settle_hold,
     why_not_held,
-    wrist_poses,
 )
 from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
 from poses.shapes import MAX_PENETRATION
@@ -71,7 +69,7 @@ def sample_object_motion(
     position, quaternion = free_wrist_path(frames, config, rng=rng)
     position = position + _scribble(frames, player.style.scribble, config.rate, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
-    return HandMotion(qpos, config.rate), BodyMotion(wrist_poses(qpos) @ held, config.rate)
+    return HandMotion(qpos, config.rate), BodyMotion(pose_matrices(qpos[:, :7]) @ held, config.rate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,10 +161,10 @@ def point_pen(
     Fingers and pen move in the wrist's frame as they are `held`. The pen's tip is its first marker.
     """
     motion, body = held
-    T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
+    T_wrist_pen = np.linalg.inv(pose_matrices(motion.qpos[:, :7])) @ body.T_world_body
     T_world_pen = path @ _rotated_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
     qpos = motion.qpos.copy()
-    qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+    qpos[:, :7] = transform_poses(T_world_pen @ np.linalg.inv(T_wrist_pen))
     led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
     return keep_apart(holder, other, pen, led, other_motion, path[:, :3, 2])
 
@@ -337,8 +335,7 @@ def _between(
     angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
     mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
     mixed = np.where(angle > 1e-6, mixed, start)
-    between: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12)
-    return between
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12))
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:

@@ -109,8 +109,7 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
     fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
-    inside: np.ndarray = np.clip(coupled, LOW, HIGH)
-    return inside
+    return np.asarray(np.clip(coupled, LOW, HIGH))
 
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
@@ -196,8 +195,7 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
     """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
     common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
-    mixed: NDArray[np.float64] = np.sqrt(0.75) * common + np.sqrt(0.25) * own
-    return mixed
+    return np.asarray(np.sqrt(0.75) * common + np.sqrt(0.25) * own)
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -262,8 +260,7 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
     if not valid.any():
         raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
-    resting: NDArray[np.float64] = tries[valid.argmax()]
-    return resting
+    return np.asarray(tries[valid.argmax()])
 
 
 def make_valid(

@@ -86,8 +86,7 @@ class Meeting:
 
     def directions(self, beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
         """Unit directions (T, 3) in which the moving hand backs off."""
-        directions: NDArray[np.float64] = self.axis[beats.astype(int)]
-        return directions
+        return np.asarray(self.axis[beats.astype(int)])
 
     def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
@@ -101,8 +100,7 @@ def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> 
     """Values between keys, `beats` counting keys from 0."""
     low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
     share = (beats - low)[:, None]
-    values: NDArray[np.float64] = keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low])
-    return values
+    return np.asarray(keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low]))
 
 
 def check_names(names: tuple[str, ...]) -> None:
@@ -204,8 +202,7 @@ def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> N
         return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
     side = (-1.0) ** np.arange(count)[:, None]
     direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
-    offsets: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
-    return offsets
+    return np.asarray(side * direction * rng.uniform(0.6, 1.0, size=(count, 1)))
 
 
 def _sketch_fingers(
@@ -245,8 +242,7 @@ def _anchors(
     if isinstance(anchor, str):
         bone = bones_of(anchor)[-1]
         frames = moving.forward_kinematics(join_qpos(opened))[:, bone]
-        tips: NDArray[np.float64] = frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0]
-        return tips
+        return np.asarray(frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0])
     mirror = MIRROR if moving.shape.side == "left" else np.eye(3)
     return np.tile(moving.shape.length * np.array(anchor) @ mirror, (len(opened), 1))
 
@@ -459,8 +455,7 @@ def two_hands_penetration(
         left.capsules,
         left.forward_kinematics(left_qpos),
     )
-    depth: NDArray[np.float64] = np.maximum(overlap, 0.0)
-    return depth
+    return np.asarray(np.maximum(overlap, 0.0))
 
 
 def sample_two_hand_motion(

@@ -22,8 +22,7 @@ def reflect(
 ) -> Float[np.ndarray, "*batch 3"]:
     """Mirror images of points in planes given by a point and a unit normal [m]."""
     height = np.einsum("...i,...i->...", points - plane_point, plane_normal)
-    mirrored: NDArray[np.float64] = points - 2.0 * height[..., None] * plane_normal
-    return mirrored
+    return np.asarray(points - 2.0 * height[..., None] * plane_normal)
 
 
 def cameras_by_mirror(

@@ -270,8 +270,7 @@ def clear_of_mesh(
         raise ArgumentError("vertices holds NaN or infinite values, expected finite numbers")
     nodes, spots = (tree.faces, tree.first, tree.skip), (tree.spots, tree.spots_start)
     lines = (starts, ends[None], np.asarray(needed, dtype=np.bool_))
-    clear: NDArray[np.bool_] = clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes))
-    return clear
+    return np.asarray(clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes)))
 
 
 def clear_of_body(
@@ -291,8 +290,7 @@ def clear_of_body(
     ends = np.ascontiguousarray((ends - positions) @ rotations)
     nodes, no_refit = (tree.faces, tree.first, tree.skip), (tree.spots[:0], tree.spots_start)
     lines = (starts, ends, np.asarray(needed, dtype=np.bool_))
-    clear: NDArray[np.bool_] = clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes)
-    return clear
+    return np.asarray(clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes))
 
 
 def _check_lines(
@@ -359,8 +357,7 @@ def facing_cameras(
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
     """Visibility as one bit per camera: bit c is set where camera c sees."""
     bits = visible.astype(np.uint32) << np.arange(visible.shape[-1], dtype=np.uint32)
-    packed: NDArray[np.uint32] = bits.sum(axis=-1, dtype=np.uint32)
-    return packed
+    return np.asarray(bits.sum(axis=-1, dtype=np.uint32))
 
 
 @kernel

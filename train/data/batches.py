@@ -329,8 +329,7 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
     """Symmetric matrices (B, 3, 3) that stretch along random orthogonal directions."""
     axes, _ = np.linalg.qr(rng.standard_normal((count, 3, 3)))
     factors = np.exp(anisotropy * rng.standard_normal((count, 1, 3)))
-    stretches: NDArray[np.float64] = (axes * factors) @ axes.transpose(0, 2, 1)
-    return stretches
+    return np.asarray((axes * factors) @ axes.transpose(0, 2, 1))
 
 
 def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:

@@ -358,8 +358,7 @@ def _arm(
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     frame = np.stack([-along, across, np.cross(along, across)], axis=2)
     places = np.array([*_WRIST, _ELBOW, *_FOREARM])
-    markers: Float[np.ndarray, "T 5 3"] = wrist[:, None] + np.einsum("tij,kj->tki", frame, places)
-    return markers
+    return np.asarray(wrist[:, None] + np.einsum("tij,kj->tki", frame, places))
 
 
 def _path(

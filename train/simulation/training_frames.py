@@ -24,8 +24,8 @@ from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, SIDES, Population
 from handsim.settings import Expected, Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
-from handsim.space.transforms import random_quaternions
-from poses.grasps import sample_held_poses, settle_hold, wrist_poses
+from handsim.space.transforms import pose_matrices, random_quaternions
+from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, sample_valid_angles
 from poses.two_hands import sample_two_hand_poses
 from train.simulation.scenes import wear_gloves
@@ -228,7 +228,7 @@ def sample_holding_hand(
     position = _sample_positions(num_frames, volume, rng)
     quaternion = random_quaternions(num_frames, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
-    return FrameScene((model,), (qpos,), rigid_object, wrist_poses(qpos) @ T_wrist_object)
+    return FrameScene((model,), (qpos,), rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
 
 
 def _sample_positions(count: int, volume: float, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -61,7 +61,7 @@ def test_only_touches_out_of_reach_are_left_out(rng, monkeypatch):
 
 
 def test_bad_values_are_told(rng):
-    with pytest.raises(ArgumentError, match="expected a positive time"):
+    with pytest.raises(ArgumentError, match="free is 0, expected a number above 0"):
         CalibrationTakeConfig(free=0.0)
     with pytest.raises(ArgumentError, match="expected 0 or more"):
         CalibrationTakeConfig(rounds=-1)

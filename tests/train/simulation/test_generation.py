@@ -364,7 +364,7 @@ OPTION_ERRORS = {
     "--volume nan": "volume is nan, expected a number from 0 to 10",
     "--slip-around nan": "slip_around is nan, expected a number from 0 to 90",
     "--population.children 5": "children is 5, expected a number from 0 to 1",
-    "--blob-loss 0 1.5": "blob_loss is (0.0, 1.5), expected chances from 0 to 1",
+    "--blob-loss 0 1.5": "blob_loss is 1.5, expected a number from 0 to 1",
     "--seed -1": "seed is -1, expected 0 or more",
 }
 

@@ -247,5 +247,5 @@ def test_hands_that_belong_together_are_not_parted(kind):
         ArgumentError, match="hands are left, expected right and left, or one of them for the"
     ):
         SimulateSettings(kind=kind, hands=("left",))
-    with pytest.raises(ArgumentError, match="unknown hand 'both'"):
+    with pytest.raises(ArgumentError, match="unknown hands 'both'"):
         SimulateSettings(hands=("both",))
