@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from handsim._kernel_cache import ensure_kernel_cache
 from handsim._lazy import lazy_exports
-from handsim._siblings import ShadowedPackageWarning as ShadowedPackageWarning
-from handsim._siblings import warn_if_shadowed
+from handsim._name_conflicts import ShadowedPackageWarning as ShadowedPackageWarning
+from handsim._name_conflicts import warn_if_shadowed
 from handsim.errors import HandSimError as HandSimError
 from handsim.errors import HandSimWarning as HandSimWarning
 

@@ -53,11 +53,6 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
 
     The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
     `?option=value&option=value`.
-
-    Raises:
-        ArgumentError: There is nothing of that name, its module cannot be imported, or it does not take the
-            options.
-        HandSimError: It raised an error; the sentence has its line.
     """
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))

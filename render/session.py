@@ -89,7 +89,7 @@ def draw(
     config = configured(config, camera, settings).resolved()
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
-    drawing.check_view()
+    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
 
 
@@ -119,12 +119,6 @@ class Drawing:
         self.subject, self.take, self.config = subject, subject.take, config
         self.viewpoints = Viewpoints(config.view, subject.take, rng=SpawnKey.VIEWPOINTS.rng(config.seed))
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
-
-    def check_view(self) -> None:
-        """Refuse the user's own cameras where none has a hand in its pictures."""
-        if self.config.view.cameras is not None:
-            cameras = self.viewpoints.cameras(0)
-            check_hands_in_view(self.config.view.own_cameras, cameras, self.take)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
         """Numbers of frames as asked for; else those with a hand."""
@@ -158,15 +152,14 @@ class Drawing:
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
         size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
-        studio = self._studio(self.take.hands, rng) if cast is None else None
+        if cast is None:  # a take has its own hands; their looks change with the shard
+            studio = open_studio(self.take.hands, config, bodies=self.take.bodies, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            # A take has its own hands; their looks change with the shard.
             person = shard if cast is None else cast.person_in(frame, shard)
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
-            assert studio is not None
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
                 chosen = sample_choices(config, studio.skin, own, size, around)
@@ -185,14 +178,12 @@ class Drawing:
                 drawn = studio.photograph(moment, camera, fresh)
                 yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
-    def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
-        return open_studio(hands, self.config, bodies=self.take.bodies, rng=rng)
-
     def _studio_of_person(self, person: int) -> Studio:
         """The hands of one of the cast, with a skin of their own; cached, because they come back."""
         cast = self.subject.cast
         assert cast is not None
-        return self._studio(cast.hands(person, self.take.hands), cast.rng(person))
+        hands = cast.hands(person, self.take.hands)
+        return open_studio(hands, self.config, bodies=self.take.bodies, rng=cast.rng(person))
 
 
 def open_studio(
@@ -303,8 +294,11 @@ def render_take(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
-    _check_cameras(formats, drawing)
-    drawing.check_view()
+    cameras = drawing.viewpoints.cameras(0)
+    check_names("cameras", cameras)
+    for one in cameras if {"freihand", "interhand"} & set(formats) else ():
+        centered_K(one)  # refuses other lenses before a folder is begun
+    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
     record = _settings(drawing, kept) | {"formats": list(formats)}
@@ -447,14 +441,6 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
-
-
-def _check_cameras(formats: Sequence[str], drawing: Drawing) -> None:
-    """Refuse cameras that a format or a file's name has no place for, before a folder is begun."""
-    cameras = drawing.viewpoints.cameras(0)
-    check_names("cameras", cameras)
-    for camera in cameras if {"freihand", "interhand"} & set(formats) else ():
-        centered_K(camera)
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:

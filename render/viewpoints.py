@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -576,11 +576,11 @@ def zoomed(camera: Camera, zoom: float) -> Camera:
     return dataclasses.replace(camera, K=K)
 
 
-def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
-    """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
-
-    Cameras among them without a hand are told.
-    """
+def check_hands_in_view(config: ViewConfig, viewpoints: Viewpoints, take: Take) -> None:
+    """Refuse the user's own cameras if none has a hand in its pictures, and warn of those that have none."""
+    if config.cameras is None:
+        return
+    cameras, name = viewpoints.cameras(0), config.own_cameras
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
         there = qpos[np.isfinite(qpos).all(axis=1)]

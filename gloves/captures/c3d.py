@@ -74,11 +74,7 @@ class Parameters:
         return Parameters(processor, values)
 
     def number(self, group: str, name: str, *, default: float | None = None) -> float:
-        """The first number of a parameter.
-
-        Raises:
-            CaptureError: It is not finite, or there is none and no default.
-        """
+        """The first number of a parameter."""
         values = self.values.get((group, name), [])
         if values and isinstance(values[0], float):
             if not math.isfinite(values[0]):
@@ -375,10 +371,6 @@ def write_c3d(path: Path, capture: Capture) -> None:
 
     A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
     programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
-
-    Raises:
-        CaptureError: A label is too long.
-        OSError: The file cannot be opened, or the disk did not take the whole file.
     """
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:

@@ -184,11 +184,7 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of labeled captures [m], NaN where missing, hand by hand; no frames without any.
-
-    Raises:
-        CaptureError: A file cannot be read or lacks a marker; the file is named.
-    """
+    """The named markers of labeled captures [m], NaN where missing, hand by hand; no frames without any."""
     markers = np.concatenate([_markers_of(file, names) for file in files])
     shown: Float[np.ndarray, "T M 3"] = markers[np.isfinite(markers).any(axis=(1, 2))]
     return shown

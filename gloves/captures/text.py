@@ -68,11 +68,7 @@ def meters_per(unit: str) -> float:
 
 
 def header_cells(line: bytes, number: int) -> list[str]:
-    """Cells of a plain header line without outer blanks; what is not UTF-8 is taken as Windows-1252.
-
-    Raises:
-        CaptureError: There are more than a marker file has.
-    """
+    """Cells of a plain header line without outer blanks; what is not UTF-8 is taken as Windows-1252."""
     check_width(line.count(TAB) + 1, number)
     try:
         text = line.decode("utf-8")
@@ -88,11 +84,7 @@ def check_width(num_cells: int, number: int) -> None:
 
 
 def cell_number(text: str) -> float:
-    """The number in a cell, which may have a decimal comma; NaN for a blank cell.
-
-    Raises:
-        ValueError: It is not a number.
-    """
+    """The number in a cell, which may have a decimal comma; NaN for a blank cell."""
     text = text.strip()
     return _BLANK if text in _BLANKS else float(text.replace(",", "."))
 
@@ -118,10 +110,6 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
 
     Quotes in a file with tabs count only where the first cell of the file is quoted. `first` is the number of
     the first line in the file; where `wider`, rows may have more cells than the line above them.
-
-    Raises:
-        CaptureError: A line has more cells than a marker file has, its quotes are damaged, or commas are both
-            between cells and in numbers.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
@@ -189,14 +177,6 @@ def parse_table(
     `num_columns` or than the first row, which tells whether rows end in a separator, or if its last number
     alone has fewer decimals. (A cut inside the last cell of a row whose numbers have as many decimals as it
     happens leaves no trace and is not noticed.)
-
-    Args:
-        lines: All lines of the file, plain.
-        start: Index of the first line of the table.
-        ended: Whether the last line has its line end.
-        num_columns: Number of cells of a whole row.
-        column_name: Name of a column in messages.
-        text_columns: Columns that hold no numbers; they are returned as NaN.
     """
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
     if not rows:

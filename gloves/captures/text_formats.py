@@ -120,12 +120,6 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
 
     A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
     count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
-
-    Args:
-        title: The file name that the first line states (`path` may be a temporary one).
-
-    Raises:
-        OSError: The file cannot be written.
     """
     num_frames, num_markers = capture.positions.shape[:2]
     rate = repr(capture.rate).removesuffix(".0")

@@ -12,7 +12,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.command_table import PresetCommand, given_option
+from handsim.cli.parsing import PresetCommand, given_option
 from train.settings import KINDS, PRESETS, Preset, TrainSettings, usual_settings
 
 

@@ -40,9 +40,6 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
     """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes.
 
     A path that does not exist, or is a folder, is left to whoever opens it.
-
-    Raises:
-        HandSimError: Of class `error`: the path is not a regular file, or is too long.
     """
     try:
         found = path.stat()
@@ -58,11 +55,7 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
 
 
 def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
-    """The bytes of a regular file of at most `most` bytes.
-
-    Raises:
-        HandSimError: Of class `error`: the file cannot be read, is not a regular one, or is too long.
-    """
+    """The bytes of a regular file of at most `most` bytes."""
     check_regular(path, error=error, most=most)
     try:
         # Without waiting: the path may have become a pipe since it was checked.
@@ -82,11 +75,7 @@ _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyon
 
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
-    """The tables of a TOML file.
-
-    Args:
-        error: What to raise, in one sentence, when the file cannot be read or is not TOML.
-    """
+    """The tables of a TOML file."""
     data = read_bytes(path, error=error, most=_MOST_TOML)
     try:
         text = data.decode("utf-8")

@@ -66,18 +66,9 @@ def claim(
 ) -> None:
     """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
 
-    Args:
-        path: The settings file; its folder is claimed.
-        settings: What decides the content of the folder.
-        noun: What the folder holds, for messages.
-        grows: A setting, written like `train.samples`, that may be larger than in the file; the file then
-            takes the new settings.
-        free: Settings that may differ or be missing, because the content does not depend on them.
-        result: A file that is true for the old settings only; it is removed before they change.
-        shown: The folder's name in messages, where it stands for another.
-
-    Raises:
-        HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
+    The setting `grows`, written like `train.samples`, may be larger than in the file, which then takes the
+    new settings; the file `result`, which is true for the old ones only, is removed before. Settings that are
+    `free` may differ. `shown` is the name of the folder in messages.
     """
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():

@@ -35,9 +35,6 @@ def plain_path(path: Path) -> Iterator[Path]:
     """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other.
 
     The file need not exist: what is written to the link is written to the file.
-
-    Raises:
-        OSError: The link cannot be made.
     """
     try:
         str(path).encode()
@@ -66,17 +63,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     the way to `path` are made. The finished file has the mode that the umask asks for, whatever its writer
     chose. What a killed process left of the same file is removed first.
 
-    Args:
-        path: Where the finished file shall be; an existing file there is replaced, of a link the file that
-            it points to.
-
     Yields:
         The path to write to.
-
-    Raises:
-        ArgumentError: `path` is no path.
-        OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
-            wrote nothing.
     """
     check_type("path", path, (str, os.PathLike), "a path")
     final = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
@@ -124,9 +112,6 @@ def written_together() -> Iterator[None]:
     If the block raises, or one file cannot take its name, older files stay as they were, and those that were
     not there before are not there. Signals to end wait for the renames. Only a process that is killed between
     two of them leaves new files beside older ones.
-
-    Raises:
-        OSError: A file cannot take its name.
     """
     if _TOGETHER.get() is not None:
         yield
@@ -143,11 +128,7 @@ def written_together() -> Iterator[None]:
 
 
 def _name(files: Mapping[Path, Path]) -> None:
-    """Rename all temporary files, or none.
-
-    Args:
-        files: The temporary file of each final name.
-    """
+    """Rename all temporary files, or none."""
     older: dict[Path, Path] = {}
     named: list[Path] = []
     with signals_wait():
@@ -199,11 +180,7 @@ def unwritten(path: Path) -> OSError:
 
 
 def make_folder_of(path: Path) -> None:
-    """Make the folders that are missing on the way to a file.
-
-    Raises:
-        OSError: One cannot be made, or there is a file in its place.
-    """
+    """Make the folders that are missing on the way to a file."""
     for folder in path.parents:
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
@@ -283,12 +260,7 @@ _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
-    """Refuse an output that names an input or another one, in whatever spelling, or has no place.
-
-    Args:
-        inputs: Files and folders that a command reads, and names that may be none; objects are no files.
-        outputs: What it writes; None where not given.
-    """
+    """Refuse an output that names an input or another one, in whatever spelling, or has no place."""
     read, written = [Path(name) for name in inputs if isinstance(name, str | Path)], set()
     for output in (path for path in outputs if path is not None):
         _check_links(output)
@@ -350,13 +322,7 @@ def _same(source: Path, output: Path) -> bool:
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
-    """Refuse work that the disk has no space for; the folder need not exist yet.
-
-    Args:
-        needed: Bytes still to be written.
-        what: What needs them, for the message, in the plural.
-        remedy: What to do beside freeing space, as in `ask for fewer frames`.
-    """
+    """Refuse work that the disk has no space for; the folder need not exist yet."""
     there = folder.absolute()
     while not there.exists():
         there = there.parent

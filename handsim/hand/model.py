@@ -97,11 +97,7 @@ def build_skeleton(shape: HandShape) -> Skeleton:
 
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
-    """`T_world_bone` of every bone in every frame.
-
-    Args:
-        qpos: Wrist position [m], wrist orientation (wxyz, normalized here), joint angles [rad].
-    """
+    """`T_world_bone` of every bone in every frame."""
     transforms: NDArray[np.float64] = pose_bones(
         np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN
     )
@@ -337,11 +333,7 @@ _WRIST: Final = 1.3  # thickness of the wrist, in thicknesses of the palm
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
-    """Keypoints in the world [m].
-
-    Raises:
-        ArgumentError: `qpos` is not (T, 27) or not finite.
-    """
+    """Keypoints in the world [m]."""
     transforms = model.forward_kinematics(qpos)
     points: NDArray[np.float64] = np.empty((len(transforms), NUM_KEYPOINTS, 3))
     points[:, 0] = transforms[:, PALM, :3, 3]
@@ -400,12 +392,7 @@ def skinned_jacobian(
     bone_indices: Int[np.ndarray, "M 4"],
     bone_weights: Float[np.ndarray, "M 4"],
 ) -> Float[np.ndarray, "T M 3 26"]:
-    """Derivative of skinned points [m] with respect to MuJoCo's velocities (`NUM_VELOCITIES`).
-
-    Args:
-        T_world_bone: Its bones, from `forward_kinematics`.
-        points: Rest positions in the wrist frame [m].
-    """
+    """Derivative of skinned points [m] with respect to MuJoCo's velocities (`NUM_VELOCITIES`)."""
     frames, count = len(T_world_bone), len(points)
     motion = T_world_bone @ np.linalg.inv(model.rest_transforms)
     homogeneous = np.concatenate([points, np.ones((count, 1))], axis=1)

@@ -53,11 +53,7 @@ class HandMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyMotion:
-    """Poses of one rigid object, frame by frame.
-
-    Raises:
-        ArgumentError: `T_world_body` is not (T, 4, 4), empty or not rigid, or the rate is not positive.
-    """
+    """Poses of one rigid object, frame by frame."""
 
     T_world_body: Float[np.ndarray, "T 4 4"]
     """The object's frame seen from the world [m]."""
@@ -112,11 +108,7 @@ def is_steady(times: Float[np.ndarray, "T"], rate: float) -> bool:
 
 
 def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K"]:
-    """The times [s] of frames at another rate, from the first to the last.
-
-    Args:
-        times: Time of each frame [s], increasing.
-    """
+    """The times [s] of frames at another rate, from the first to the last."""
     if not 0.0 < rate < np.inf:
         raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
     last = (times[-1] - times[0]) * rate + _STEADY

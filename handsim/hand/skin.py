@@ -544,12 +544,7 @@ def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
 def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
-    """Outward unit normals, each the area-weighted mean of the faces around its vertex.
-
-    Args:
-        vertices: Positions in any frame [m].
-        faces: Triangles, counter-clockwise from outside.
-    """
+    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
     return _vertex_normals(
         np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64)
     )
@@ -621,12 +616,6 @@ def skin_frames(
     transforms: Float[np.ndarray, "T L 4 4"],
 ) -> Float[np.ndarray, "T V 3"]:
     """Points attached at rest, carried by the bones.
-
-    Args:
-        points: Rest positions, in the frame of `rest_transforms` [m].
-        bone_weights: Their shares in descending order; the first zero ends a point's list.
-        rest_transforms: Bones at rest.
-        transforms: Bones in every frame, in any one frame of reference.
 
     Returns:
         Positions in the frame of `transforms` [m].

@@ -125,11 +125,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is."""
     hands = tuple(posed_hands(motion))
     tables = [_numbers(hand) for hand in hands]
     row_format = ",%.9g" * len(NUMBERS)
@@ -143,12 +139,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as Apache Parquet, in the take's axes whatever `up` is.
-
-    Raises:
-        OSError: The file cannot be written.
-        HandSimError: pyarrow is not installed.
-    """
+    """Write the table as Apache Parquet, in the take's axes whatever `up` is."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -180,11 +171,7 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
 
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the angles of all hands, in the take's axes whatever `up` is.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the angles of all hands, in the take's axes whatever `up` is."""
     hands = tuple(posed_hands(motion))
     table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
     names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
@@ -340,11 +327,7 @@ def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:
-    """`T_world_joint` of OpenXR's joints, in our world [m].
-
-    Raises:
-        ArgumentError: `qpos` is not (T, 27) or not finite.
-    """
+    """`T_world_joint` of OpenXR's joints, in our world [m]."""
     bones = model.forward_kinematics(qpos)
     poses = np.empty((len(bones), len(OPENXR_JOINTS), 4, 4))
     number = 2

@@ -180,11 +180,7 @@ _SHARP: Final = np.cos(np.deg2rad(40.0))
 def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
-    """Outward unit normal at each corner of each face: of the faces there that meet at less than 40 degrees.
-
-    Args:
-        faces: Triangles, counter-clockwise from outside.
-    """
+    """Outward unit normal at each corner of a face: of the faces there that meet at less than 40 degrees."""
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     areas = np.cross(second - first, third - first)
     units = _unit(areas)

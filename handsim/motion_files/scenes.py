@@ -61,12 +61,7 @@ _MOST: Final = (1 << 32) - 1  # bytes that the header can state
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things; a motion of one frame is written as a pose, without an animation.
-
-    Raises:
-        OSError: The file cannot be written.
-        ArgumentError: The file would be larger than a .glb can be.
-    """
+    """Write hands and things; a motion of one frame is written as a pose, without an animation."""
     content = _Scene(motion, up).pack()
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -241,14 +236,7 @@ class GlbBuffer:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: NDArray[Any], *, target: Target | None = None, bounds: bool = False) -> int:
-        """Add an array and return the index of its accessor.
-
-        Args:
-            array: Entries along the first axis: numbers, vectors or matrices (4, 4), of unsigned bytes or
-                words, or of float32.
-            target: What a graphics card uses it for.
-            bounds: Whether its least and greatest values are stated, as for positions and times.
-        """
+        """Add an array and return the index of its accessor."""
         content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # by columns
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": content.nbytes}
         if target is not None:
@@ -268,11 +256,7 @@ class GlbBuffer:
         return len(self._accessors) - 1
 
     def pack(self, document: dict[str, Any]) -> bytes:
-        """The whole file.
-
-        Args:
-            document: The JSON without buffers, views and accessors.
-        """
+        """The whole file."""
         arrays = {"buffers": [{"byteLength": self._size}], "bufferViews": self._views}
         text = json.dumps(
             {**document, **arrays, "accessors": self._accessors}, separators=(",", ":"), allow_nan=False
@@ -294,12 +278,7 @@ _AROUND: Final = 0.03  # [m] of skin around keypoints
 
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things.
-
-    Raises:
-        OSError: The file cannot be written.
-        HandSimError: usd-core is not installed.
-    """
+    """Write hands and things."""
     try:
         from pxr import Tf, Usd, UsdGeom
     except ImportError as error:

@@ -393,12 +393,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarra
 def pinhole(
     name: str, size: tuple[int, int], focal: float, center: tuple[float, float] | None = None
 ) -> Camera:
-    """A camera without distortion.
-
-    Args:
-        focal: Focal length [px].
-        center: Principal point [px]; the picture's center when not given.
-    """
+    """A camera without distortion."""
     x, y = (size[0] / 2, size[1] / 2) if center is None else center
     return Camera(name, size, camera_matrix(focal, focal, x, y))
 
@@ -519,11 +514,7 @@ PRESETS: Final = tuple(_presets())
 
 
 def preset(name: str) -> Camera:
-    """One of the cameras that come with the package, at the world's origin.
-
-    Raises:
-        ArgumentError: There is no camera of that name.
-    """
+    """One of the cameras that come with the package, at the world's origin."""
     cameras = _presets()
     check_choice(name, cameras, noun="camera")
     return cameras[name]

@@ -256,13 +256,6 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 
     Cameras see the mesh as it is; fingers touch its convex hull, so they cannot reach into hollows. The
     object carries no markers. A file with several meshes makes one object.
-
-    Args:
-        path: An .stl, .obj, .ply or .glb file, in meters.
-        mass: Its mass [kg].
-
-    Raises:
-        ObjectError: The file cannot be read, or is not a closed surface of a size that a hand can hold.
     """
     path = Path(path)
     mesh = _read_mesh(path)

@@ -84,22 +84,14 @@ def attribute_numbers(element: ET.Element, key: str, count: int, owner: str) -> 
 
 
 def attribute_number(element: ET.Element, key: str, owner: str, default: float | None = None) -> float:
-    """The number of an attribute; `default`, unless None, where it is missing.
-
-    Raises:
-        RigError: It is missing without a default, or not a finite number.
-    """
+    """The number of an attribute; `default`, unless None, where it is missing."""
     if default is not None and element.get(key) is None:
         return default
     return attribute_numbers(element, key, 1, owner)[0]
 
 
 def child(element: ET.Element, tag: str, owner: str) -> ET.Element:
-    """The first child of a tag.
-
-    Raises:
-        RigError: There is none.
-    """
+    """The first child of a tag."""
     found = element.find(tag)
     if found is None:
         raise RigError(f"{owner} lacks <{tag}>")
@@ -410,9 +402,6 @@ def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
     """A camera for each image of a reconstruction in meters, called after it.
 
     `path` is the folder of `cameras.txt` and `images.txt`, or one of the two.
-
-    Raises:
-        RigError: A file is missing or damaged, or a model is one that we do not have.
     """
     folder = path if path.is_dir() else path.parent
     lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
@@ -851,16 +840,8 @@ _CLOSED: Final = {
 def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     """The cameras of a file, by its ending.
 
-    Args:
-        path: A camera or rig file of ours (`.toml`), Vicon's `.xcp`, Qualisys' calibration (`.xml`, `.txt`),
-            Motive's `.mcal`, OpenCV's calibration (`.yml`, `.yaml`, `.json`), or COLMAP's `cameras.txt`,
-            `images.txt` or their folder.
-
     Returns:
         Cameras with intrinsics [px], lenses and poses in the file's world [m].
-
-    Raises:
-        RigError: The file cannot be read, or does not describe cameras; the sentence names it.
     """
     return tuple(one.camera for one in load_lab_cameras(path))
 
@@ -869,13 +850,6 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
     """The cameras of a calibration that see markers, in a world with z up.
 
     Those that take pictures are left out where there are others, and named in a warning.
-
-    Args:
-        path: As for `load_cameras`.
-        up: The axis that points up in the file; when not given y where its format says so, else z.
-
-    Raises:
-        RigError: As `load_cameras`; or no camera is calibrated.
     """
     found = load_lab_cameras(path)
     seeing = [one for one in found if not one.video] or list(found)

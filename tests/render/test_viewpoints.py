@@ -72,8 +72,8 @@ def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
     ("wrong", "said"),
     [
         ({"placement": "nowhere"}, "placement"),
-        ({"views": 0}, "0 views"),
-        ({"distance": (0.8, 0.5)}, "distances"),
+        ({"views": 0}, "views is 0"),
+        ({"distance": (0.8, 0.5)}, "distance"),
     ],
 )
 def test_what_is_no_view_is_refused(wrong, said):
@@ -86,11 +86,16 @@ def test_cameras_must_look_at_the_hands():
     eye = np.array([0.0, -0.6, 0.0])
     seeing = pinhole("seeing", (640, 480), 600.0).at(look_at(eye, np.zeros(3)))
     blind = pinhole("blind", (640, 480), 600.0).at(look_at(eye, 2 * eye))
-    check_hands_in_view("c.toml", [seeing], take)
+
+    def check(*cameras):
+        config = ViewConfig(cameras=cameras)
+        check_hands_in_view(config, Viewpoints(config, take, rng=np.random.default_rng(0)), take)
+
+    check(seeing)
     with pytest.warns(HandSimWarning, match="camera 'blind' has no hand"):
-        check_hands_in_view("c.toml", [seeing, blind], take)
+        check(seeing, blind)
     with pytest.raises(RigError, match="no camera has a hand in its picture in any of 3 frames"):
-        check_hands_in_view("c.toml", [blind], take)
+        check(blind)
 
 
 FRAMES, STEP = 480, 8

@@ -22,12 +22,9 @@ class ShadowedPackageWarning(UserWarning):
 
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Where each sibling leads that does not lie in `home`, the folder that holds `handsim`."""
-    strangers = {}
-    for name in SIBLINGS:
-        location = _location(name)
-        if location is not None and not _same(location, os.path.join(home, name)):
-            strangers[name] = location
-    return strangers
+    found = {name: _location(name) for name in SIBLINGS}
+    own = {name: os.path.realpath(os.path.join(home, name)) for name in SIBLINGS}
+    return {name: place for name, place in found.items() if place and os.path.realpath(place) != own[name]}
 
 
 def warn_if_shadowed() -> None:
@@ -49,10 +46,5 @@ def _location(name: str) -> str | None:
         return getattr(sys.modules.get(name), "__file__", None) or f"a module made by hand, '{name}'"
     if spec is None:
         return None
-    if spec.submodule_search_locations:
-        return str(next(iter(spec.submodule_search_locations)))
-    return spec.origin
-
-
-def _same(first: str, second: str) -> bool:
-    return os.path.normcase(os.path.realpath(first)) == os.path.normcase(os.path.realpath(second))
+    folders = spec.submodule_search_locations
+    return str(next(iter(folders))) if folders else spec.origin

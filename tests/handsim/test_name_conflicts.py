@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from handsim._siblings import SIBLINGS, ShadowedPackageWarning, shadowed_siblings, warn_if_shadowed
+from handsim._name_conflicts import SIBLINGS, ShadowedPackageWarning, shadowed_siblings, warn_if_shadowed
 
 ROOT = Path(__file__).resolve().parents[2]
 
