@@ -10,8 +10,7 @@ from jaxtyping import Float
 from gloves.layout import load_layout
 from handsim.space.rig import as_rig
 from train.data.shards import row_dtype
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import FrameSource, GenerateSettings, simulate_frames
+from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
 _SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 

@@ -390,49 +390,12 @@ _SPACING: Final = 4e-3  # [m] between the skin's vertices, about
 def place_marker(
     layout: MarkerLayout, index: int, model: HandModel, point: Float[np.ndarray, "3"]
 ) -> MarkerLayout:
-    """The layout with one marker moved to the place on the skin that is nearest to a point.
+    """The layout with one marker moved to the place on the skin that is nearest to a point, or an error.
 
-    The marker stays on its bone where that reaches the point, or else goes to the one that carries the skin
-    there. On the palm it lies straight above or below its place in the palm's plane.
+    The point [m] is in the wrist's frame of the flat hand. The marker stays on its bone where that reaches
+    the point, or else goes to the one that carries the skin there. On the palm it lies straight above or
+    below its place in the palm's plane. A marker on a stalk keeps its height; the stalk points at the point.
     """
-    height = layout.markers[index].height
-    placed = _place_on_skin(_with_height(layout, index, 0.0), index, model, point)
-    return placed if height == 0.0 else _stand_up(placed, index, height, model, point)
-
-
-def _stand_up(
-    layout: MarkerLayout, index: int, height: float, model: HandModel, point: NDArray[np.float64]
-) -> MarkerLayout:
-    """A marker that lies near its place, put on its stalk and moved until the stalk points at a point."""
-    foot = attach_markers(layout, model).points[index]
-    best, least = layout, math.inf
-    for _ in range(_STEPS):
-        standing = _with_height(layout, index, height)
-        worn = attach_markers(standing, model)
-        missed = point - worn.points[index]
-        missed -= (missed @ worn.normals[index]) * worn.normals[index]
-        distance = float(np.linalg.norm(missed))
-        if distance < least:
-            best, least = standing, distance
-        if least < _POINTED:
-            break
-        # On skin as curved as a finger's tip the end of the stalk moves more than its foot.
-        foot = foot + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
-        layout = _place_on_skin(layout, index, model, foot)
-    return best
-
-
-def _with_height(layout: MarkerLayout, index: int, height: float) -> MarkerLayout:
-    marker = dataclasses.replace(layout.markers[index], height=height)
-    return dataclasses.replace(
-        layout, markers=(*layout.markers[:index], marker, *layout.markers[index + 1 :])
-    )
-
-
-def _place_on_skin(
-    layout: MarkerLayout, index: int, model: HandModel, point: NDArray[np.float64]
-) -> MarkerLayout:
-    """The layout with a marker without a stalk on the skin that is nearest to a point."""
     surface = model.surface
     nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
     normal = vertex_normals(surface.vertices, surface.faces)[nearest]
@@ -443,7 +406,7 @@ def _place_on_skin(
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
     for bone in dict.fromkeys(bones):
-        candidate, missed = _place_on(layout, index, bone, model, center)
+        candidate, missed = _place_on(layout, index, bone, model, center, point)
         if missed < least:
             best, least = candidate, missed
         if least < _REACHED:
@@ -454,30 +417,39 @@ def _place_on_skin(
 
 
 def _place_on(
-    layout: MarkerLayout, index: int, bone: int, model: HandModel, center: NDArray[np.float64]
+    layout: MarkerLayout,
+    index: int,
+    bone: int,
+    model: HandModel,
+    center: NDArray[np.float64],
+    point: NDArray[np.float64],
 ) -> tuple[MarkerLayout, float]:
-    """The layout with a marker's center on one bone as near to a place as can be, and how far it misses [m].
+    """The layout with a marker on one bone, as near to a center or as much towards a point as can be.
 
-    The layout is the given one, and the distance infinite, where the bone's rays meet no skin.
+    And how far it misses [m]: infinitely where the bone's rays meet no skin.
     """
-    wanted, start = center, model.rest_transforms[bone]
+    height, wanted, start = layout.markers[index].height, center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
     for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
-        moved = _place(layout.markers[index], bone, model, wanted)
+        moved = dataclasses.replace(_place(layout.markers[index], bone, model, wanted), height=height)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
         try:
-            missed = center - attach_markers(candidate, model).points[index]
+            worn = attach_markers(candidate, model)
         except LayoutError:  # beside the skin, as beyond a finger's tip
             wanted = wanted + 0.1 * (middle - wanted)
             continue
+        missed = (point if height else center) - worn.points[index]
+        if height:
+            missed -= (missed @ worn.normals[index]) * worn.normals[index]
         distance = float(np.linalg.norm(missed))
         if distance < least:
             least, best = distance, candidate
-        if least < _NEAR:
+        if least < (_POINTED if height else _NEAR):
             break
-        wanted = wanted + missed
+        # On skin as curved as a finger's tip the end of a stalk moves more than its foot.
+        wanted = wanted + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
     return best, least
 
 

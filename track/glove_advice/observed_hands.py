@@ -14,13 +14,14 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.rig import ROOM_CENTER, CameraRig
-from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import (
     FrameScene,
     GenerateSettings,
     HandFrames,
     observe_scene,
     sample_frame_scene,
+    sample_hands,
+    wear_gloves,
 )
 
 _POSES_EACH: Final = 60  # of a person

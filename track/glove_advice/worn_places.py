@@ -17,8 +17,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import pose_spreads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import GenerateSettings, sample_single_hand
+from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
 
 _TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
 _JOINT_POSES: Final = 6  # of a person, from which the joints' spread is taken

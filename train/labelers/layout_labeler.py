@@ -47,12 +47,13 @@ from train.labelers.protocol import (
 )
 from train.labelers.storage import LEARNED, learned_folder, learned_gloves
 from train.settings import TrainSettings
-from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import (
     FrameSource,
     GenerateSettings,
+    sample_hands,
     sample_single_hand,
     simulate_frames,
+    wear_gloves,
 )
 
 NUM_POSES: Final = 40_000

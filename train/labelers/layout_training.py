@@ -32,8 +32,7 @@ from train.data.batches import Cloud, Corruption, corrupt, stretched
 from train.labelers.layout_labeler import save_layout_network
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.labelers.protocol import torch_threads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import GenerateSettings, sample_frame_scene
+from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least

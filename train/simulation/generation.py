@@ -41,8 +41,7 @@ from train.data.shards import (
     rows_name,
     save_array,
 )
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import FrameSource, GenerateSettings, simulate_frames
+from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
 _SMALL: Final = 50_000_000  # bytes that no disk is asked for

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, get_args
@@ -12,12 +11,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.fit import GlovedHand, GloveFit, wear
+from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
-from handsim.hand.shape import ADULTS, BONES, EVERYBODY, NUM_JOINTS, SIDES, Population, sample_shape
+from handsim.hand.shape import BONES, EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import CameraRig
@@ -33,9 +32,10 @@ from poses.motion import (
     wrist_path,
 )
 from poses.object_motion import keep_apart, point_pen, pointing_path, sample_object_motion
-from poses.shapes import gesture, make_valid, resting_angles
+from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
+from train.simulation.training_frames import sample_hands, wear_gloves
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -47,10 +47,6 @@ SimulatedKind = Literal[
 SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""
-
-NO_REST: Final = "person: fingers overlap at rest"
-"""Reason for which a person is drawn again."""
-_MAX_PEOPLE: Final = 1000
 
 _HAND_OFFSET: Final = 0.22  # from the middle to a hand that touches nothing [m]
 _VOLUME: Final = 0.1  # half side of the cube that the wrist of such a hand stays in [m]
@@ -97,49 +93,6 @@ class SceneMotion:
             motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
             held = dataclasses.replace(held, motion=motion)
         return SceneMotion(hands, held, self.rate)
-
-
-def sample_hands(
-    population: Population, *, redrawn: Counter[str] | None = None, rng: np.random.Generator
-) -> tuple[HandModel, ...]:
-    """A random person's left and right hand, whose fingers do not overlap at rest.
-
-    Those who were drawn again are counted in `redrawn`, by reason.
-    """
-    for _ in range(_MAX_PEOPLE):
-        shape = sample_shape(population, side=SIDES[0], rng=rng)
-        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
-        try:
-            resting_angles(models[0])
-        except PoseError:
-            if redrawn is not None:
-                redrawn[NO_REST] += 1
-            continue
-        return models
-    raise ArgumentError(
-        f"the fingers of all {_MAX_PEOPLE} people drawn from the population overlap at rest, expected a "
-        f"population with smaller spreads than {population}"
-    )
-
-
-def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
-    """Right and left hand of a random adult, for takes."""
-    shape = sample_shape(ADULTS, side="right", rng=rng)
-    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
-
-
-def wear_gloves(
-    layout: MarkerLayout,
-    models: Sequence[HandModel],
-    *,
-    along: float,
-    around: float,
-    rng: np.random.Generator,
-) -> tuple[GloveFit, ...]:
-    """The same glove on each hand, its markers slipped along [bone lengths] and around [rad] the bones."""
-    return tuple(
-        GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
-    )
 
 
 def sample_scene_motion(

@@ -31,12 +31,11 @@ from train.simulation.scenes import (
     SceneMotion,
     SimulatedKind,
     other_markers,
-    sample_adult_hands,
     sample_calibration_scene,
     sample_real_like_scene,
     sample_scene_motion,
-    wear_gloves,
 )
+from train.simulation.training_frames import sample_adult_hands, wear_gloves
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube that wrists stay in [m]; no camera may stand there."""

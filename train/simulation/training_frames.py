@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -13,23 +14,25 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, wear
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
-from handsim.errors import PoseError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, SIDES, Population
+from handsim.hand.shape import ADULTS, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
 from handsim.settings import Expected, Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
 from handsim.space.transforms import pose_matrices, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
-from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, sample_valid_angles
+from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
 from poses.two_hands import sample_two_hand_poses
-from train.simulation.scenes import wear_gloves
 
+NO_REST: Final = "person: fingers overlap at rest"
+"""Reason for which a person is drawn again."""
+_MAX_PEOPLE: Final = 1000
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 """Reason for which a scene of two hands becomes one of a single hand."""
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
@@ -123,6 +126,49 @@ class HandFrames(NamedTuple):
     """Where the system puts each marker [m], NaN where it loses it."""
     ghosts: Float[np.ndarray, "T 4 3"]
     """[m], NaN where there is none."""
+
+
+def sample_hands(
+    population: Population, *, redrawn: Counter[str] | None = None, rng: np.random.Generator
+) -> tuple[HandModel, ...]:
+    """A random person's left and right hand, whose fingers do not overlap at rest.
+
+    Those who were drawn again are counted in `redrawn`, by reason.
+    """
+    for _ in range(_MAX_PEOPLE):
+        shape = sample_shape(population, side=SIDES[0], rng=rng)
+        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
+        try:
+            resting_angles(models[0])
+        except PoseError:
+            if redrawn is not None:
+                redrawn[NO_REST] += 1
+            continue
+        return models
+    raise ArgumentError(
+        f"the fingers of all {_MAX_PEOPLE} people drawn from the population overlap at rest, expected a "
+        f"population with smaller spreads than {population}"
+    )
+
+
+def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
+    """Right and left hand of a random adult, for takes."""
+    shape = sample_shape(ADULTS, side="right", rng=rng)
+    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
+
+
+def wear_gloves(
+    layout: MarkerLayout,
+    models: Sequence[HandModel],
+    *,
+    along: float,
+    around: float,
+    rng: np.random.Generator,
+) -> tuple[GloveFit, ...]:
+    """The same glove on each hand, its markers slipped along [bone lengths] and around [rad] the bones."""
+    return tuple(
+        GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
+    )
 
 
 def simulate_frames(

@@ -27,10 +27,9 @@ from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
-from train.simulation import generation, scenes, training_frames
+from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
-from train.simulation.scenes import NO_REST
-from train.simulation.training_frames import NO_GRASP, NO_TOUCH, GenerateSettings, SceneMix
+from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH, GenerateSettings, SceneMix
 
 CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
@@ -184,9 +183,9 @@ def test_people_are_not_drawn_for_ever(rng, monkeypatch):
     def no_rest(model):
         raise PoseError("this hand's fingers overlap at rest")
 
-    monkeypatch.setattr(scenes, "resting_angles", no_rest)
+    monkeypatch.setattr(training_frames, "resting_angles", no_rest)
     with pytest.raises(ArgumentError, match="the fingers of all 1000 people drawn"):
-        scenes.sample_hands(Population(), rng=rng)
+        training_frames.sample_hands(Population(), rng=rng)
 
 
 def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
@@ -316,8 +315,8 @@ def test_a_set_that_the_disk_has_no_space_for_is_refused(tmp_path):
 
 
 MANIFESTS = {
-    "marker_names": (5, "marker_names is not a list of different names"),
-    "num_frames": (float("nan"), "num_frames is not a whole number of at least 1"),
+    "marker_names": (5, "marker_names is 5, expected a tuple"),
+    "num_frames": (float("nan"), "num_frames is nan, expected a whole number"),
     "files": ({"../../etc/passwd": "0"}, "files is not a table of names of files in this folder"),
     "config": (None, "config is not a table"),
     "redrawn": ([1], "redrawn is not a table of counts"),
