@@ -7,10 +7,8 @@ wrist orientation (wxyz), twenty joint angles [rad]. A `CameraRig` is a set of c
 
 from typing import TYPE_CHECKING
 
-from handsim._kernel_cache import ensure_kernel_cache
-from handsim._lazy import lazy_exports
-from handsim._name_conflicts import ShadowedPackageWarning as ShadowedPackageWarning
-from handsim._name_conflicts import warn_if_shadowed
+from handsim._imports import ShadowedPackageWarning as ShadowedPackageWarning
+from handsim._imports import ensure_kernel_cache, lazy_exports, warn_if_shadowed
 from handsim.errors import HandSimError as HandSimError
 from handsim.errors import HandSimWarning as HandSimWarning
 

@@ -36,11 +36,7 @@ def list_plugins(group: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
-    """What a name stands for, imported now; a class is called without arguments, once.
-
-    The name is `module:name`, or that of an entry point of the group. The current folder is searched last,
-    after everything that is installed.
-    """
+    """What a name stands for, imported now; a class is called without arguments, once."""
     found = _find(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
@@ -60,10 +56,7 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
 
 
 def plugin_name(value: Any) -> str:
-    """How a function or an object is called in records and messages: `module:name`, or its name as it is.
-
-    What has no name of its own is shown as Python shows it, without addresses in memory.
-    """
+    """How a function or an object is called in records and messages: `module:name`, or its name as it is."""
     if isinstance(value, str):
         return value
     if isinstance(value, functools.partial):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, PoseError
-from handsim.files.json_files import package_data
+from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
 from handsim.hand.shape import (
     BONE_NAMES,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array, check_callable, check_choice, check_rng, check_type
 from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError, PoseError
-from handsim.files.json_files import package_data
+from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
 from handsim.settings import Expected, Mixture

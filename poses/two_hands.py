@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError
-from handsim.files.json_files import package_data
+from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion

@@ -25,9 +25,8 @@ from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from handsim.files.inputs import checksum
-from handsim.files.json_files import load_json, save_json
-from handsim.files.outputs import check_free
+from handsim.files.inputs import checksum, load_json
+from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.rig import CameraRig, check_names

@@ -345,10 +345,7 @@ _MOST_LABEL_BYTES: Final = 255
 
 
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a C3D file; points with a negative residual are missing.
-
-    A missing unit is told, and where the file contradicts itself.
-    """
+    """The capture in the bytes of a C3D file; points with a negative residual are missing."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
     parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)

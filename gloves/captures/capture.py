@@ -206,10 +206,7 @@ def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
 
 
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
-    """What tells that clouds are not in meters, if anything does.
-
-    Medians over the frames decide, since strays of a real system lie anywhere.
-    """
+    """What tells that clouds are not in meters, if anything does."""
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
     step = -(-len(shown) // _SAMPLED) or 1
     shown = shown[::step]

@@ -341,10 +341,7 @@ def check_same_rate(name: str, rate: float, other_name: str, other: float) -> No
 def timed_positions(
     positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, tell: Callable[[str], None]
 ) -> tuple[Float[np.ndarray, "T N 3"], float]:
-    """Positions of all frames from the first to the last [m], and their rate [Hz].
-
-    Frames that are missing are NaN, and told, as is a rate that is stated by the times alone.
-    """
+    """Positions of all frames from the first to the last [m], and their rate [Hz]."""
     numbers, times = _increasing_numbers(stated.numbers), _increasing_times(stated)
     steps, stride = np.ones(len(positions) - 1, dtype=np.int64), 1
     if numbers is not None and len(numbers) > 1:

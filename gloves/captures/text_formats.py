@@ -66,11 +66,7 @@ _KEYS: Final = (
 
 
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a TRC file.
-
-    Cells are separated by tabs, or by commas or semicolons where the first line is. Missing frames are told,
-    and a rate that only the column of times states.
-    """
+    """The capture in the bytes of a TRC file."""
     lines, ended = split_lines(data)
     if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
@@ -147,10 +143,7 @@ def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
 
 
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
-    """Names of line 4, one in every three cells; a blank one becomes '*n'. There may be none.
-
-    Some writers put a name in every cell instead; that is accepted only if line 5 has three axes per name.
-    """
+    """Names of line 4, one in every three cells; a blank one becomes '*n'. There may be none."""
     lower = [title.lower() for title in titles[: 2 * _LEADING]]
     if not lower[0].startswith("frame"):
         raise CaptureError(_NO_MARKERS)
@@ -192,10 +185,7 @@ _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Mark
 
 
 def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
-
-    Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
-    """
+    """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out."""
     lines, ended = split_lines(data)
     separator = separator_behind([MOTIVE_BEGIN], lines[0])
     if separator is None:
@@ -239,11 +229,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
-    """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells.
-
-    The take is named after the stem of `title`, since `path` may be a temporary one; an `OSError` if it
-    cannot be written.
-    """
+    """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells."""
     num_frames, num_markers = capture.positions.shape[:2]
     rate = f"{capture.rate:.6f}"
     stated = {
@@ -335,10 +321,7 @@ def vicon_sections(lines: list[bytes]) -> dict[str, int]:
 
 
 def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
-    """The trajectories in the bytes of a Vicon CSV, labeled or not.
-
-    Cells are separated by commas, semicolons or tabs. A missing unit of length, or missing frames, are told.
-    """
+    """The trajectories in the bytes of a Vicon CSV, labeled or not."""
     lines, ended = split_lines(data)
     sections = vicon_sections(lines)
     if _TITLE not in sections:

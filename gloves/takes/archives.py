@@ -156,11 +156,7 @@ class _Block(NamedTuple):
 
 
 class GrownArchive:
-    """Reads an archive that grew, or still grows, up to its last whole block.
-
-    Args:
-        check: Whether checksums are compared.
-    """
+    """Reads an archive that grew, or still grows, up to its last whole block."""
 
     def __init__(self, path: Path, *, check: bool = True) -> None:
         self.path = path
@@ -259,10 +255,7 @@ def is_growing(path: Path) -> bool:
 def finish_archive(
     grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
 ) -> None:
-    """Write an archive that grew in its usual form, whole or not at all, and read it back.
-
-    Memory does not grow with the archive.
-    """
+    """Write an archive that grew in its usual form, whole or not at all, and read it back."""
     with atomic_write(path) as temporary:
         write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
         try:

@@ -53,15 +53,16 @@ from handsim.hand.shape import (
     pack_hand,
     unpack_hand,
 )
-from handsim.motion_files.joint_files import (
+from handsim.motion_files.motion import (
     OPENXR_SUFFIX,
+    Motion,
+    posed_hands,
     write_bvh,
     write_joint_csv,
     write_joint_parquet,
     write_mot,
     write_openxr,
 )
-from handsim.motion_files.motion import Motion, posed_hands
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import UpAxis
@@ -884,10 +885,7 @@ def _check(take: Take) -> None:
 
 
 def _check_values(take: Take) -> None:
-    """Raise a `ValueError` for numbers that nothing can be computed with.
-
-    These are times and rates beyond all clocks, and orientations whose quaternions have not unit length.
-    """
+    """Raise a `ValueError` for numbers that nothing can be computed with."""
     _check_range(take.times, -_LATEST, _LATEST)
     _check_range(np.array(take.rate), 1.0 / _LATEST, _LATEST)
     for poses in (take.qpos, take.body_poses):

@@ -18,8 +18,7 @@ from upath import UPath
 from handsim.app.workers import Job
 from handsim.errors import ArgumentError, HandSimError, shortened
 from handsim.files.inputs import checksum
-from handsim.files.json_files import claim
-from handsim.files.outputs import remove_abandoned, remove_leftovers, temporary_beside
+from handsim.files.outputs import claim, remove_abandoned, remove_leftovers, temporary_beside
 
 Make = Callable[[Path, int], int]
 """Takes a folder and a number, leaves the number's files in the folder, and returns the number."""
@@ -88,7 +87,7 @@ class Output:
         grows: str = "",
         result: str | None = None,
     ) -> None:
-        """Claim the folder by a settings file of this name, see `handsim.files.json_files.claim`."""
+        """Claim the folder by a settings file of this name, see `handsim.files.outputs.claim`."""
         path = self.folder / name
         if self.is_here:
             old = None if result is None else self.folder / result

@@ -26,7 +26,7 @@ from typing import Any, Final
 from handsim._checks import check_count
 from handsim._plugins import import_extra
 from handsim.errors import ArgumentError, DatasetError, HandSimError
-from handsim.files.json_files import load_json
+from handsim.files.inputs import load_json
 
 Job = Callable[[int], int]
 """Takes a number, leaves files that depend on nothing else, and returns the number; it can be pickled."""

@@ -17,8 +17,7 @@ from typing import Final
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from handsim._kernel_cache import VARIABLE, kernel_cache
-from handsim._name_conflicts import SIBLINGS, shadowed_siblings
+from handsim._imports import SIBLINGS, VARIABLE, kernel_cache, shadowed_siblings
 from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 

@@ -34,8 +34,7 @@ def evaluate(
     """
     import numpy as np
 
-    from handsim.files.json_files import save_json
-    from handsim.files.outputs import check_outputs
+    from handsim.files.outputs import check_outputs, save_json
     from train.evaluation import evaluate_labeler, print_figures
     from train.labelers.protocol import label_on
     from train.labelers.storage import load_labeler

@@ -81,10 +81,7 @@ class BodyMotion:
 
 
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
-    """A motion from poses some of which (NaN), but not all, are missing: linear from pose to pose.
-
-    The hand keeps its first pose before it, and its last pose after it.
-    """
+    """A motion from poses some of which (NaN), but not all, are missing: linear from pose to pose."""
     from scipy.spatial.transform import Rotation, Slerp
 
     there = np.flatnonzero(np.isfinite(qpos[:, 0]))

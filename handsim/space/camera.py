@@ -464,10 +464,7 @@ def points_in_view(
 
 @kernel(inline=True)
 def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
-    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture.
-
-    The camera is its rows of `CameraArrays`: intrinsics, sizes and lenses.
-    """
+    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture."""
     u, v = x / z, y / z
     if lens[0] != PINHOLE:  # the call costs more than all the rest
         u, v = distort_ray(lens, x, y, z)

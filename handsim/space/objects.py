@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, ObjectError, shortened
-from handsim.files.inputs import check_regular
-from handsim.files.json_files import package_data
+from handsim.files.inputs import check_regular, package_data
 from handsim.space.transforms import axis_angle_matrix
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]

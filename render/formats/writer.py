@@ -17,8 +17,8 @@ from typing import Any, Final, Protocol
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.json_files import load_json, save_json
-from handsim.files.outputs import check_free
+from handsim.files.inputs import load_json
+from handsim.files.outputs import check_free, save_json
 from render.formats.coco import CocoWriter, InterhandWriter, YoloWriter
 from render.formats.freihand import FreihandWriter
 from render.formats.records import to_json, write_exr

@@ -27,8 +27,7 @@ from handsim._checks import check_type
 from handsim.app.output import Place, place_of
 from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutError
 from handsim.files.arrays import check_npy_header
-from handsim.files.inputs import checksum
-from handsim.files.json_files import load_json
+from handsim.files.inputs import checksum, load_json
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import HAND_DTYPE, NUM_QPOS, HandShape, unpack_hand
 from handsim.settings import Limits, Settings

@@ -21,8 +21,8 @@ from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
-from handsim.files.json_files import load_json, save_json
-from handsim.files.outputs import check_free
+from handsim.files.inputs import load_json
+from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
