@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.inputs import package_data
-from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos, load_model
 from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape
 from handsim.settings import Limits, Settings
 from handsim.space.rig import ROOM_CENTER

@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.capsules import overlap_between
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import axis_angle_matrix, pose_matrices, transform_poses
 from poses.grasps import (

@@ -15,8 +15,7 @@ from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions

@@ -41,7 +41,7 @@ def test_hands_are_tracked_to_a_millimeter(truth, tracked):
     take, _ = truth
     result, _ = tracked
     for hand in take.moving_hands():
-        place = result.hand(hand.shape.side)
+        place = result.hand_index(hand.shape.side)
         there = np.isfinite(result.qpos[:, place, 0])
         assert there.mean() >= 0.98
         model = HandModel(hand.shape)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import BONES, EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import RigidObject, named_object

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.errors import PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices
 from poses.grasps import object_penetration
