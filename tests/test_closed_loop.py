@@ -13,7 +13,7 @@ from handsim.hand.model import HandModel, hand_keypoints
 from render import RenderConfig, draw
 from render.viewpoints import ViewConfig
 from track.captures import track_capture
-from train.simulation.takes import TakeConfig
+from train.simulation.takes import SimulateSettings
 
 MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0
@@ -23,7 +23,7 @@ FRAMES = 120
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
-    simulate(folder / "take.c3d", TakeConfig(kind="hand-hand", num_frames=FRAMES))
+    simulate(folder / "take.c3d", SimulateSettings(kind="hand-hand", num_frames=FRAMES))
     return load_take(folder / "take.truth.npz"), folder
 
 
