@@ -49,8 +49,7 @@ from train.labelers.layout_labeler import learned_labeler, mean_features, shippe
 from train.labelers.layout_training import sample_places
 from train.labelers.matching import match_probabilities, pair_probabilities
 from train.labelers.protocol import labeling_threads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, sample_single_hand
+from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
 
 _PEOPLE, _POSES_EACH = 40, 40
 _JOINT_POSES: Final = 6  # poses of a person from which the joints' spread is taken
@@ -228,13 +227,13 @@ class WornPlaces:
     def __init__(
         self, num_people: int, poses_each: int, radius: float, rig: CameraRig, *, rng: np.random.Generator
     ) -> None:
-        config = DatasetConfig()
+        config = GenerateSettings()
         self._radius, self._rig, self._rng = radius, rig, rng
         self._slip = config.slip_along, float(np.deg2rad(config.slip_around))
         self._people: list[tuple[HandModel, Float[np.ndarray, "T 27"], Float[np.ndarray, "T L 4 4"]]] = []
         for _ in range(num_people):
             model = sample_hands(config.population, rng=rng)[SIDES.index("right")]
-            (qpos,) = sample_single_hand(model, poses_each, config.poses, config.volume, rng=rng).qpos
+            (qpos,) = sample_single_hand(model, poses_each, config, rng=rng).qpos
             self._people.append((model, qpos, model.forward_kinematics(qpos)))
 
     def put_on(self, places: Sequence[MarkerPlace]) -> Columns:

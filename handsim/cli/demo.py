@@ -7,8 +7,7 @@ import tempfile
 from pathlib import Path
 
 from handsim._checks import check_count
-from handsim.app.messages import print_line, print_table
-from handsim.app.progress import named_steps
+from handsim.app.messages import named_steps, print_line, print_table
 from handsim.files.outputs import atomic_write, written_together
 from handsim.pages import write_sections
 

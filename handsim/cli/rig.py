@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import numpy as np
 import tyro
 
-from handsim.app.messages import print_line, print_table
-from handsim.app.progress import named_steps
+from handsim.app.messages import named_steps, print_line, print_table
 from handsim.errors import RigError
 from handsim.files.outputs import (
     as_text,

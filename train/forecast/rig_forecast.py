@@ -21,7 +21,7 @@ from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, PoseError
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion
 from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (
@@ -39,17 +39,17 @@ from train.simulation.scenes import (
     MovingObject,
     SceneMotion,
     SimulatedKind,
-    sample_hands,
     sample_real_like_scene,
-    wear_gloves,
 )
 from train.simulation.takes import sample_scene
 from train.simulation.training_frames import (
-    DatasetConfig,
     FrameScene,
+    GenerateSettings,
     HandFrames,
     observe_scene,
     sample_frame_scene,
+    sample_hands,
+    wear_gloves,
 )
 
 HALF_SIDE: Final = 0.3
@@ -169,11 +169,11 @@ def observe_poses(
     layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
 ) -> list[ObservedHand]:
     """Random people's hands in the poses and scenes of training sets; at least so many frames in all."""
-    config, observed, done = DatasetConfig(), [], 0
+    config, observed, done = GenerateSettings(), [], 0
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     while done < num_frames:
         models = sample_hands(config.population, rng=rng)
-        scene = sample_frame_scene(models, _POSES_EACH, config.scenes, config.poses, config.volume, rng=rng)
+        scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
         fits = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         hands = list(_observe(scene, fits, rig, rng))
         observed += hands
@@ -200,7 +200,7 @@ def observe_motion(
 def _observe(
     scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
 ) -> Iterator[ObservedHand]:
-    config = DatasetConfig()
+    config = GenerateSettings()
     # Single frames do not continue points, so that two rays are enough, as for points that exist already.
     optics = dataclasses.replace(config.optics, min_rays_to_start=config.min_cameras)
     frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)

@@ -9,7 +9,7 @@ from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.errors import CaptureError
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion
 from handsim.space.camera import look_at
 from handsim.space.rig import named_rig
 from handsim.space.transforms import pose_matrices
