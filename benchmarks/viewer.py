@@ -18,9 +18,9 @@ from websockets.sync.client import ClientConnection, connect
 from benchmarks.record import describe
 from gloves.takes.take import load_take
 from track.streams import LOOPBACK
-from track.viewer.frame_view import FrameView
+from track.viewer import opened_server
 from track.viewer.recordings import TakeRecording
-from track.viewer.server import opened_server
+from track.viewer.stage import FrameView
 from track.viewer.timeline import Timeline
 
 

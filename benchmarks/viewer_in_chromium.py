@@ -27,8 +27,8 @@ import viser
 
 from gloves.takes.take import LOST, Take, load_take
 from track.streams import LOOPBACK
+from track.viewer import address_of, opened_server
 from track.viewer.contents import open_content
-from track.viewer.server import address_of, opened_server
 
 SPAN = 61
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
@@ -20,6 +19,7 @@ from track.config import Size
 from track.frames import TrackedFrame
 
 if TYPE_CHECKING:
+    from gloves.takes.take import Take
     from track.captures import OnFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
@@ -75,13 +75,11 @@ def track(
             so on, other points Unlabeled1, Unlabeled2, ...
     """
     from gloves.captures.formats import write_capture
-    from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
     from track.live import track_live
     from track.settings import TrackerSetup, TrackSettings
     from track.sinks import open_sinks
     from track.streams.frame_source import StreamedFrame
-    from track.tracker import warm_up
 
     _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
@@ -97,16 +95,13 @@ def track(
             tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
             setup = TrackerSetup.of(settings)
-            with Console(stderr=True).status("getting ready"):
-                warm_up(setup.user, setup.labeler)
-            tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
+            tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
             if labeled is not None:  # after the recording, which nobody can make again
-                write_capture(
-                    labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture()
-                )
+                write_capture(labeled, tracked.whole_take(out).labeled_capture())
+    assert tracked.take is not None  # it was recorded
     if shape is not None and glove is None:
         print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _tell(out, tracked, float(np.median(times)))
+    _tell(out, tracked.take, tracked.num_frames, tracked.notes, 1e3 * float(np.median(times)))
 
 
 def _track_file(
@@ -147,18 +142,17 @@ def _track_file(
     return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))
 
 
-def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
-    """Print what was tracked, and warn of what looks wrong; `seconds` is the time of the median frame."""
+def _tell(out: Path, take: Take, frames: int, notes: tuple[str, ...], milliseconds: float) -> None:
+    """Print what was tracked, in which time per frame, and warn of what looks wrong."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
 
-    take, frames = tracked.take, tracked.num_frames
     _, measured, size = take.settings["user"].partition(MEASURED)
     lines = [f"size of the hands: {size}"] if measured else []
     if take.settings["user"].startswith("calibrated on"):
         lines = take.settings["user"].split("; ")
     lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*lines, *tracked.notes, *summarize(take), f"{1e3 * seconds:.2f} ms per frame"):
+    for line in (*lines, *notes, *summarize(take), f"{milliseconds:.2f} ms per frame"):
         print_line(line)
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
