@@ -101,8 +101,8 @@ def main() -> None:
         drawn = [sphere_and_wall(face.at(np.eye(4))) for face in faces]
         depths, directions, colors = (list(kind) for kind in zip(*drawn, strict=True))
         ids = [np.ascontiguousarray(color[..., 0]) for color in colors]
-        clock("colors", lambda c=lensed, p=colors: warp(c, p, "linear"), repeats)
-        clock("ids", lambda c=lensed, p=ids: warp(c, p, "nearest"), repeats)
+        clock("colors", lambda c=lensed, p=colors: warp(c, p, cv2.INTER_LINEAR), repeats)
+        clock("ids", lambda c=lensed, p=ids: warp(c, p), repeats)
         clock("depth", lambda c=lensed, p=depths: warp_depth(c, p), repeats)
         clock("normals", lambda c=lensed, p=directions: warp_normals(c, p), repeats)
 

@@ -15,11 +15,10 @@ from typing import Annotated, Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim._checks import check_choice
-from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, Lens, camera_matrix
@@ -59,36 +58,23 @@ class StructuredLight:
     """What is measured at all [m]."""
 
 
-def measure_disparity(
-    depth: Float32[np.ndarray, "H W"],
-    cosines: Float32[np.ndarray, "H W"] | None,
-    noise: StructuredLight,
-    focal: float,
-    *,
-    rng: np.random.Generator,
-) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
-
-    Cosines are of the angles between normals and the rays that come back (None: all surfaces face), `focal`
-    is the camera's horizontal focal length [px].
-    """
+def _measure_disparity(
+    depth: Floats, cosines: Floats, noise: StructuredLight, focal: float, *, rng: np.random.Generator
+) -> Floats:
+    """Depth (H, W) as the sensor has it [m], 0 where it has none; `focal` is horizontal [px]."""
     scale, height, width = np.float32(noise.baseline * focal), *depth.shape
     with np.errstate(divide="ignore"):
         ideal = np.where(depth > 0.0, scale / depth, np.float32(0.0))
     kept = (depth >= noise.nearest) & (depth <= noise.farthest)
-    if cosines is not None:
-        kept &= cosines >= np.cos(noise.steepest)
+    kept &= cosines >= np.cos(noise.steepest)
     if noise.support > 0.0:
         coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
         needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
         _keep_supported(ideal, needed.astype(np.int64), int(noise.agreement * _FIXED), kept)
     if noise.shadow:
-        _keep_lit(ideal, kept)
-    if max(noise.shift, noise.disparity_noise, noise.step) <= 0.0:
-        return np.where(kept, depth, np.float32(0.0))
-    moved, wavering = noise.shift > 0.0, noise.disparity_noise > 0.0
-    shifts = random_words((2, height, width) if moved else (2, 0, 0), rng=rng)
-    words = random_words((height, width) if wavering else (0, 0), rng=rng)
+        keep_lit(ideal, kept)
+    shifts = random_words((2, height, width) if noise.shift > 0.0 else (2, 0, 0), rng=rng)
+    words = random_words((height, width) if noise.disparity_noise > 0.0 else (0, 0), rng=rng)
     measured = np.zeros_like(depth)
     table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
     step = np.float32(noise.step)
@@ -96,26 +82,15 @@ def measure_disparity(
     return measured
 
 
-def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels that a nearer surface hides from the projector, which stands to the right in the same row.
+@kernel
+def keep_lit(disparity: Floats, kept: Flags) -> None:
+    """Clear pixels of `kept` (H, W) that a nearer surface hides from the projector, to the right in the row.
 
     A pixel of disparity d is d columns further left in the projector's picture. Where several pixels fall on
     one of its columns, the nearest one is visible to it.
     """
-    lit = np.ones(disparity.shape, np.bool_)
-    _keep_lit(disparity, lit)
-    return ~lit
-
-
-@kernel
-def _keep_lit(disparity: Floats, kept: Flags) -> None:
-    """Clear what is `shadowed` of `kept` (H, W)."""
     height, width = disparity.shape
-    most = (
-        np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
-        if disparity.size
-        else np.float32(1.0)
-    )
+    most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
     first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
     for row in range(height):
         first[:] = 0.0
@@ -230,23 +205,20 @@ class TimeOfFlight:
     """What is measured at all [m]."""
 
 
-def measure_flight(
-    depth: Float32[np.ndarray, "H W"],
-    cosines: Float32[np.ndarray, "H W"] | None,
-    reflectance: Float32[np.ndarray, "H W"] | None,
-    noise: TimeOfFlight,
-    *,
-    rng: np.random.Generator,
-) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
-
-    Cosines are of the angles between normals and the rays that come back (None: all surfaces face),
-    reflectance the share of light that surfaces send back (None: all are white walls).
-    """
+def _measure_flight(
+    depth: Floats, cosines: Floats, reflectance: Floats, noise: TimeOfFlight, *, rng: np.random.Generator
+) -> Floats:
+    """Depth (H, W) as the sensor has it [m], 0 where it has none."""
     there = depth > 0.0
     measured = _mixed(depth, noise, rng=rng)
-    sigma = _sigma(depth, cosines, reflectance, noise)
-    if sigma is not None:
+    c0, c1, c2 = (np.float32(c) for c in noise.sigma)
+    if any(noise.sigma) or noise.angle_sigma:
+        sigma = (c2 * depth + c1) * depth + c0
+        if noise.angle_sigma > 0.0:
+            bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+            sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
+        # Shot noise goes with the root of the light.
+        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
         measured += sigma * normal_numbers(depth.shape, rng=rng)
     measured += np.float32(noise.offset)
     if noise.step > 0.0:
@@ -259,8 +231,6 @@ def measure_flight(
 def _mixed(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> Floats:
     """Depth with flying pixels along edges, and 0 where an edge is not measured."""
     mixed = depth.copy()
-    if noise.flying + noise.dropped <= 0.0:
-        return mixed
     around = np.ones((3, 3), np.uint8)
     far = cv2.dilate(depth, around)
     near = cv2.erode(np.where(depth > 0.0, depth, _NOTHING), around)
@@ -278,45 +248,25 @@ def _mixed(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> F
     return mixed
 
 
-def _sigma(
-    depth: Floats, cosines: Floats | None, reflectance: Floats | None, noise: TimeOfFlight
-) -> Floats | None:
-    """Standard deviation of each pixel [m]; None: there is none."""
-    c0, c1, c2 = (np.float32(c) for c in noise.sigma)
-    if not (any(noise.sigma) or noise.angle_sigma):
-        return None
-    sigma = (c2 * depth + c1) * depth + c0
-    if cosines is not None and noise.angle_sigma > 0.0:
-        bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
-        sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
-    if reflectance is not None:  # shot noise: as the root of the light
-        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
-    return sigma
-
-
 def _drop_weak(
     there: Flags,
     depth: Floats,
-    cosines: Floats | None,
-    reflectance: Floats | None,
+    cosines: Floats,
+    reflectance: Floats,
     noise: TimeOfFlight,
     *,
     rng: np.random.Generator,
 ) -> None:
     """Take out what is too steep and, within half of the least light above and below it, too dark."""
-    if cosines is not None:
-        last = np.cos(noise.steepest - _FADING)
-        steep = np.flatnonzero(there & (cosines < last))
-        chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
-        there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
+    last = np.cos(noise.steepest - _FADING)
+    steep = np.flatnonzero(there & (cosines < last))
+    chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
+    there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
     if noise.weakest <= 0.0:
         return
-    light = np.float32(1.0) if reflectance is None else reflectance
-    if cosines is not None:
-        light = light * cosines
+    light = reflectance * cosines
     dim = np.flatnonzero(there & (light < np.float32(1.5 * noise.weakest) * depth * depth))
-    bright = np.broadcast_to(light, depth.shape).ravel()[dim] / depth.ravel()[dim] ** 2
-    chance = 1.5 - bright / noise.weakest
+    chance = 1.5 - light.ravel()[dim] / depth.ravel()[dim] ** 2 / noise.weakest
     there.ravel()[dim] = rng.random(len(dim), dtype=np.float32) > chance
 
 
@@ -398,31 +348,22 @@ def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> Dept
 
 def apply_depth_noise(
     depth: Float32[np.ndarray, "H W"],
-    normals: Float32[np.ndarray, "H W 3"] | None,
-    noise: DepthNoise | None,
+    normals: Float32[np.ndarray, "H W 3"],
+    noise: DepthNoise,
     *,
     camera: Camera,
-    reflectance: Float32[np.ndarray, "H W"] | None = None,
+    reflectance: Float32[np.ndarray, "H W"] | None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
     """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
 
-    Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
-    infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
-    nothing.
+    Normals are in the camera's axes. The reflectance for infrared light counts for time of flight alone.
     """
-    shape = camera.size[1], camera.size[0]
-    for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
-        if picture is not None and picture.shape[:2] != shape:
-            raise ArgumentError(
-                f"{name} has shape {picture.shape}, expected {shape} as camera '{camera.name}' has"
-            )
-    if noise is None:
-        return depth.copy()
-    cosines = None if normals is None else _facing(normals, camera)
+    cosines = _facing(normals, camera)
     if isinstance(noise, StructuredLight):
-        return measure_disparity(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
-    return measure_flight(depth, cosines, reflectance, noise, rng=rng)
+        return _measure_disparity(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
+    assert reflectance is not None
+    return _measure_flight(depth, cosines, reflectance, noise, rng=rng)
 
 
 def _facing(normals: Floats, camera: Camera) -> Floats:
@@ -464,8 +405,7 @@ def _back(size: tuple[int, int], middle: tuple[float, float, float, float], lens
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
-    light: Floats = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
-    return light
+    return np.asarray(cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance()))
 
 
 @functools.cache

@@ -23,8 +23,7 @@ from render.frames import Doubles, Floats
 def quantiles() -> Float32[np.ndarray, "65536"]:
     """Quantiles of the standard normal at the middle of each sixteen-bit number's share."""
     table = ndtri((np.arange(65536) + 0.5) / 65536)
-    scaled: Floats = (table / table.std()).astype(np.float32)
-    return scaled
+    return np.asarray((table / table.std()).astype(np.float32))
 
 
 def random_words(shape: tuple[int, ...], *, rng: np.random.Generator) -> UInt16[np.ndarray, "..."]:
@@ -77,8 +76,14 @@ def _add_octave(positions: Doubles, start: Doubles, scale: float, knots: Floats,
 def smooth(values: NDArray[Any], low: float | NDArray[Any], high: float | NDArray[Any]) -> NDArray[Any]:
     """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    smoothed: NDArray[Any] = share * share * (3.0 - 2.0 * share)
-    return smoothed
+    return np.asarray(share * share * (3.0 - 2.0 * share))
+
+
+def along_segment(points: Doubles, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
+    """How far along a segment in a plane points (N, 2) are, 0 to 1, and how far from it."""
+    way = end - start
+    along = np.clip((points - start) @ way / (way @ way), 0.0, 1.0)
+    return along, np.linalg.norm(points - start - along[:, None] * way, axis=1)
 
 
 def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:

@@ -30,7 +30,6 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
-    Flags,
     Floats,
     HandTruth,
     Pictures,
@@ -38,7 +37,7 @@ from render.frames import (
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
-from render.painting.rasterizer import NEAR, faces_for, join, rasterize, warp, warp_depth, warp_normals
+from render.painting.rasterizer import NEAR, Geometry, faces_for, see, warp
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
@@ -53,7 +52,7 @@ def hand_truth(
     qpos: Float[np.ndarray, "27"],
     number: int,
     camera: Camera,
-    pictures: Pictures,
+    pictures: Geometry,
     *,
     recorded: bool = True,
 ) -> HandTruth:
@@ -64,7 +63,6 @@ def hand_truth(
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     pixels = camera.project(keypoints)
-    assert pictures.parts is not None
     worn = figure.look.glove is not None
     return HandTruth(
         shape=model.shape,
@@ -80,14 +78,13 @@ def hand_truth(
 
 
 def _visible(
-    keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Pictures
+    keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
 ) -> Bool[np.ndarray, "21"]:
     """Keypoints whose pixel shows the finger that they are in.
 
     The pixel is one of this hand, of the keypoint's digit (or of the palm, where it is at its edge), and the
     keypoint is no deeper under the surface there than the finger is thick.
     """
-    assert pictures.parts is not None and pictures.instances is not None and pictures.depth is not None
     width, height = camera.size
     inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
@@ -99,8 +96,7 @@ def _visible(
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
     # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
-    visible: Flags = own & np.where(ahead, under <= thickness, True)
-    return visible
+    return np.asarray(own & np.where(ahead, under <= thickness, True))
 
 
 def _allowed_parts() -> Bool[np.ndarray, "21 32"]:
@@ -136,14 +132,10 @@ class FrameChoices:
 
     lighting: Lighting
     background: Background
-    exposure: Exposure | None
-    """None for a perfect color sensor."""
-    shutter: Shutter | None
-    """None for a picture of a moment."""
-    depth_noise: DepthNoise | None
-    """None for a perfect depth sensor."""
-    seed: int
-    """Seed of the sensors' noise."""
+    exposure: Exposure | None  # None for a perfect color sensor
+    shutter: Shutter | None  # None for a picture of a moment
+    depth_noise: DepthNoise | None  # None for a perfect depth sensor
+    seed: int  # seed of the sensors' noise
     enclosure: Enclosure | None = None
     """The box whose walls have the background, for several cameras; None: a picture without depth."""
 
@@ -239,8 +231,9 @@ class Studio:
         drawn = self._still(moment)
         _check_outside(camera, drawn, frame)
         present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
-        noisy = "depth" in self.passes and choices.depth_noise is not None
-        truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
+        sensor = choices.depth_noise if "depth" in self.passes else None
+        surfaces = [one.triangles for one in drawn]
+        truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
@@ -248,8 +241,8 @@ class Studio:
         seen = truth
         if choices.enclosure is not None:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
-        if noisy:
-            noisy_depth = self._noisy_depth(seen, rgb, present, camera, choices.depth_noise, rng)
+        if sensor is not None:
+            noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)
         hands = tuple(
             hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth, recorded=recorded)
             for index, number in enumerate(present)
@@ -281,7 +274,7 @@ class Studio:
         for number, hand in enumerate(self._hands):
             pose = moment.hand(number)
             if pose is not None:
-                elbow, forearm = hand.forearm_line(pose)
+                elbow, forearm = hand.skin.forearm_line(pose)
                 there.append(number)
                 elbows.append(elbow)
                 forearms.append(forearm)
@@ -317,40 +310,17 @@ class Studio:
                 drawn += body.drawn(T_world_body, number)
         return drawn
 
-    def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
-        """Depth, normals and ids through the camera's lens."""
-        surface = join([one.triangles for one in drawn]) if drawn else None
-        width, height = camera.size
-        if surface is None:
-            flat = np.zeros((height, width), dtype=np.uint8)
-            bare = np.zeros((height, width, 3), dtype=np.float32)
-            return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
-        faces = [rasterize(face, surface, with_normals=with_normals) for face in faces_for(camera)]
-        if camera.lens.kind == "pinhole":
-            return faces[0]
-        normals = [face.normals for face in faces if face.normals is not None]
-        ids = (
-            warp(camera, [getattr(face, name) for face in faces], "nearest")
-            for name in ("parts", "instances", "markers")
-        )
-        return Pictures(
-            None,
-            warp_depth(camera, [face.depth for face in faces if face.depth is not None]),
-            warp_normals(camera, normals) if normals else None,
-            *ids,
-        )
-
     def _noisy_depth(
         self,
-        truth: Pictures,
+        truth: Geometry,
         rgb: Bytes | None,
         present: Sequence[int],
         camera: Camera,
-        sensor: DepthNoise | None,
+        sensor: DepthNoise,
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "H W"]:
         """Depth as the sensor has it; only the part of the picture that has depth takes time."""
-        assert truth.depth is not None
+        assert truth.normals is not None
         noisy = np.zeros_like(truth.depth)
         left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
         if width == 0:
@@ -361,17 +331,12 @@ class Studio:
         )
         left, top = max(0, left - _AROUND), max(0, top - _AROUND)
         part = np.s_[top:bottom, left:right]
-        cut = {name: getattr(truth, name) for name in ("depth", "normals", "instances")}
-        inner = dataclasses.replace(
-            truth, **{name: None if picture is None else picture[part] for name, picture in cut.items()}
-        )
-        assert inner.depth is not None
         light = None
         if isinstance(sensor, TimeOfFlight):  # others need none
-            light = self._infrared(inner, None if rgb is None else rgb[part], present)
+            light = self._infrared(truth.instances[part], None if rgb is None else rgb[part], present)
         noisy[part] = apply_depth_noise(
-            inner.depth,
-            inner.normals,
+            truth.depth[part],
+            truth.normals[part],
             sensor,
             camera=camera.part(left, top, right - left, bottom - top),
             reflectance=light,
@@ -379,16 +344,12 @@ class Studio:
         )
         return noisy
 
-    def _infrared(
-        self, truth: Pictures, rgb: Bytes | None, present: Sequence[int]
-    ) -> Float32[np.ndarray, "H W"]:
-        """Infrared reflectance of each pixel, from its color; bare skin has its own."""
-        assert truth.instances is not None
-        shape = truth.instances.shape
-        infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
+    def _infrared(self, instances: Bytes, rgb: Bytes | None, present: Sequence[int]) -> Floats:
+        """Infrared reflectance of each pixel (H, W), from its color; bare skin has its own."""
+        infrared = np.ones(instances.shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
         for index, number in enumerate(present):
             if self._people[number].glove is None:
-                infrared[truth.instances == index + 1] = self._people[number].skin.infrared
+                infrared[instances == index + 1] = self._people[number].skin.infrared
         return infrared
 
     def _colors_of(
@@ -396,7 +357,7 @@ class Studio:
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The perfect color picture."""
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
-        whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
+        whole = warp(camera, painted, cv2.INTER_LINEAR)
         if choices.enclosure is None:
             return put_before(whole, self._behind(camera, drawn, choices))
         behind = draw_surroundings(choices.background, choices.enclosure, camera)
@@ -412,8 +373,7 @@ class Studio:
         light = light_behind(camera, drawn, choices.lighting, backdrop)
         if light is None:
             return plain
-        lit: Floats = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
-        return lit
+        return np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
 
     def _exposed(
         self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
@@ -430,7 +390,7 @@ class Studio:
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
-    def _requested(self, truth: Pictures, rgb: Bytes | None) -> Pictures:
+    def _requested(self, truth: Geometry, rgb: Bytes | None) -> Pictures:
         ids = "ids" in self.passes
         return Pictures(
             rgb,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -60,19 +60,16 @@ class Framing:
 
     def middle(self) -> Float[np.ndarray, "3"]:
         """Middle of all places where the hands are [m]."""
-        middle: Doubles = 0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0))
-        return middle
+        return np.asarray(0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0)))
 
     def followed(self) -> Float[np.ndarray, "T 3"]:
         """The centers as a person with a camera follows them [m]: without what is quicker than a second."""
-        smooth: Doubles = uniform_filter1d(self.centers, self._window, axis=0, mode="nearest")
-        return smooth
+        return np.asarray(uniform_filter1d(self.centers, self._window, axis=0, mode="nearest"))
 
     def held(self, distances: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
         """Distances that change slowly and are nowhere shorter than these [m]."""
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
-        slow: Doubles = uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest")
-        return slow
+        return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
     def sides(
         self, rotations: Float[np.ndarray, "F 3 3"], frames: Int[np.ndarray, "F"] | None = None
@@ -138,8 +135,7 @@ class Framing:
         shifts = np.zeros((len(centers), 2))
         shifts[there] = 0.5 * distances[there, None] * (np.nanmin(rays, axis=1) + np.nanmax(rays, axis=1))
         shifts = uniform_filter1d(shifts, self._window, axis=0, mode="nearest")
-        moved: Doubles = centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts)
-        return moved
+        return np.asarray(centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts))
 
     def _rows(self, frames: Integers | None) -> tuple[Floats, Flags]:
         if frames is None:
@@ -159,8 +155,7 @@ def half_view(camera: Camera) -> Float[np.ndarray, "2"]:
     rays = camera.unproject(np.array([[0.0, cy], [width, cy], [cx, 0.0], [cx, height]]))
     ahead = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
     tangents = np.nan_to_num(np.abs(rays[:, :2]).max(axis=1) / ahead, nan=_WIDEST)
-    half: Doubles = (1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST)
-    return half
+    return np.asarray((1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST))
 
 
 def looking(directions: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3 3"]:
@@ -263,10 +258,8 @@ class _Path(NamedTuple):
     """A camera on its way."""
 
     camera: Camera
-    poses: Doubles
-    """(T, 4, 4)."""
-    zoom: Doubles | None = None
-    """Factor on its focal lengths (T,); None: it keeps them."""
+    poses: Doubles  # (T, 4, 4)
+    zoom: Doubles | None = None  # factor on its focal lengths (T,); None: it keeps them
 
     def at(self, frame: int) -> Camera:
         """The camera of one frame."""
@@ -280,18 +273,16 @@ class Viewpoints:
     """Cameras of every frame."""
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
-        if config.cameras is not None:
-            own = config.cameras
+        framing, own = Framing(take), config.cameras
+        if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
-            self._centers = hand_centers(take)
         else:
-            framing = Framing(take)
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-            self._centers = framing.centers
+        self._centers = framing.centers
 
     @property
     def num_cameras(self) -> int:
@@ -310,11 +301,6 @@ class Viewpoints:
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
         return [path.at(frame) for path in self._paths]
-
-
-def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
-    """Middle of the box around the hands of each frame [m]; interpolated over frames without hands."""
-    return Framing(take).centers
 
 
 def _along(take: Take) -> Doubles:
@@ -530,8 +516,7 @@ def _behind_arms(qpos: Doubles, positions: Doubles) -> Flags:
     back = -(away * along).sum(axis=-1)
     behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
     beside = np.linalg.norm(away + np.clip(back, 0.0, _ARM)[..., None] * along, axis=-1) < _ARM_DISTANCE
-    hidden: Flags = (behind | beside).any(axis=1)
-    return hidden
+    return np.asarray((behind | beside).any(axis=1))
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
@@ -582,11 +567,11 @@ def zoomed(camera: Camera, zoom: float) -> Camera:
     return dataclasses.replace(camera, K=K)
 
 
-def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
-    """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
-
-    Cameras among them without a hand are told.
-    """
+def check_hands_in_view(config: ViewConfig, viewpoints: Viewpoints, take: Take) -> None:
+    """Refuse the user's own cameras if none has a hand in its pictures, and warn of those that have none."""
+    if config.cameras is None:
+        return
+    cameras, name = viewpoints.cameras(0), config.own_cameras
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
         there = qpos[np.isfinite(qpos).all(axis=1)]

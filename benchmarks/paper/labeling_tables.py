@@ -19,7 +19,7 @@ from benchmarks.record import Figures, save_figures
 from gloves.captures.capture import count_gaps, run_lengths
 from gloves.captures.formats import find_captures, read_markers
 from gloves.takes.take import Take
-from handsim.app.progress import progress_bar
+from handsim.app.messages import progress_bar
 from handsim.errors import HandSimError
 from train.data.batches import Corruption, paper_corruption
 from train.data.shards import Dataset
@@ -27,7 +27,7 @@ from train.evaluation import LabelingReport, evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler, shipped_labelers
 from train.loop import train_labeler
-from train.settings import Kind, default_config
+from train.settings import Kind, usual_settings
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
@@ -100,7 +100,7 @@ def table2(
 
 def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samples: int, seed: int) -> None:
     drawn = augmentations(len(dataset.marker_names))[name]
-    usual = dataclasses.replace(default_config(kind), samples=samples, seed=seed, rig_share=0.0)
+    usual = dataclasses.replace(usual_settings(kind), samples=samples, seed=seed, rig_share=0.0)
     config = dataclasses.replace(usual, occlude=drawn.occlude, ghosts=drawn.ghosts)
     with progress_bar("samples") as bar:
         train_labeler(

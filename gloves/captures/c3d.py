@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
+BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
-_BLOCK: Final = 512
 _GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # which say where points are; damage to others does not matter
 _MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
 _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
@@ -74,11 +74,7 @@ class Parameters:
         return Parameters(processor, values)
 
     def number(self, group: str, name: str, *, default: float | None = None) -> float:
-        """The first number of a parameter.
-
-        Raises:
-            CaptureError: It is not finite, or there is none and no default.
-        """
+        """The first number of a parameter."""
         values = self.values.get((group, name), [])
         if values and isinstance(values[0], float):
             if not math.isfinite(values[0]):
@@ -107,7 +103,7 @@ def _walk(
     groups: dict[int, str] = {}
     found: list[tuple[int, str, memoryview]] = []
     view = memoryview(data)
-    points_at = (int.from_bytes(data[16:18], order) - 1) * _BLOCK
+    points_at = (int.from_bytes(data[16:18], order) - 1) * BLOCK
     end = points_at if points_at > at else len(data)  # of the section
     while at + 2 <= len(data):
         name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
@@ -166,7 +162,6 @@ def _text(raw: bytes) -> str:
         return raw.decode("latin-1")
 
 
-BLOCK: Final = 512
 MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
 _MOST_FILLING: Final = 2 * BLOCK  # bytes behind the last frame
 _SAME_SCALE: Final = 1e-3  # by which the two scales of a file may differ, of themselves
@@ -349,10 +344,7 @@ _MOST_LABEL_BYTES: Final = 255
 
 
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a C3D file; points with a negative residual are missing.
-
-    A missing unit is told, and where the file contradicts itself.
-    """
+    """The capture in the bytes of a C3D file; points with a negative residual are missing."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
     parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)
@@ -375,10 +367,6 @@ def write_c3d(path: Path, capture: Capture) -> None:
 
     A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
     programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
-
-    Raises:
-        CaptureError: A label is too long.
-        OSError: The file cannot be opened, or the disk did not take the whole file.
     """
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:

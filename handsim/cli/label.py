@@ -34,11 +34,10 @@ def label(
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
     from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-    from handsim.app.messages import print_line
-    from handsim.app.progress import progress_bar
+    from handsim.app.messages import print_line, progress_bar
     from handsim.files.outputs import check_outputs
     from track.captures import label_capture
-    from train.threads import label_on
+    from train.labelers.protocol import label_on
 
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it

@@ -1,33 +1,24 @@
-"""The command `handsim train`."""
+"""The commands `handsim train` and `handsim evaluate`."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
 
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
-from handsim.cli.command_table import PresetCommand, given_option
-from handsim.cli.parsing import run_command
-from handsim.errors import DatasetError, HandSimError
-from handsim.files.signals import Stopped
-from train.devices.world import world_of
-from train.evaluation import print_figures
-from train.settings import KINDS, PRESETS, Kind, Preset, TrainSettings, default_config, preset_config
-
-_PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
+from handsim.app.messages import print_line, progress_bar
+from handsim.cli.parsing import PresetCommand, given_option
+from train.settings import KINDS, PRESETS, EvaluateSettings, Preset, TrainSettings, usual_settings
 
 
 def _train(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    config: Annotated[TrainSettings, tyro.conf.arg(name="")],
+    settings: Annotated[TrainSettings, tyro.conf.arg(name="")],
     preset: Preset | None = None,
     threads: int | None = None,
 ) -> None:
@@ -36,90 +27,75 @@ def _train(
     Args:
         dataset: Folder that `handsim generate` wrote.
         out: Folder for the weights, the model card, the checkpoint and report.html.
-        config: How to train.
+        settings: How to train.
         preset: A published recipe, which replaces the defaults; options given beside it hold.
-        threads: Threads on a CPU; the faster of one and all when not given, measured now and then.
+        threads: Threads on a CPU; when not given, one for the set labeler and all for the paper's network.
     """
+    from train.evaluation import print_figures
+    from train.loop import train_labeler
     from train.reports.run_page import PAGE
 
-    del preset  # it is in `config` already
-    from train.devices.agreement import PeerError
-    from train.loop import train_labeler
-
-    try:
-        if world_of().rank:
-            _train_silently(dataset, out, config, threads)
-            return
-        with progress_bar("samples") as bar:
-            card = train_labeler(
-                dataset,
-                out,
-                config,
-                threads=threads,
-                progress=bar,
-                on_step=bar.step,
-            )
-    except PeerError as error:  # another process has told it
-        raise SystemExit(1) from error
+    del preset  # it is in `settings`
+    if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # the first process tells
+        train_labeler(dataset, out, settings, threads=threads)
+        return
+    with progress_bar("samples") as bar:
+        card = train_labeler(dataset, out, settings, threads=threads, progress=bar, on_step=bar.step)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     print_line(f"weights and model card in {out}")
     print_line(f"report in {out / PAGE}")
 
 
-def _train_silently(dataset: Path, out: Path, config: TrainSettings, threads: int | None) -> None:
-    """Train in a process other than the first of several, which tells what there is to tell."""
-    from train.loop import train_labeler
-
-    try:
-        train_labeler(dataset, out, config, threads=threads)
-    except KeyboardInterrupt as stop:
-        raise SystemExit(128 + (stop.number if isinstance(stop, Stopped) else 2)) from stop
+def _with_usual_settings(args: Sequence[str], prog: str) -> Callable[..., None]:
+    """The command with the settings of the given labeler or preset as its defaults."""
+    labeler, preset = given_option(args, "--labeler"), given_option(args, "--preset")
+    kinds, presets = (one for one in KINDS if one == labeler), (one for one in PRESETS if one == preset)
+    return functools.partial(_train, settings=usual_settings(next(kinds, "set"), next(presets, None)))
 
 
-def _command_of_rank(args: Sequence[str], prog: str) -> Callable[..., None]:
-    """The command; of several processes the first alone tells mistakes in the options, which all have."""
-    if not world_of().rank:
-        return _with_recipe_as_default(args, prog)
-    try:
-        # A silent tyro still prints values it cannot read.
-        with contextlib.redirect_stderr(io.StringIO()):
-            command = _with_recipe_as_default(args, prog)
-            parsed = functools.partial(_dataset_of, **command.keywords)
-            run_command(parsed, prog=prog, args=args, is_silent=True)
-        return command
-    except DatasetError:  # this one may not see the set
-        raise
-    except HandSimError as error:
-        raise SystemExit(1) from error
+train: Final = PresetCommand(_with_usual_settings)
 
 
-def _with_recipe_as_default(args: Sequence[str], prog: str) -> functools.partial[None]:
-    """`handsim train` with the settings of the given labeler or preset as the default of `config`."""
-    from train.data.shards import load_manifest
+def evaluate(
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")],
+    *,
+    glove: str = "dense19",
+    labeler: str | None = None,
+    json: Path | None = None,
+    threads: int = 1,
+) -> None:
+    """Measure a labeler on labeled captures, corrupted as in the paper.
 
-    name = given_option(args, "--preset")
-    preset = next((preset for preset in PRESETS if preset == name), None)
-    if preset is None:
-        labeler = given_option(args, "--labeler")
-        kind: Kind = next((kind for kind in KINDS if kind == labeler), "set")
-        return functools.partial(_train, config=default_config(kind))
-    # The recipe counts epochs, so the training set must be known before its defaults are.
-    recipe = functools.partial(_dataset_of, config=preset_config(preset, _PAPER_FRAMES))
-    folder = run_command(recipe, prog=prog, args=args)
-    config = preset_config(preset, load_manifest(folder).num_frames)
-    return functools.partial(_train, config=config)
+    Args:
+        captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, or the .truth.npz of
+            takes. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
+        settings: What is evaluated.
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
+            not given.
+        json: File for the figures.
+        threads: Threads of the labeler; more than one helps a large network on an idle machine.
+    """
+    import numpy as np
 
+    from handsim.files.outputs import check_outputs, save_json
+    from train.evaluation import evaluate_labeler, print_figures
+    from train.labelers.protocol import label_on
+    from train.labelers.storage import load_labeler
 
-@functools.wraps(_train)
-def _dataset_of(
-    dataset: Annotated[Path, tyro.conf.Positional],
-    out: Path,
-    config: Annotated[TrainSettings, tyro.conf.arg(name="")],
-    preset: Preset | None = None,
-    threads: int | None = None,
-) -> Path:
-    del out, config, preset, threads
-    return dataset
-
-
-train: Final = PresetCommand(_command_of_rank)
+    label_on(threads)
+    check_outputs((*captures, glove, labeler), [json])
+    network = load_labeler(glove, labeler)
+    report = evaluate_labeler(network, captures, settings=settings)
+    by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
+    if json is not None:
+        # JSON has no NaN, which stands where there was nothing to count.
+        figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
+        found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
+        save_json(json, {"glove": glove, **settings.record(), **found, "slot_accuracy_by_marker": by_marker})
+    hard = f", occlude {settings.occlude}, ghosts {settings.ghosts}"
+    hard = hard if settings.occlude or settings.ghosts else ""
+    print_figures({"share": report.figures}, title=f"{report.num_frames} hands in frames{hard}")
+    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
+    print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))

@@ -27,6 +27,7 @@ from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
+from render.color_sensor import linear_of
 from render.frames import FOREARM, PARTS_A_HAND, Doubles, Flags, Floats, HandTruth, Pictures, RenderedFrame
 
 CENTER: Final = 0.5
@@ -328,30 +329,16 @@ _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")
 _IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
 _SENSOR: Final = "sensor."
-# The two branches of sRGB (IEC 61966-2-1).
-_TOE, _TOE_SLOPE, _POWER, _SCALE, _SHIFT = 0.04045, 12.92, 2.4, 1.055, 0.055
-
-
-def linear_light(picture: UInt8[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Linear light in [0, 1] of 8-bit sRGB."""
-    levels = np.arange(256) / 255.0
-    light = np.where(levels <= _TOE, levels / _TOE_SLOPE, ((levels + _SHIFT) / _SCALE) ** _POWER)
-    values: Floats = light.astype(np.float32)[picture]
-    return values
 
 
 def write_exr(path: str | Path, frame: RenderedFrame) -> None:
     """Write all pictures of a frame and its camera."""
     import OpenEXR
 
-    if Path(path).suffix.lower() != ".exr":
-        raise HandSimError(f"{path}: expected a file name that ends in .exr")
     channels = {
         **_channels(frame.ideal),
         **{_SENSOR + name: values for name, values in _channels(frame.noisy).items()},
     }
-    if not channels:
-        raise HandSimError(f"{path}: frame {frame.number} has no pictures to write")
     record = frame.camera.record()
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
@@ -372,7 +359,7 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
 def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     if pictures.rgb is not None:
-        light = linear_light(pictures.rgb).astype(np.float16)
+        light = linear_of(pictures.rgb).astype(np.float16)
         channels |= {name: light[..., index] for index, name in enumerate(_RGB)}
     if pictures.depth is not None:
         channels["Z"] = pictures.depth.astype(np.float32)

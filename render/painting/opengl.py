@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
-from render.frames import Bytes, Doubles
+from render.frames import Doubles
 
 if TYPE_CHECKING:
     from handsim.space.camera import Camera
@@ -164,8 +164,7 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
     scene.add(lens, pose=camera.T_world_camera @ OPENGL_FROM_OPENCV)
     add_lights(pyrender, scene, lighting, camera.T_world_camera)
     flags = pyrender.RenderFlags
-    painted: Bytes = renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0]
-    return painted
+    return np.asarray(renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0])
 
 
 @functools.lru_cache(maxsize=16)

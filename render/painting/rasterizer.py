@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens, camera_matrix
-from render.frames import Bytes, Doubles, Flags, Floats, Integers, Pictures
+from render.frames import Bytes, Doubles, Flags, Floats, Integers
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -33,16 +33,38 @@ _NARROW: Final = 6  # [px] width of a triangle's box up to which each of its pix
 class Triangles:
     """A surface to draw."""
 
-    vertices: Float[np.ndarray, "V 3"]
-    """In the world [m]."""
-    faces: Int[np.ndarray, "F 3"]
-    """Counter-clockwise from outside."""
-    normals: Float[np.ndarray, "V 3"]
-    """Unit normals in the world."""
-    parts: UInt8[np.ndarray, "F"]
-    """See `render.frames.Pictures`, as the next two."""
+    vertices: Float[np.ndarray, "V 3"]  # in the world [m]
+    faces: Int[np.ndarray, "F 3"]  # counter-clockwise from outside
+    normals: Float[np.ndarray, "V 3"]  # unit normals in the world
+    parts: UInt8[np.ndarray, "F"]  # see `render.frames.Pictures`, as the next two
     instances: UInt8[np.ndarray, "F"]
     markers: UInt8[np.ndarray, "F"]
+
+
+class Geometry(NamedTuple):
+    """What a camera sees of surfaces; see `render.frames.Pictures`."""
+
+    depth: Float32[np.ndarray, "H W"]
+    normals: Float32[np.ndarray, "H W 3"] | None
+    parts: UInt8[np.ndarray, "H W"]
+    instances: UInt8[np.ndarray, "H W"]
+    markers: UInt8[np.ndarray, "H W"]
+
+
+def see(camera: Camera, surfaces: Sequence[Triangles], *, with_normals: bool) -> Geometry:
+    """Depth, normals and ids of surfaces through any lens."""
+    if not surfaces:
+        flat = np.zeros(camera.size[::-1], dtype=np.uint8)
+        return Geometry(flat.astype(np.float32), np.zeros((*flat.shape, 3), np.float32), flat, flat, flat)
+    whole = join(surfaces)
+    faces = [rasterize(face, whole, with_normals=with_normals) for face in faces_for(camera)]
+    depths, _, *ids = zip(*faces, strict=True)
+    normals = [face.normals for face in faces if face.normals is not None]
+    return Geometry(
+        warp_depth(camera, depths),
+        warp_normals(camera, normals) if with_normals else None,
+        *(warp(camera, pictures) for pictures in ids),
+    )
 
 
 def join(surfaces: Sequence[Triangles]) -> Triangles:
@@ -56,13 +78,11 @@ def join(surfaces: Sequence[Triangles]) -> Triangles:
     return Triangles(vertices, np.concatenate(faces), normals, parts, instances, markers)
 
 
-def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Pictures:
+def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Geometry:
     """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
 
     The surface is closed; the backs of its faces are not drawn.
     """
-    if camera.lens.kind != "pinhole":
-        raise ArgumentError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', expected a pinhole")
     width, height = camera.size
     local = camera.local(surface.vertices)
     faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
@@ -76,7 +96,7 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     if normals is not None:
         local_normals = surface.normals @ camera.T_world_camera[:3, :3]
         _interpolate(faces, local_normals, corners, first, normals)
-    return Pictures(depth=depth, normals=normals, parts=parts, instances=instances, markers=markers)
+    return Geometry(depth, normals, parts, instances, markers)
 
 
 def nearest_faces(
@@ -218,7 +238,6 @@ def _interpolate(
                 picture[row, column, i] *= scale
 
 
-Interpolation = Literal["nearest", "linear"]
 _MARGIN: Final = 2  # [px] around what is looked up
 _WIDEST: Final = 1.4  # tangent up to which one flat picture suffices: 54 degrees
 _ONE_SURFACE: Final = 0.01  # share of the depth by which neighboring pixels of one surface differ
@@ -240,12 +259,10 @@ class _Face:
     size: tuple[int, int]
     focal: float
     center: tuple[float, float]
-    rotation: Doubles
-    """Rotation (3, 3): the face's axes in the camera's."""
+    rotation: Doubles  # rotation (3, 3): the face's axes in the camera's
     part: tuple[slice, slice]
     """Rows and columns of the lens's picture that hold all of this face's pixels."""
-    mask: Bool[np.ndarray, "h w"]
-    """Which of the part's pixels are this face's."""
+    mask: Bool[np.ndarray, "h w"]  # which of the part's pixels are this face's
     pixels: Float32[np.ndarray, "h w 2"]
     """Their pixels in the face, counted from the center of its first pixel [px]."""
     ahead: Float32[np.ndarray, "h w"]
@@ -268,17 +285,16 @@ def faces_for(camera: Camera) -> list[Camera]:
     return cameras
 
 
-def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interpolation) -> NDArray[Any]:
+def warp(camera: Camera, pictures: Sequence[NDArray[Any]], flag: int = cv2.INTER_NEAREST) -> NDArray[Any]:
     """The picture through the lens, from one for each of `faces_for`; 0 where it sees nothing.
 
-    The interpolation is `linear` for colors, `nearest` for ids.
+    The flag is OpenCV's way of interpolation.
     """
     if camera.lens.kind == "pinhole":
-        return pictures[0].copy()
+        return pictures[0]
     width, height = camera.size
     whole = np.zeros((height, width, *pictures[0].shape[2:]), pictures[0].dtype)
-    flag = cv2.INTER_LINEAR if interpolation == "linear" else cv2.INTER_NEAREST
-    for face, picture in _matched(camera, pictures):
+    for face, picture in zip(_faces(camera), pictures, strict=True):
         _fill(whole, face, _resampled(picture, face, flag))
     return whole
 
@@ -290,9 +306,9 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
     nearest pixel counts. What is not ahead of the camera (a fisheye may see it) has depth 0.
     """
     if camera.lens.kind == "pinhole":
-        return depths[0].copy()
+        return depths[0]
     whole = np.zeros(camera.size[::-1], np.float32)
-    for face, depth in _matched(camera, depths):
+    for face, depth in zip(_faces(camera), depths, strict=True):
         with np.errstate(divide="ignore"):
             reciprocal = np.where(depth > 0.0, np.float32(1.0) / depth, np.float32(0.0))
         nearest = _resampled(reciprocal, face, cv2.INTER_NEAREST)
@@ -309,27 +325,16 @@ def warp_normals(
 ) -> Float32[np.ndarray, "H W 3"]:
     """Normals in the camera's axes from those of its faces in theirs; 0 where there is nothing."""
     if camera.lens.kind == "pinhole":
-        return normals[0].copy()
+        return normals[0]
     whole = np.zeros((*camera.size[::-1], 3), np.float32)
-    for face, picture in _matched(camera, normals):
+    for face, picture in zip(_faces(camera), normals, strict=True):
         resampled = _resampled(picture, face, cv2.INTER_NEAREST)
         _fill(whole, face, cv2.transform(resampled, face.rotation))
     return whole
 
 
-def _matched(camera: Camera, pictures: Sequence[NDArray[Any]]) -> list[tuple[_Face, NDArray[Any]]]:
-    faces = _faces(camera)
-    expected, given = [face.size[::-1] for face in faces], [picture.shape[:2] for picture in pictures]
-    if expected != given:
-        raise ArgumentError(
-            f"pictures of {given} rows and columns, expected camera '{camera.name}' faces': {expected}"
-        )
-    return list(zip(faces, pictures, strict=True))
-
-
 def _resampled(picture: NDArray[Any], face: _Face, flag: int) -> NDArray[Any]:
-    resampled: NDArray[Any] = cv2.remap(picture, face.pixels, None, flag, borderMode=cv2.BORDER_REPLICATE)
-    return resampled
+    return np.asarray(cv2.remap(picture, face.pixels, None, flag, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _fill(whole: NDArray[Any], face: _Face, part: NDArray[Any]) -> None:
@@ -344,8 +349,7 @@ def _faces(camera: Camera) -> tuple[_Face, ...]:
         largest = max((face.size for face in faces), default=(0, 0))
         raise ArgumentError(
             f"camera '{camera.name}' needs flat pictures of up to {largest[0]} x {largest[1]} pixels, "
-            "expected "
-            "1 to 8192 each way: its lens sees nothing, or too much of a plane"
+            "expected 1 to 8192 each way: its lens sees nothing, or too much of a plane"
         )
     return faces
 

@@ -40,10 +40,8 @@ class ShadowMap(NamedTuple):
 
     to_map: Float[np.ndarray, "3 4"]
     """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
-    nearest: Float32[np.ndarray, "N N"]
-    """Nearness [m], minus infinity where nothing is."""
-    bias: float
-    """How much nearer a surface must be to cast a shadow [m]: about a texel."""
+    nearest: Float32[np.ndarray, "N N"]  # nearness [m], minus infinity where nothing is
+    bias: float  # how much nearer a surface must be to cast a shadow [m]: about a texel
 
 
 def shadow_map(
@@ -140,8 +138,7 @@ def light_behind(
     mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
     light = 1.0 - np.float32(_SHADED * _key_share(lighting, normal)) * mask
     whole = cv2.resize(light, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
-    shown: Floats = whole[: camera.size[1], : camera.size[0]]
-    return shown
+    return np.asarray(whole[: camera.size[1], : camera.size[0]])
 
 
 @kernel

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -29,8 +29,11 @@ from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
-from render.frames import Bytes, Doubles, Floats, Pictures
+from render.frames import Bytes, Doubles, Floats
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
+
+if TYPE_CHECKING:
+    from render.painting.rasterizer import Geometry
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
@@ -120,8 +123,7 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     scaled = cv2.resize(
         np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     )
-    light: Floats = (scaled.astype(np.float32) / 255.0) ** _GAMMA
-    return light
+    return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
 
 
 SHARE: Final = 0.6
@@ -144,12 +146,10 @@ _SIDE: Final = np.float32(0.6)  # light on an object's side, where its top has 1
 class Backdrop:
     """A plane behind all of the hands that is in the picture; it catches their shadows."""
 
-    gap: float
-    """Its distance from the nearest point of them [m]."""
+    gap: float  # its distance from the nearest point of them [m]
     recedes: tuple[float, float] = (0.0, 0.0)
     """By how much it recedes to the right and downwards, a length for a length."""
-    softness: float = 0.1
-    """Tangent of half the angle under which it sees the lamp."""
+    softness: float = 0.1  # tangent of half the angle under which it sees the lamp
 
 
 def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
@@ -207,10 +207,8 @@ class Background:
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Linear colors; not used by rooms and photographs."""
     seed: int
-    blur: float = 0.0
-    """Standard deviation of its blur, in picture heights."""
-    photo: str | None = None
-    """The photograph's file."""
+    blur: float = 0.0  # standard deviation of its blur, in picture heights
+    photo: str | None = None  # the photograph's file
     backdrop: Backdrop | None = None
     """What the hands' shadows fall on; None where the background is far away."""
 
@@ -270,8 +268,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    drawn: Floats = np.clip(picture, 0.0, 1.0, dtype=np.float32)
-    return drawn
+    return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -287,8 +284,7 @@ def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.rand
     y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(angle))
     share = (x[None, :] + y[:, None])[..., None]
     share = 0.5 + 0.5 * share / np.abs(share).max()
-    blend: Floats = first + share * (second - first)
-    return blend
+    return np.asarray(first + share * (second - first))
 
 
 def _octaves(
@@ -323,8 +319,7 @@ def _noise(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.
     grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
     share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
     color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
-    mixed: Floats = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
-    return mixed
+    return np.asarray((first + np.clip(share, 0.0, 1.0) * (second - first)) * color)
 
 
 def _clutter(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
@@ -394,37 +389,28 @@ _SHORTEST: Final = 1e-6  # component of a ray, so that it meets each pair of wal
 class Enclosure:
     """A box that holds everything, in the world's axes, z up."""
 
-    low: Corner
-    """[m]."""
+    low: Corner  # [m]
     high: Corner
-    free: tuple[Corner, Corner]
-    """Low and high corner of the box that hands and cameras stay in [m]."""
+    free: tuple[Corner, Corner]  # low and high corner of the box that hands and cameras stay in [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
     """What one camera sees behind hands and objects."""
 
-    rgb: UInt8[np.ndarray, "H W 3"]
-    """sRGB; 0 where the lens sees nothing."""
-    depth: Float32[np.ndarray, "H W"]
-    """Along the camera's axis [m]; 0 for what is not ahead."""
-    axes: Int8[np.ndarray, "H W"]
-    """Axis of the world that the surface's normal has."""
-    signs: Int8[np.ndarray, "H W"]
-    """Whether it points along that axis (1) or against it (-1)."""
+    rgb: UInt8[np.ndarray, "H W 3"]  # sRGB; 0 where the lens sees nothing
+    depth: Float32[np.ndarray, "H W"]  # along the camera's axis [m]; 0 for what is not ahead
+    axes: Int8[np.ndarray, "H W"]  # axis of the world that the surface's normal has
+    signs: Int8[np.ndarray, "H W"]  # whether it points along that axis (1) or against it (-1)
 
-    def put_behind(self, pictures: Pictures, camera: Camera) -> Pictures:
+    def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
         """Pictures of hands and objects with depth and normals behind them, too."""
-        assert pictures.depth is not None and pictures.instances is not None
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
             normals = normals.copy()
             normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
-        return dataclasses.replace(
-            pictures, depth=np.where(bare, self.depth, pictures.depth), normals=normals
-        )
+        return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
 
 
 def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:

@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.errors import ArgumentError
 from render.color_sensor import (
     Exposure,
     ExposureConfig,
     Shutter,
     ShutterConfig,
     combine,
-    encoded,
     expose,
     linear_of,
     sample_exposure,
@@ -36,7 +34,6 @@ def shot(light, exposure, seed=0):
 
 def test_the_plainest_exposure_changes_no_byte():
     rgb = every_value()
-    assert (encoded(linear_of(rgb)) == rgb).all()
     assert (shot(linear_of(rgb), Exposure()) == rgb).all()
 
 
@@ -50,7 +47,7 @@ def test_the_curve_is_srgbs():
 
 def test_a_stop_doubles_the_light_and_balance_tints_it():
     light = np.full((8, 8, 3), 0.2, np.float32)
-    assert (shot(light, Exposure(stops=1.0)) == encoded(2 * light)).all()
+    assert (shot(light, Exposure(stops=1.0)) == shot(2 * light, Exposure())).all()
     assert (shot(light, Exposure(stops=3.0)) == 255).all()
     tinted = linear_of(shot(light, Exposure(balance=(1.2, 1.0, 0.8))))[0, 0]
     np.testing.assert_allclose(tinted / 0.2, [1.2, 1.0, 0.8], rtol=0.02)
@@ -119,8 +116,6 @@ def test_exposures_are_plain_and_within_limits():
 def test_odd_sizes_work():
     light = np.full((37, 23, 3), 0.3, np.float32)
     assert shot(light, Exposure(0.1, (1.1, 1.0, 0.9), 900.0, 3.0, 0.2, 80)).shape == (37, 23, 3)
-    with pytest.raises(ArgumentError, match="expected \\(H, W, 3\\)"):
-        shot(light[..., 0], Exposure())
 
 
 def test_blur_spreads_light_and_loses_none() -> None:
@@ -169,7 +164,7 @@ def test_weights_add_up_and_middles_are_where_they_should_be(exposure, readout, 
 def test_what_does_not_move_does_not_change():
     rgb = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     _, weights = shutter_times(0.008, 0.013, 7, HEIGHT)
-    assert (encoded(combine([rgb] * 7, weights)) == rgb).all()
+    assert (shot(combine([rgb] * 7, weights), Exposure()) == rgb).all()
 
 
 def test_blur_keeps_the_light():
@@ -186,7 +181,7 @@ def test_blur_keeps_the_light():
 def test_light_is_averaged_not_srgb_values():
     _, weights = shutter_times(0.01, 0.0, 2, 4)
     black, white = np.zeros((4, 4, 3), np.uint8), np.full((4, 4, 3), 255, np.uint8)
-    assert (encoded(combine([black, white], weights)) == 188).all()
+    assert (shot(combine([black, white], weights), Exposure()) == 188).all()
     np.testing.assert_allclose(combine([black, white], weights), 0.5)
 
 
@@ -210,7 +205,7 @@ def test_frames_may_come_one_by_one():
     times, weights = shutter_times(0.01, 0.01, 5, HEIGHT)
     frames = [bar(50.0 + 1000.0 * time) for time in times]
     assert (combine(iter(frames), weights) == combine(frames, weights)).all()
-    bytes_ = [encoded(frame) for frame in frames]
+    bytes_ = [shot(frame, Exposure()) for frame in frames]
     np.testing.assert_allclose(
         combine(bytes_, weights), combine([linear_of(one) for one in bytes_], weights), atol=1e-6
     )
@@ -224,14 +219,3 @@ def test_shutters_are_plain_and_within_limits():
     assert all(0.001 <= one.exposure <= 0.016 and one.sub_frames == 8 for one in drawn)
     assert 0.3 < np.mean([one.readout > 0 for one in drawn]) < 0.7
     assert Shutter() == Shutter(0.0, 0.0, 1)
-
-
-def test_mistakes_are_told():
-    with pytest.raises(ArgumentError, match="counts of at least 1"):
-        shutter_times(0.01, 0.0, 0, 10)
-    with pytest.raises(ArgumentError, match="times of at least 0"):
-        shutter_times(-0.01, 0.0, 3, 10)
-    _, weights = shutter_times(0.01, 0.0, 3, HEIGHT)
-    for frames in ([bar(1.0)] * 2, [bar(1.0)] * 4, [bar(1.0)[:10]] * 3, []):
-        with pytest.raises(ArgumentError, match="expected 3 of 60 rows"):
-            combine(frames, weights)

@@ -28,7 +28,7 @@ from train.evaluation import LabelCounts
 from train.labelers.layout_labeler import mean_features, shipped_network
 from train.labelers.layout_training import sample_places
 from train.labelers.matching import match_probabilities, pair_probabilities
-from train.threads import labeling_threads
+from train.labelers.protocol import labeling_threads
 
 _PEOPLE, _POSES_EACH = 40, 40
 _CANDIDATES: Final = 10  # places that are tried at once

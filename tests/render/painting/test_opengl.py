@@ -141,7 +141,7 @@ def draw(lighting: Lighting) -> np.ndarray:
         material=pyrender_material(skin_material(skin_texture(SkinLook()))),
     )
     scene.add(pyrender.Mesh([primitive]))
-    camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)
+    camera = pyrender.PerspectiveCamera(np.deg2rad(24.0), znear=0.05, zfar=10.0)
     scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
     add_lights(pyrender, scene, lighting, view.T_world_camera)
     flags = pyrender.RenderFlags

@@ -24,7 +24,6 @@ from track.association.label_consistency import (
 from track.config import TrackerConfig
 from train import load_labeler
 from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
 
 RATE = 120.0
 

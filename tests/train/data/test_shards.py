@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset, MappedRows, row_dtype
-from train.settings import TrainSettings, batch_recipe
+from train.settings import TrainSettings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 
 def shards_of(sizes):
@@ -46,7 +46,7 @@ def test_spans_numbers_and_fields_are_those_of_the_rows_in_memory(sizes, data):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 
@@ -61,7 +61,7 @@ def test_a_set_that_is_handed_on_is_its_files(dataset):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_are_the_batch_of_one_device_shared_out(dataset, share, count):
-    recipe = batch_recipe(TrainSettings(batch=32, rig_share=share), 19)
+    recipe = TrainSettings(batch=32, rig_share=share).batch_recipe(19)
     whole, again = (
         draw_batch(rows, recipe, rng=np.random.default_rng(5))
         for rows in (dataset.rows(), dataset.mapped_rows())
