@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from train.rig_advice.rig_score import VolumeMap as VolumeMap
     from train.rig_advice.scoring import score_rig as score_rig
     from train.settings import CNNConfig as CNNConfig
+    from train.settings import EvaluateSettings as EvaluateSettings
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
