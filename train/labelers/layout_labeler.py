@@ -48,8 +48,14 @@ from train.labelers.protocol import (
     torch_threads,
 )
 from train.settings import TrainSettings, batch_recipe
-from train.simulation.scenes import sample_hands, wear_gloves
-from train.simulation.training_frames import DatasetConfig, sample_single_hand, simulate_frames
+from train.simulation.training_frames import (
+    FrameSource,
+    GenerateSettings,
+    sample_hands,
+    sample_single_hand,
+    simulate_frames,
+    wear_gloves,
+)
 
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""
@@ -166,13 +172,13 @@ def sample_worn_markers(
     layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T M 3"]:
     """Markers [m] of right hands in valid poses; each hundred are another person's, whose glove slipped."""
-    config = DatasetConfig()
+    config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts = []
     for first in range(0, num_frames, _POSES_EACH):
         count = min(_POSES_EACH, num_frames - first)
         right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
-        scene = sample_single_hand(right, count, config.poses, config.volume, rng=rng)
+        scene = sample_single_hand(right, count, config, rng=rng)
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)
@@ -259,11 +265,11 @@ def fine_tuned_labeler(
     """A labeler for any layout that has learned more of this one, as a rig sees it, from so many clouds."""
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler.at_once(layout, seed=seed)
-    config, cameras = DatasetConfig(), as_rig(rig)
+    source = FrameSource(GenerateSettings(), layout, as_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
     for first in range(0, len(rows), _POSES_EACH):
-        models = sample_hands(config.population, rng=rng)
-        simulate_frames(rows[first : first + _POSES_EACH], models, layout, cameras, config, rng=rng)
+        models = sample_hands(source.settings.population, rng=rng)
+        simulate_frames(rows[first : first + _POSES_EACH], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
     optimizer = new_optimizer(network)

@@ -32,8 +32,7 @@ from train.data.batches import Cloud, Corruption, corrupt, stretched
 from train.labelers.layout_labeler import layout_step, new_optimizer, save_layout_network
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features
 from train.labelers.protocol import torch_threads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, sample_frame_scene
+from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least
@@ -129,9 +128,9 @@ def _point_of(place: MarkerPlace, model: HandModel) -> Float[np.ndarray, "3"] | 
 
 def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
     """Places of one person in some poses; None where a place misses the skin of the hand."""
-    config = DatasetConfig()
+    config = GenerateSettings()
     models = sample_hands(config.population, rng=rng)
-    scene = sample_frame_scene(models, _POSES_EACH, config.scenes, config.poses, config.volume, rng=rng)
+    scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
     model = scene.hands[0]
     bones = model.forward_kinematics(scene.qpos[0])
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
