@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handsim._checks import check_array, check_choice
-from handsim.errors import ArgumentError, PoseError
+from handsim._checks import check_choice
+from handsim.errors import PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
 from handsim.hand.shape import (
@@ -24,7 +24,6 @@ from handsim.hand.shape import (
     DIGITS,
     JOINTS,
     NUM_JOINTS,
-    NUM_QPOS,
     PALM,
     bones_of,
     shape_from_measures,
@@ -134,13 +133,9 @@ def object_penetration(
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch."""
-    qpos = check_array("qpos", qpos, (None, NUM_QPOS))
-    poses = check_array("T_world_object", T_world_object, (None, 4, 4))
-    if len(qpos) != len(poses):
-        raise ArgumentError(
-            f"qpos has {len(qpos)} frames and T_world_object {len(poses)}, expected equal numbers"
-        )
-    return grasp_scene(model, obj).depth(qpos[:, 7:], np.linalg.inv(pose_matrices(qpos[:, :7])) @ poses)
+    return grasp_scene(model, obj).depth(
+        qpos[:, 7:], np.linalg.inv(pose_matrices(qpos[:, :7])) @ T_world_object
+    )
 
 
 def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
