@@ -96,6 +96,8 @@ def configured(
     config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
 ) -> RenderConfig:
     """A configuration with the camera and the settings that were named beside it."""
+    config = RenderConfig() if config is None else config
+    check_type("config", config, RenderConfig, "a RenderConfig")
     config = RenderConfig.of(config, settings)
     if camera is None:
         return config

@@ -11,9 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from handsim._checks import check_count
-from handsim.app.messages import print_line
+from handsim.app.messages import named_steps, print_line
 from handsim.app.page import write_page
-from handsim.app.progress import named_steps
 from handsim.files.outputs import atomic_write, written_together
 
 

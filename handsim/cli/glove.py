@@ -20,8 +20,7 @@ from gloves.layout import (
     shipped_layout,
     starter_layout,
 )
-from handsim.app.messages import print_line
-from handsim.app.progress import named_steps
+from handsim.app.messages import named_steps, print_line
 from handsim.errors import LayoutError
 from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES

@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from handsim.app.messages import print_line
-from handsim.app.progress import named_steps
+from handsim.app.messages import named_steps, print_line
 from handsim.errors import RigError
 from handsim.files.outputs import (
     as_text,
