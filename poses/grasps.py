@@ -52,14 +52,6 @@ _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting
 _CONTACT_TIME: Final = (0.005, 1.0)
 _GUIDE_TIME: Final = (0.03, 1.0)  # of a soft constraint that holds the object while fingers close
 _FAR: Final = 0.5  # [m], beyond which distances are not needed
-_GEOMS: Final = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
-}
 
 
 class GraspScene:
@@ -174,7 +166,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
     for number, part in enumerate(obj.parts):
         geom = body.add_geom(
             name=f"object_{number}",
-            type=_GEOMS[part.kind],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}"),
             pos=part.T_object_part[:3, 3],
             quat=rotation_quaternions(part.T_object_part[None, :3, :3])[0],
             condim=4,

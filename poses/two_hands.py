@@ -541,8 +541,6 @@ def _in_world(
     return (
         join_qpos(whole.right, position=middle - across, quaternion=rotation_quaternions(rotations)),
         join_qpos(
-            whole.left,
-            position=middle + across,
-            quaternion=rotation_quaternions(rotations @ whole.rotation),
+            whole.left, position=middle + across, quaternion=rotation_quaternions(rotations @ whole.rotation)
         ),
     )
