@@ -12,9 +12,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, Final, Literal, TextIO
 
 from handsim.callbacks import Closing
 from handsim.errors import HandSimWarning
@@ -22,6 +22,7 @@ from handsim.errors import HandSimWarning
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, Task, TaskID
+    from rich.text import Text
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
 _PRINTED: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
@@ -34,6 +35,28 @@ def print_line(line: str) -> None:
 
     printable = line.encode("utf-8", "backslashreplace").decode("utf-8")
     Console().print(printable, highlight=False, soft_wrap=True, markup=False)
+
+
+def print_table(
+    rows: Sequence[Sequence[str | Text]], *, left: int = 1, wraps: bool = False, title: str | None = None
+) -> None:
+    """Print rows of cells, the header first; the first columns, `left` of them, are words, others numbers.
+
+    Cells keep to one line unless the table `wraps`; units stand below titles then, for eighty columns.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    header, *others = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    table = Table(box=None, pad_edge=False, title=None if title is None else Text(title))
+    for number, column in enumerate(header):
+        justify: Literal["left", "right"] = "left" if number < left else "right"
+        name = column if wraps else Text(column.plain.replace(" [", "\n["))
+        table.add_column(name, justify=justify, no_wrap=not wraps)
+    for row in others:
+        table.add_row(*row)
+    Console().print(table)
 
 
 @contextmanager
