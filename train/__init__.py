@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from train.labelers.storage import load_labeler as load_labeler
     from train.loop import train_labeler as train_labeler
     from train.settings import CNNConfig as CNNConfig
+    from train.settings import EvaluateSettings as EvaluateSettings
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
