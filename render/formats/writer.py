@@ -43,22 +43,23 @@ class PngWriter(FolderWriter):
     """
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        files = self._add_pictures(folder, frame, name, lossless=True)
-        record = frame_record(frame) | files
+        record = frame_record(frame) | self._add_files(folder, frame, name)
         (folder / f"{frame.key}.json").write_text(to_json(record) + "\n", "utf-8")
         return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
 
+    def _add_files(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, str]:
+        return self._add_pictures(folder, frame, name, lossless=True)
 
-class ExrWriter(FolderWriter):
+
+class ExrWriter(PngWriter):
     """`shard-00000/KEY.exr` with all pictures, and `KEY.json` with all that is known of the frame."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, inside=".")
 
-    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+    def _add_files(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, str]:
         write_exr(folder / f"{frame.key}.exr", frame)
-        (folder / f"{frame.key}.json").write_text(to_json(frame_record(frame)) + "\n", "utf-8")
-        return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
+        return {}
 
 
 class FrameWriter(Protocol):
