@@ -27,20 +27,16 @@ from handsim.errors import ArgumentError, CalibrationError, HandSimError, choice
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
 from handsim.hand.topology import SIDES
+from handsim.kernels import move, velocity_of
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.transforms import quaternion_matrix
 from track.constellation import (
     FEWEST,
-    assign_by_id,
     assign_remaining,
     fit_inliers,
-    predict_pose,
     search_constellation,
-    shift_to_points,
     track_by_ids,
     transform_markers,
-    velocity_between,
-    write_labels,
-    write_transform,
 )
 from track.streams.frame_source import StreamedFrame, capture_frames
 
@@ -239,7 +235,7 @@ class BodyTracker:
             self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
         )
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
-            predicted = predict_pose(self._pose, self._velocity, elapsed)
+            predicted = self._predict(elapsed)
             count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
         if count < FEWEST:
             return None
@@ -255,10 +251,19 @@ class BodyTracker:
         """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
         if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
-        pose = predict_pose(self._pose, self._velocity, elapsed)
-        assignment = np.empty(len(self._positions), dtype=np.int64)
-        assign_by_id(points, ids, self._last_ids, assignment)
-        _, rms = shift_to_points(points, assignment, pose, transform_markers(self._positions, pose), GATE)
+        pose = self._predict(elapsed)
+        there = (self._last_ids[:, None] == ids) & (ids >= 0)
+        assignment, rms = np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1), np.nan
+        seen = np.flatnonzero(assignment >= 0)
+        if len(seen):  # one or two points shift the body, if they agree with its pose
+            off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
+            shift = off.mean(axis=0)
+            distances = np.linalg.norm(off - shift, axis=1)
+            if max(distances.max(), np.linalg.norm(shift)) <= GATE:
+                pose[:3] += shift
+                rms = float(np.sqrt((distances**2).mean()))
+            else:
+                assignment[:] = -1
         self._status = Status.COASTING
         return self._result(pose, rms, assignment, ids)
 
@@ -270,7 +275,7 @@ class BodyTracker:
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius, predicted = (
                 self._search_radius(elapsed),
-                predict_pose(self._pose, self._velocity, elapsed),
+                self._predict(elapsed),
             )
             count, rms = self._match(points, predicted, radius, assignment, pose)
             if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
@@ -287,6 +292,10 @@ class BodyTracker:
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
+
+    def _predict(self, elapsed: float) -> NDArray[np.float64]:
+        """The pose after some time [s] at constant velocity."""
+        return move(self._pose[None], elapsed * self._velocity[None])[0]  # type: ignore[no-any-return]
 
     def _search_radius(self, elapsed: float) -> float:
         """Largest distance of a marker from its predicted position [m]."""
@@ -335,7 +344,7 @@ class BodyTracker:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _LONGEST_PREDICTION:
             weight = _SMOOTHING if self._fits > 1 else 1.0
-            self._velocity += weight * (velocity_between(self._pose, pose, elapsed) - self._velocity)
+            self._velocity += weight * (velocity_of(self._pose, pose, elapsed) - self._velocity)
         self._fits += 1
         self._pose, self._time, self._status = pose, time, status
         self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
@@ -345,9 +354,11 @@ class BodyTracker:
         self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> BodyFrame:
         """The result of a fit; the IDs are kept for the next frame."""
-        labels, transform = np.full(len(ids), -1), np.eye(4)
-        write_labels(assignment, ids, labels, self._last_ids)
-        write_transform(pose, transform)
+        seen, labels, transform = np.flatnonzero(assignment >= 0), np.full(len(ids), -1), np.eye(4)
+        labels[assignment[seen]] = seen
+        self._last_ids[:] = -1
+        self._last_ids[seen] = ids[assignment[seen]]
+        transform[:3, :3], transform[:3, 3] = quaternion_matrix(pose[3:]), pose[:3]
         return BodyFrame(self._status, transform, labels, rms)
 
 

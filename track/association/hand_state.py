@@ -28,7 +28,7 @@ from track.kinematics.pose_spread import (
     MarkerPrediction,
     SpreadModel,
     predict_joints,
-    resting_covariance,
+    predict_markers,
     resting_prior,
 )
 
@@ -92,11 +92,6 @@ class HandEstimate(NamedTuple):
         """Positions of the pose's markers in the world [m]."""
         return self.predicted.positions
 
-    @property
-    def covariances(self) -> Float[np.ndarray, "M 3 3"]:
-        """Covariance of each marker in the world [m^2]."""
-        return self.predicted.covariances
-
 
 class Biases(NamedTuple):
     """What is known of the biases of a hand's markers."""
@@ -147,8 +142,7 @@ class HandState:
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
         """Digits that have had a settled label since the hand was initialized."""
         self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
-        self._joint_covariance = resting_covariance()  # [rad^2] of the last estimate
-        self._resting_prior = resting_prior()
+        self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
@@ -199,13 +193,15 @@ class HandState:
                 prediction.wrist_spread,
             )
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
-        predicted = self.solver.predict_markers(
+        predicted = predict_markers(
+            self.solver.hand,
+            self.solver.on_part,
             qpos,
             targets,
             prediction.joint_prior,
-            wrist_spread=prediction.wrist_spread,
-            variance=self.variance,
-            noise=self.config.marker_noise,
+            prediction.wrist_spread,
+            self.variance,
+            self.config.marker_noise,
         )
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
@@ -224,7 +220,7 @@ class HandState:
             slack,
             self._ranges,
         )
-        return confirmed, confirmed._replace(joint_prior=self._resting_prior)
+        return confirmed, confirmed._replace(joint_prior=resting_prior())
 
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
         """What computes the standard deviations of this pose at a time [s], whatever the hand does later."""
@@ -267,7 +263,7 @@ class HandState:
         self._last_label[:] = -np.inf
         self.confirmed[:] = False
         positions = self.solver.marker_positions(qpos)
-        unknown = Prediction(qpos, positions, self._resting_prior, (1.0, 1.0))
+        unknown = Prediction(qpos, positions, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
         if not (self._bias_frames.any() and estimate.rms < _BIAS_REUSE_RMS):
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
@@ -286,9 +282,8 @@ class HandState:
     @property
     def biases(self) -> Biases:
         """A copy of what is known of the markers' biases, for `recall`."""
-        return Biases(
-            self._bias.copy(), self._bias_frames.copy(), self._variance.copy(), self.variance.copy()
-        )
+        known = (self._bias, self._bias_frames, self._variance, self.variance)
+        return Biases(*(values.copy() for values in known))
 
     def forget(self, markers: Int[np.ndarray, "K"]) -> None:
         """Forget the biases of some markers: they are where the glove has them again, give or take."""
@@ -325,7 +320,6 @@ class HandState:
             estimate.predicted.rotations,
             settled,
             seen[parts] >= np.where(parts > 0, _FEWEST_ON_DIGIT, _FEWEST_ON_PALM),
-            _AVERAGING_FRAMES,
             self._bias_frames,
             self._bias,
             self._variance,
@@ -349,20 +343,9 @@ class HandState:
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
-        """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m].
-
-        A bias is in the frame of its bone, and known if averaged over any frames; it changes by a share
-        `variation` of the typical one as the hand moves. Variances below the least are overwritten, as are
-        the first `positions` of each marker in `HandArrays`.
-        """
+        """Shift the hand's markers by their biases, and update the typical bias and the least variances."""
         self._typical_bias = _shift_markers(
-            self._bias_frames,
-            self._bias,
-            self._designed,
-            _LEAST_SPREAD,
-            _BIAS_VARIATION,
-            self._variance,
-            self.adapted.positions,
+            self._bias_frames, self._bias, self._designed, self._variance, self.adapted.positions
         )
 
 
@@ -385,7 +368,6 @@ def _learn_bias(
     rotations: Float[np.ndarray, "M 3 3"],
     settled: Bool[np.ndarray, "M"],
     is_tested: Bool[np.ndarray, "M"],
-    averaging_frames: float,
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
@@ -394,13 +376,13 @@ def _learn_bias(
 
     Residuals are model minus marker in the world [m], rotations those of the markers' bones. Any pose fits
     markers that are not tested by others on their part: their variance stays. `bias_frames`, `bias` [m] and
-    `variance` [m^2] are overwritten; an average goes over `averaging_frames` at most.
+    `variance` [m^2] are overwritten.
     """
     residual = np.empty(3)
     for marker in range(len(residuals)):
         if not settled[marker] or np.isnan(residuals[marker, 0]):
             continue
-        bias_frames[marker] = min(bias_frames[marker] + 1.0, averaging_frames)
+        bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
         square = 0.0
         for i in range(3):
             residual[i] = 0.0
@@ -417,8 +399,6 @@ def _shift_markers(
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     designed: Float[np.ndarray, "M 3"],
-    least_spread: float,
-    variation: float,
     variance: Float[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 4 3"],
 ) -> float:
@@ -428,8 +408,6 @@ def _shift_markers(
         bias_frames: Frames that each bias was averaged over; zero where it is unknown.
         bias: Bias of each marker in the frame of its bone [m].
         designed: Position of each marker in that frame as the glove has it [m].
-        least_spread: Least standard deviation of a marker [m].
-        variation: Share of the typical bias by which a bias changes as the hand moves.
         variance: Variance of each marker [m^2], overwritten where it is below the least.
         positions: `HandArrays.positions`; the first of each marker is overwritten.
     """
@@ -441,15 +419,13 @@ def _shift_markers(
         count += bias_frames[marker] > 0.0
     square /= max(count, 1)
     for marker in range(len(bias_frames)):
-        variance[marker] = max(variance[marker], least_spread**2 + variation**2 * square)
+        variance[marker] = max(variance[marker], _LEAST_SPREAD**2 + _BIAS_VARIATION**2 * square)
     return np.sqrt(square)  # type: ignore[no-any-return]
 
 
 @kernel
 def _rms_without_bias(
-    residuals: Float[np.ndarray, "M 3"],
-    rotations: Float[np.ndarray, "M 3 3"],
-    bias: Float[np.ndarray, "M 3"],
+    residuals: Float[np.ndarray, "M 3"], rotations: Float[np.ndarray, "M 3 3"], bias: Float[np.ndarray, "M 3"]
 ) -> float:
     """RMS of the residuals with the biases added back [m]; the arguments are those of `_learn_bias`."""
     square, count = 0.0, 0

@@ -1,9 +1,8 @@
 """Labels for new points: first the palms' markers, then those of all digits with candidates, jointly.
 
-All assignments of a digit's candidates to its markers are tested on the digit
-(`track.association.digit_hypotheses`). Where digits share candidates, of one hand or of two that touch, the
-best joint assignment is taken (`track.association.assignment`). Labels that are not settled yet can be
-reassigned.
+The points within a radius of a digit's markers are its candidates. All assignments of them to its markers
+are tested on the digit (`track.association.digit_hypotheses`). Where digits share candidates, of one hand or
+of two that touch, the best joint assignment is taken. Labels with weak evidence can be reassigned.
 """
 
 from __future__ import annotations
@@ -21,7 +20,13 @@ from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses, empt
 from track.association.frame_state import FrameState, Numbering, match_log_odds, match_points
 from track.association.hand_state import HandState, HandTrack
 
+MAX_CANDIDATES: Final = 7
+"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
+SETTLED_EVIDENCE: Final = 4.0
+"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
 _NOWHERE: Final = 1e6  # [m] of the markers of a hand without a pose, which no point is near
+_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
+_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
 
 
 class DigitTable(NamedTuple):
@@ -33,113 +38,6 @@ class DigitTable(NamedTuple):
     """Labels of each digit, -1 where there are fewer."""
     markers: Int[np.ndarray, "D K"]
     """The same in the order of the hand's layout."""
-
-
-def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
-    """The table of all hands."""
-    own = [np.where(one.digits >= 0, row * len(DIGITS) + one.digits, -1) for row, one in enumerate(states)]
-    digits = np.concatenate([np.zeros(0, dtype=np.int64), *own])
-    members = [np.flatnonzero(digits == digit) for digit in range(len(states) * len(DIGITS))]
-    labels = np.full((len(members), max(map(len, members), default=0)), -1)
-    for row, some in zip(labels, members, strict=True):
-        row[: len(some)] = some
-    owners = np.repeat(np.arange(len(states)), len(DIGITS))
-    markers = [numbering.markers(owner, row) for owner, row in zip(owners.tolist(), labels, strict=True)]
-    return DigitTable(digits, labels, np.array(markers).reshape(labels.shape))
-
-
-def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: DigitTable) -> FrameState:
-    """Label points without a label, and reassign labels that are not settled.
-
-    Args:
-        tracks: The hands that have a pose.
-    """
-    if not tracks:
-        return frame
-    for track in tracks:
-        frame = _label_palm(frame, track)
-    positions = np.full((len(table.digits), 3), _NOWHERE)
-    for track in tracks:
-        positions[frame.numbering.part(track.hand)] = track.estimate.positions
-    assigned = frame.labels.copy()
-    markers = MarkerTable(positions, table.digits, assigned)
-    candidates = find_candidates(frame.points, frame.evidence, markers, len(table.labels))
-    if not candidates.counts.any():
-        return frame
-    hypotheses = empty_hypotheses(len(table.labels), MAX_CANDIDATES, table.labels.shape[1])
-    for track in tracks:
-        rows = _rows(track.hand)
-        own = DigitCandidates(*(values[rows] for values in candidates))
-        filled = DigitHypotheses(*(values[rows] for values in hypotheses))
-        _evaluate_hand(frame, track, own, table.markers[rows], filled)
-    margins = np.full(len(frame.points), np.nan)
-    assign_jointly(candidates, hypotheses, table.labels, assigned, margins)
-    changed = assigned != frame.labels
-    confidence = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
-    return frame._replace(labels=assigned).with_confidence(changed, confidence)
-
-
-def _rows(hand: int) -> slice:
-    """The digits of a hand."""
-    return slice(hand * len(DIGITS), (hand + 1) * len(DIGITS))
-
-
-def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
-    """Match unlabeled points with the missing markers of a palm."""
-    free = np.flatnonzero(frame.unlabeled)
-    if not len(free):
-        return frame
-    markers, missing = frame.markers(track.hand), track.state.digits < 0
-    missing[markers[markers >= 0]] = False
-    if not missing.any():
-        return frame
-    palm = np.flatnonzero(missing)
-    log_odds = match_log_odds(
-        frame.points[free],
-        track.estimate.positions[palm],
-        track.estimate.covariances[palm],
-        track.state.config.stray_density,
-    )
-    log_odds += track.state.presence_log_odds(frame.first_seen[free])[:, palm]
-    matched, confidence = match_points(log_odds)
-    chosen = free[matched >= 0]
-    markers[chosen] = palm[matched[matched >= 0]]
-    return frame.with_markers(track.hand, markers).with_confidence(chosen, confidence[matched >= 0])
-
-
-def _evaluate_hand(
-    frame: FrameState,
-    track: HandTrack,
-    candidates: DigitCandidates,
-    digit_markers: NDArray[np.int64],
-    hypotheses: DigitHypotheses,
-) -> None:
-    """Evaluate the hypotheses of one hand's digits, which are filled."""
-    if not candidates.counts.any():
-        return
-    state, markers = track.state, frame.markers(track.hand)
-    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(markers >= 0)
-    log_odds[labeled, markers[labeled]] = frame.evidence[labeled]
-    confirmed, unconfirmed = state.digit_models(track.prediction, track.estimate)
-    for digit in np.flatnonzero(candidates.counts).tolist():
-        evaluate_digit(
-            state.adapted,
-            confirmed if state.confirmed[digit] else unconfirmed,
-            digit,
-            digit_markers[digit, digit_markers[digit] >= 0],
-            frame.points,
-            candidates.candidates[digit, : candidates.counts[digit]],
-            log_odds,
-            *(values[digit] for values in hypotheses),
-        )
-
-
-MAX_CANDIDATES: Final = 7
-"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
-SETTLED_EVIDENCE: Final = 4.0
-"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
-_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
-_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
 
 
 class MarkerTable(NamedTuple):
@@ -160,22 +58,98 @@ class DigitCandidates(NamedTuple):
     """Points of each digit: first those labeled as its markers, then others, the nearest first."""
     counts: Int[np.ndarray, "D"]
     """How many there are; zero where there is nothing to decide."""
-    labeled: Int[np.ndarray, "D"]
-    """How many of them are labeled as the digit's markers."""
+
+
+def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
+    """The table of all hands."""
+    own = [np.where(one.digits >= 0, row * len(DIGITS) + one.digits, -1) for row, one in enumerate(states)]
+    digits = np.concatenate([np.zeros(0, dtype=np.int64), *own])
+    members = [np.flatnonzero(digits == digit) for digit in range(len(states) * len(DIGITS))]
+    labels = np.full((len(members), max(map(len, members), default=0)), -1)
+    for row, some in zip(labels, members, strict=True):
+        row[: len(some)] = some
+    owners = np.repeat(np.arange(len(states)), len(DIGITS))
+    markers = [numbering.markers(owner, row) for owner, row in zip(owners.tolist(), labels, strict=True)]
+    return DigitTable(digits, labels, np.array(markers).reshape(labels.shape))
+
+
+def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: DigitTable) -> FrameState:
+    """Label points without a label, and reassign labels with weak evidence, by the hands that have a pose."""
+    if not tracks:
+        return frame
+    positions = np.full((len(table.digits), 3), _NOWHERE)
+    for track in tracks:
+        frame = _label_palm(frame, track)
+        positions[frame.numbering.part(track.hand)] = track.estimate.positions
+    assigned = frame.labels.copy()
+    markers = MarkerTable(positions, table.digits, assigned)
+    candidates = find_candidates(frame.points, frame.evidence, markers, len(table.labels))
+    if not candidates.counts.any():
+        return frame
+    hypotheses = empty_hypotheses(len(table.labels), MAX_CANDIDATES, table.labels.shape[1])
+    for track in tracks:
+        _evaluate_hand(frame, track, candidates, table.markers, hypotheses)
+    margins = np.full(len(frame.points), np.nan)
+    assign_jointly(candidates, hypotheses, table.labels, assigned, margins)
+    changed = assigned != frame.labels
+    confidence = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
+    return frame._replace(labels=assigned).with_confidence(changed, confidence)
+
+
+def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
+    """Match unlabeled points with the missing markers of a palm."""
+    free = np.flatnonzero(frame.unlabeled)
+    markers, missing = frame.markers(track.hand), track.state.digits < 0
+    missing[markers[markers >= 0]] = False
+    if not len(free) or not missing.any():
+        return frame
+    palm, expected = np.flatnonzero(missing), track.estimate.predicted
+    density = track.state.config.stray_density
+    log_odds = match_log_odds(
+        frame.points[free], expected.positions[palm], expected.covariances[palm], density
+    )
+    log_odds += track.state.presence_log_odds(frame.first_seen[free])[:, palm]
+    matched, confidence = match_points(log_odds)
+    chosen = free[matched >= 0]
+    markers[chosen] = palm[matched[matched >= 0]]
+    return frame.with_markers(track.hand, markers).with_confidence(chosen, confidence[matched >= 0])
+
+
+def _evaluate_hand(
+    frame: FrameState,
+    track: HandTrack,
+    candidates: DigitCandidates,
+    digit_markers: NDArray[np.int64],
+    hypotheses: DigitHypotheses,
+) -> None:
+    """Evaluate the hypotheses of one hand's digits, which are filled."""
+    first = track.hand * len(DIGITS)
+    open_digits = np.flatnonzero(candidates.counts[first : first + len(DIGITS)]).tolist()
+    if not open_digits:
+        return
+    state, markers = track.state, frame.markers(track.hand)
+    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(markers >= 0)
+    log_odds[labeled, markers[labeled]] = frame.evidence[labeled]
+    confirmed, unconfirmed = state.digit_models(track.prediction, track.estimate)
+    for digit in open_digits:
+        row = first + digit
+        evaluate_digit(
+            state.adapted,
+            confirmed if state.confirmed[digit] else unconfirmed,
+            digit,
+            digit_markers[row, digit_markers[row] >= 0],
+            frame.points,
+            candidates.candidates[row, : candidates.counts[row]],
+            log_odds,
+            DigitHypotheses(*(values[row] for values in hypotheses)),
+        )
 
 
 def find_candidates(
-    points: Float[np.ndarray, "N 3"],
-    evidence: Float[np.ndarray, "N"],
-    table: MarkerTable,
-    num_digits: int,
+    points: Float[np.ndarray, "N 3"], evidence: Float[np.ndarray, "N"], table: MarkerTable, num_digits: int
 ) -> DigitCandidates:
     """The candidates of each digit."""
-    found = DigitCandidates(
-        np.full((num_digits, MAX_CANDIDATES), -1),
-        np.zeros(num_digits, dtype=np.int64),
-        np.zeros(num_digits, dtype=np.int64),
-    )
+    found = DigitCandidates(np.full((num_digits, MAX_CANDIDATES), -1), np.zeros(num_digits, dtype=np.int64))
     _find_candidates(points, evidence, table, found)
     return found
 
@@ -187,7 +161,7 @@ def _find_candidates(
     table: MarkerTable,
     found: DigitCandidates,
 ) -> None:
-    """Fill `found`; the other arguments are those of `find_candidates`."""
+    """Kernel of `find_candidates`."""
     positions, digits, assigned = table
     missing = np.ones(len(positions), dtype=np.bool_)
     for owner in assigned:
@@ -213,15 +187,12 @@ def _find_candidates(
         for point in range(len(points)):
             if assigned[point] >= 0 and digits[assigned[point]] == digit:
                 rivals[point] = False
-                undecided = (
-                    undecided or contested[point] or (incomplete and evidence[point] < SETTLED_EVIDENCE)
-                )
+                weak = incomplete and evidence[point] < SETTLED_EVIDENCE
+                undecided = undecided or contested[point] or weak
                 found.candidates[digit, count] = point
                 count += 1
-        if not (undecided or rivals.any()):
-            continue
-        found.labeled[digit] = count
-        found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
+        if undecided or rivals.any():
+            found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
 
 
 @kernel
@@ -231,7 +202,7 @@ def _find_contested(
     table: MarkerTable,
     missing: Bool[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "N"]:
-    """Points with an unsettled label and a missing marker of another digit nearby."""
+    """Points whose label has weak evidence, with a missing marker of another digit nearby."""
     contested = np.zeros(len(points), dtype=np.bool_)
     for point in range(len(points)):
         owner = table.assigned[point]
