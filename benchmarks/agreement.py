@@ -19,7 +19,7 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import HIGH, LOW, sample_valid_angles
 from train.simulation.scenes import sample_hands

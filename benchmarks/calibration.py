@@ -37,8 +37,7 @@ from gloves.fit import GloveFit, attach_markers, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIZES, HandShape, sample_shape, shape_from_measures
-from handsim.hand.topology import BONES, SIDES
+from handsim.hand.shape import BONES, SIDES, SIZES, HandShape, sample_shape, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.energy import contact_geometry, initialize_contacts

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.files.atomic import atomic_write
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, PALM
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import BONES, PALM
+from handsim.hand.skin import vertex_normals
 from track.calibration.user_calibration import Calibration
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from benchmarks.paper.take_evaluation import measured_users, nearest_size, nomin
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.fit import GloveFit, nominal_fit
 from gloves.takes.take import Take, keypoints_of
-from handsim.hand.topology import JOINT_NAMES
+from handsim.hand.shape import JOINT_NAMES
 from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
 from track.tracker import Tracker

@@ -25,7 +25,7 @@ from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.labelers.networks import labeler_of
 from train.loop import TrainingState, start_fabric
-from train.settings import KINDS, TrainSettings, batch_recipe, default_config
+from train.settings import KINDS, TrainSettings, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import DatasetConfig
 
@@ -50,7 +50,7 @@ def main() -> None:
         markers = read_markers(find_captures([options.captures]), load_layout(GLOVE).names)
         tests["captures"] = markers[:: -(-len(markers) // tested)]
     with tempfile.TemporaryDirectory() as folder:
-        config = dataclasses.replace(default_config(options.labeler), samples=options.samples)
+        config = dataclasses.replace(usual_settings(options.labeler), samples=options.samples)
         beaten = race(tests, options.frames, config, Path(folder))
     for name, times in beaten.items():
         print(name + ": " + ", ".join(f"{test} after {minutes:.1f} min" for test, minutes in times.items()))
@@ -72,7 +72,7 @@ def race(
     make_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
-    recipe = batch_recipe(config, len(names))
+    recipe = config.batch_recipe(len(names))
     print(f"{(time.perf_counter() - start) / 60:5.1f} min: {frames} frames generated")
     state = TrainingState(config, start_fabric(config, folder), rows)
     beaten: dict[str, dict[str, float]] = {name: {} for name in tests}

@@ -21,10 +21,8 @@ from benchmarks.people import right_hands
 from benchmarks.record import add_save, describe, save_figures
 from gloves.fit import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape, shape_from_measures
-from handsim.hand.topology import JOINTS
+from handsim.hand.model import HandModel, skinned_jacobian
+from handsim.hand.shape import JOINTS, HandShape, shape_from_measures
 from handsim.kernels import move
 from track.kinematics.pose_solver import PoseFit, solve_pose
 

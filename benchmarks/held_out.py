@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import load_layout
-from handsim.space.cameras import as_rig
+from handsim.space.rig import as_rig
 from train.data.shards import row_dtype
 from train.simulation.scenes import sample_hands
 from train.simulation.training_frames import DatasetConfig, simulate_frames

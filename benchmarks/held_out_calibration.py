@@ -28,7 +28,7 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.captures import calibrate, measure_hands, track_capture
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.takes import simulate_take
@@ -57,7 +57,7 @@ def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
     count = round(seconds * RATE)
     seen, layout = truth.cut(0, count), load_layout(truth.hands[0].layout.name)  # as designed, not as worn
     before = measure_hands(seen, layout, hands=truth.sides)
-    user = calibrate(seen, layout, hands=truth.sides)
+    user = calibrate(seen, glove=layout, hands=truth.sides)
     takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands) if angles]
     rows = []
     for done, worn in zip(user.calibrations, user, strict=True):
@@ -87,7 +87,7 @@ def run_person(person: Path) -> list[float]:
     )
     capture = Capture(tuple(f"*{column}" for column in range(first.shape[1])), first, RATE)
     before = measure_hands(capture, layout, hands="right")
-    user = calibrate(capture, layout, hands="right")
+    user = calibrate(capture, glove=layout, hands="right")
     (done,) = user.calibrations
     assert done.held_out is not None
     kept = done.held_out.after if done.is_better else done.held_out.before

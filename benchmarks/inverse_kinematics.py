@@ -18,9 +18,7 @@ from scipy.optimize import least_squares
 
 from gloves.fit import Attachment, GloveFit, attach_markers
 from gloves.layout import load_layout
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
 from poses.motion import sample_motion

@@ -42,7 +42,7 @@ import trimesh
 
 from benchmarks import keypoint_training as training
 from benchmarks.record import Figures, add_save, describe, save_figures
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
 from render.config import RenderConfig
 from render.frames import RenderedFrame

@@ -83,7 +83,7 @@ def frames(count: int, rng: np.random.Generator, config: RenderConfig) -> Iterat
         subject = subject_of_poses(
             qpos, model=model, people=len(qpos), person=person, glove="dense19", seed=config.seed
         )
-        drawing = Drawing(subject, config)
+        drawing = Drawing(subject, config.resolved())
         for shard, chosen in enumerate(drawing.shards()):
             yield from drawing.frames(shard, enumerate(chosen))
 

@@ -24,8 +24,8 @@ from scipy.stats import spearmanr
 from benchmarks.record import describe
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
-from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
-from handsim.space.cameras import load_rig
+from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
+from handsim.space.rig import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses

@@ -18,7 +18,7 @@ from benchmarks.layout_forecast import chosen_layouts, stored, trial_figures
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
-from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
+from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from track.glove_advice.trials import METHODS
 from train.labelers.layout_labeler import learned_labeler
 

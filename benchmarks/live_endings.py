@@ -34,8 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gloves.captures.formats import write_capture
-from gloves.takes.archives import CutOffWarning
-from gloves.takes.growing import GrownArchive
+from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.take import load_take
 from handsim.cli.main import main as handsim
 from train.simulation.takes import simulate_take

@@ -25,13 +25,11 @@ from websockets.sync.client import connect
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
 from gloves.takes.take import Take
-from track.settings import warm_up
 from track.sinks import open_sinks
-from track.streams import natnet
-from track.streams.addresses import open_source
-from track.streams.natnet import ServerInfo
-from track.streams.natnet_server import LOOPBACK, ReplayServer
-from track.tracker import Tracker
+from track.streams import LOOPBACK, natnet
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer, ServerInfo
+from track.tracker import Tracker, warm_up
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 

@@ -31,14 +31,13 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
-from gloves.takes.growing import GrownArchive
+from gloves.takes.archives import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
-from track.streams import natnet
+from track.streams import LOOPBACK, natnet
+from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream
-from track.streams.natnet import Kind, MarkerFrame, ServerInfo
-from track.streams.natnet_server import LOOPBACK, ReplayServer
-from track.streams.point_stream import open_stream
+from track.streams.natnet import Kind, ReplayServer, ServerInfo, open_stream
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
@@ -163,7 +162,7 @@ class BadServer(threading.Thread):
         # A new round is as of new markers: their IDs do not go on.
         ids = self._take.ids[row, there].astype(np.int64) + number // self._take.num_frames * 100_000
         return natnet.pack_frame(
-            MarkerFrame(number, told, self._take.points[row, there], ids % 2**31), natnet.NEWEST
+            StreamedFrame(number, told, self._take.points[row, there], ids % 2**31), natnet.NEWEST
         )
 
 

@@ -32,8 +32,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import Take, load_take
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side, sample_shape
 from handsim.space.camera import Camera, preset
 from poses.shapes import gesture, make_valid
 from render.color_sensor import ExposureConfig, sample_exposure

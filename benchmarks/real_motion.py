@@ -84,7 +84,7 @@ def print_row(name: str, values: object, rest: str = "") -> None:
 def label(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The same for `handsim label`; the computing time is the mean one, the size measured included."""
     start = perf_counter()
-    take = label_capture(scene.capture(), load_layout("dense19"))
+    take = label_capture(scene.capture(), glove="dense19")
     seconds = np.full(len(scene.points), (perf_counter() - start) / len(scene.points))
     right = ((take.labels == true_labels(scene)) | ~np.isfinite(scene.points[..., 0])).all(axis=1)
     return right[scene.counted], seconds

@@ -65,7 +65,7 @@ def a_take(frames: int) -> Take:
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
-    drawing = Drawing(subject_of_take(a_take(frames)), config)
+    drawing = Drawing(subject_of_take(a_take(frames)), config.resolved())
     return drawing.frames(shard, enumerate(range(frames)))
 
 

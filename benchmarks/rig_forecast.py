@@ -23,7 +23,7 @@ from benchmarks.record import describe
 from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.rig_advice.forecast import Forecast, forecast, light_work
 from train.rig_advice.planning import plan_rig
 from train.rig_advice.work import sample_work

@@ -26,7 +26,7 @@ from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import clear_of_mesh, facing_cameras, hand_tree, visible_cameras
 from handsim.hand.model import join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from train.simulation.room import (

@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.space.camera import Camera, pinhole
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, pinhole
 from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
-from render.depth_sensor import SENSORS, apply_depth_noise, named_sensor, reflectance_of
+from render.depth_sensor import DEPTH_NOISES, SENSORS, apply_depth_noise, reflectance_of
 from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals
 
 
@@ -63,7 +62,7 @@ def main() -> None:
 
     print(f"\ndepth noise, {size[0]} x {size[1]}, with normals and colors")
     for name in SENSORS:
-        noise = named_sensor(name)
+        noise = DEPTH_NOISES[name]
         clock(
             name,
             lambda noise=noise: apply_depth_noise(
@@ -102,8 +101,8 @@ def main() -> None:
         drawn = [sphere_and_wall(face.at(np.eye(4))) for face in faces]
         depths, directions, colors = (list(kind) for kind in zip(*drawn, strict=True))
         ids = [np.ascontiguousarray(color[..., 0]) for color in colors]
-        clock("colors", lambda c=lensed, p=colors: warp(c, p, "linear"), repeats)
-        clock("ids", lambda c=lensed, p=ids: warp(c, p, "nearest"), repeats)
+        clock("colors", lambda c=lensed, p=colors: warp(c, p, cv2.INTER_LINEAR), repeats)
+        clock("ids", lambda c=lensed, p=ids: warp(c, p), repeats)
         clock("depth", lambda c=lensed, p=depths: warp_depth(c, p), repeats)
         clock("normals", lambda c=lensed, p=directions: warp_normals(c, p), repeats)
 

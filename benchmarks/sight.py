@@ -29,9 +29,8 @@ from gloves.optics.visibility import (
     visible_cameras,
 )
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import Side
-from handsim.space.cameras import CameraRig, list_rigs, named_rig
+from handsim.hand.shape import Side, sample_shape
+from handsim.space.rig import CameraRig, list_rigs, named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 

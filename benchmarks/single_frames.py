@@ -49,7 +49,7 @@ class CommandLabeler:
             row[: len(cloud)] = cloud
         names = tuple(f"*{column}" for column in range(points.shape[1]))
         order = np.random.default_rng(0).permutation(len(frames))
-        take = label_capture(Capture(names, points[order], RATE), self._glove, labeler=self._labeler)
+        take = label_capture(Capture(names, points[order], RATE), glove=self._glove, labeler=self._labeler)
         labels = np.where(take.labels >= 0, take.labels % len(self.marker_names), -1)
         return [
             Labeling(labels[row, : len(cloud)], take.confidence[row, : len(cloud)])

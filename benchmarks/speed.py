@@ -57,23 +57,21 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from poses.shapes import sample_valid_angles
-from track.settings import warm_up
-from track.tracker import Tracker
+from track.tracker import Tracker, warm_up
 from train.data.batches import Corruption, corrupt, draw_batch
 from train.data.shards import Dataset
-from train.devices.fabric_start import start_fabric
+from train.devices import start_fabric
 from train.labelers.networks import labeler_of, new_network
-from train.labelers.protocol import Labeler
+from train.labelers.protocol import Labeler, torch_threads
 from train.labelers.storage import OnnxLabeler, export_onnx, load_labeler, load_network
 from train.loop import TrainingState
-from train.settings import CNNConfig, batch_recipe, default_config
+from train.settings import CNNConfig, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
 from train.simulation.training_frames import DatasetConfig, SceneMix
-from train.threads import TrainingThreads
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
@@ -288,33 +286,26 @@ def commands(speeds: Speeds) -> None:
 
 
 def training(speeds: Speeds) -> None:
-    torch.set_num_threads(CORES)
-    config = default_config("cnn")
+    config = usual_settings("cnn")
     with tempfile.TemporaryDirectory() as folder:
         make_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
-        rng, recipe = np.random.default_rng(0), batch_recipe(config, rows["markers"].shape[1])
+        rng, recipe = np.random.default_rng(0), config.batch_recipe(rows["markers"].shape[1])
 
         def images(seconds: float) -> float:
             """Images a second over a while."""
             count, start = 0, time.perf_counter()
             while time.perf_counter() - start < seconds:
-                with threads.timed_step():
-                    state.step(draw_batch(rows, recipe, rng=rng), rng=rng)
+                state.step(draw_batch(rows, recipe, rng=rng), rng=rng)
                 count += config.batch
             return count / (time.perf_counter() - start)
 
-        def try_step() -> None:
-            state.try_step(draw_batch(rows, recipe, rng=rng), rng=rng)
-
-        threads = TrainingThreads(None, try_step)
-        with threads.in_use():
+        with torch_threads(CORES):
             images(speeds.some(20, 1))
             alone = images(speeds.some(60, 2))
             with busy_process():
                 beside = images(speeds.some(60, 2))
-    torch.set_num_threads(1)
     speeds.rate("training", "images learned by the paper's network", alone)
     speeds.rate("training_beside", "the same beside a busy process", beside)
 

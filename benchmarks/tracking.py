@@ -43,8 +43,7 @@ from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from track.captures import calibrate
-from track.settings import warm_up
-from track.tracker import Tracker
+from track.tracker import Tracker, warm_up
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind

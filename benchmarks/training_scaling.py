@@ -81,7 +81,9 @@ def main() -> None:
 
 def train(dataset: Path, out: Path, devices: int, options: list[str]) -> Run:
     """Run `handsim train` and look at the memory of its processes now and then."""
-    command = [*HANDSIM, "train", str(dataset), "--out", str(out), "--devices", str(devices)]
+    several = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={devices}"]
+    start = [*several, "-m", "handsim.cli.main"] if devices > 1 else HANDSIM
+    command = [*start, "train", str(dataset), "--out", str(out)]
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen([*command, "--threads", "1", *options], stdout=said, stderr=said)
         largest: list[Memory] = []

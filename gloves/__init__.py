@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gloves.layout import MarkerPlace as MarkerPlace
     from gloves.layout import load_layout as load_layout
     from gloves.takes.points import PointList as PointList
-    from gloves.takes.status import Status as Status
+    from gloves.takes.points import Status as Status
     from gloves.takes.take import RigidBody as RigidBody
     from gloves.takes.take import Take as Take
     from gloves.takes.take import load_take as load_take

@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, load_layout
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
-from handsim.hand.mjcf import Site
-from handsim.hand.model import HandModel, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.skin.surface import HandSurface, vertex_normals
-from handsim.hand.topology import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, Side
+from handsim.hand.model import HandModel, Site, load_model
+from handsim.hand.shape import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
+from handsim.hand.skin import HandSurface, vertex_normals
 from handsim.kernels import kernel
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 
 _MOST_FITTINGS: Final = 20

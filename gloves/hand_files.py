@@ -11,12 +11,10 @@ from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from handsim.files.atomic import atomic_write
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.osim import hand_osim
-from handsim.hand.topology import NUM_JOINTS
-from handsim.hand.urdf import hand_urdf
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import HandModel, build_spec, join_qpos
+from handsim.hand.model_files import hand_osim, hand_urdf
+from handsim.hand.shape import NUM_JOINTS
 
 ENDINGS: Final = (".xml", ".urdf", ".osim", ".glb")
 WITH_MARKERS: Final = (".xml", ".osim")

@@ -21,9 +21,9 @@ from jaxtyping import Float
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import HandSimError, LayoutError, choices
-from handsim.files.atomic import atomic_write, read_toml
-from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
-from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
+from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
@@ -74,7 +74,7 @@ class MarkerPlace:
 
     name: str
     bone: str
-    """One of `handsim.hand.topology.BONE_NAMES`; pinky_distal is another name of little_distal, and so on."""
+    """One of `handsim.hand.shape.BONE_NAMES`; pinky_distal is another name of little_distal, and so on."""
     along: float
     """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
     around: float

@@ -11,7 +11,6 @@ from handsim._kernel_cache import ensure_kernel_cache
 from handsim._lazy import lazy_exports
 from handsim._siblings import ShadowedPackageWarning as ShadowedPackageWarning
 from handsim._siblings import warn_if_shadowed
-from handsim._version import __version__ as __version__
 from handsim.errors import HandSimError as HandSimError
 from handsim.errors import HandSimWarning as HandSimWarning
 
@@ -24,12 +23,13 @@ if TYPE_CHECKING:
     from handsim.hand.shape import sample_shape as sample_shape
     from handsim.pages import write_page as write_page
     from handsim.space.camera import Camera as Camera
+    from handsim.space.camera import Lens as Lens
     from handsim.space.camera import look_at as look_at
-    from handsim.space.cameras import CameraRig as CameraRig
-    from handsim.space.cameras import load_rig as load_rig
-    from handsim.space.lens import Lens as Lens
     from handsim.space.objects import RigidObject as RigidObject
+    from handsim.space.rig import CameraRig as CameraRig
+    from handsim.space.rig import load_rig as load_rig
 
+__version__ = "0.1.0"
 __getattr__, __dir__ = lazy_exports(__name__)
 
 ensure_kernel_cache()

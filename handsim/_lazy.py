@@ -20,7 +20,7 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     own = sys.modules[package]
     body = ast.parse(Path(str(own.__file__)).read_text(encoding="utf-8")).body
     lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
-    public = sorted({*lazy, *dict(_exports(body))})
+    public = sorted({*lazy, *dict(_exports(body)), "__version__"})
     vars(own)["__all__"] = public
 
     def load(name: str) -> Any:

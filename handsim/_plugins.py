@@ -1,4 +1,7 @@
-"""Functions and classes of users' own, by `module:name` or by the name of an entry point."""
+"""Code that comes from elsewhere: optional packages, and functions and classes of users' own.
+
+Users name theirs as `module:name`, or by the name of an entry point.
+"""
 
 from __future__ import annotations
 
@@ -132,3 +135,18 @@ def _told(error: Exception) -> str:
     """An error and the line that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({last.filename}, line {last.lineno})"
+
+
+EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
+"""What drawing through OpenGL without a screen needs of Debian and Ubuntu, which pip cannot install."""
+
+
+def import_extra(module: str, what: str, extra: str) -> Any:
+    """A module of an optional package, for something (`what`, in messages) that needs it."""
+    try:
+        return importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library
+        raise ArgumentError(
+            f"{what} needs the package {module.partition('.')[0]}, which cannot be imported "
+            f"({' '.join(str(error).split())}); run `pip install 'handsim[{extra}]'`"
+        ) from error

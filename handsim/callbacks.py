@@ -1,8 +1,10 @@
-"""What long work calls to tell how far it is; the same everywhere."""
+"""What long work calls to tell how far it is, and objects that are closed at its end."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import TracebackType
+from typing import Self
 
 Progress = Callable[[int, int], None]
 """Called with what is done and all there is to do: frames, samples, pictures or steps."""
@@ -16,3 +18,19 @@ def no_progress(done: int, total: int) -> None:
 
 def no_step(name: str) -> None:
     """The `OnStep` of work that nobody watches."""
+
+
+class Closing:
+    """A base of classes with `close`: the end of a `with` block closes them, whatever ended it."""
+
+    def close(self) -> None:
+        """Give back what is held; to be overridden."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

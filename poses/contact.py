@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim.hand.capsules import bounding_spheres
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import bounding_spheres, overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions

@@ -17,11 +17,18 @@ from scipy.spatial.transform import Rotation
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.json_files import package_data
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import shape_from_measures
-from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, NUM_QPOS, PALM, bones_of
+from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
+from handsim.hand.shape import (
+    BONE_NAMES,
+    BONES,
+    DIGITS,
+    JOINTS,
+    NUM_JOINTS,
+    NUM_QPOS,
+    PALM,
+    bones_of,
+    shape_from_measures,
+)
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions, vector_quaternions
 from poses.shapes import HIGH, LOW, gesture, is_valid

@@ -19,9 +19,8 @@ from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import DIGITS, NUM_JOINTS
-from handsim.space.cameras import ROOM_CENTER
+from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.shapes import (
     HIGH,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject

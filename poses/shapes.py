@@ -16,8 +16,7 @@ from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.json_files import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import JOINTS, NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
 """Names of all libraries; no two hold the same name."""
@@ -358,7 +357,7 @@ class PoseSampler(Protocol):
             rng: Source of all randomness.
 
         Returns:
-            Joint angles [rad], in the order of `handsim.hand.topology.JOINTS`; or whole poses: wrist position
+            Joint angles [rad], in the order of `handsim.hand.shape.JOINTS`; or whole poses: wrist position
             [m], wrist orientation (wxyz) and these angles.
         """
 

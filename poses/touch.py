@@ -18,8 +18,7 @@ from handsim._checks import check_array, check_choice
 from handsim.errors import PoseError
 from handsim.hand.capsules import Capsules
 from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
+from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape, bones_of
 from handsim.kernels import kernel, segment_distance_squared
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, gesture, is_valid, make_valid
 

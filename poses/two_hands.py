@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.json_files import package_data
-from handsim.hand.contact import overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
-from handsim.hand.topology import DIGITS, bones_of
-from handsim.space.cameras import ROOM_CENTER
+from handsim.hand.shape import DIGITS, bones_of
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions
 from poses.contact import (
     APPROACH,

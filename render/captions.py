@@ -10,16 +10,14 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
-from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.atomic import atomic_write
-from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
-from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, DIGITS
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
+from handsim.hand.shape import BONES, DIGITS
+from handsim.hand.skin import vertex_normals
 from render.formats.records import CENTER, as_sensed
-from render.frames import HandTruth, RenderedFrame
+from render.frames import Bytes, Doubles, HandTruth, RenderedFrame
 from render.painting.figures import Material, linear
 from render.skin.texture import GLOVE_COLOR
 
@@ -63,8 +61,7 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
         reddening += mine * np.clip(share, 0.0, 1.0)
     pale = np.clip(-vertex_normals(surface.vertices, surface.faces)[:, 2], 0.0, 1.0)[:, None]
     paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
-    tint: NDArray[np.float64] = 1.0 + pale * paleness + reddening[:, None] * redness
-    return tint
+    return np.asarray(1.0 + pale * paleness + reddening[:, None] * redness)
 
 
 Picture = UInt8[np.ndarray, "H W 3"]
@@ -78,12 +75,7 @@ _PADDING: Final = 16  # [pixels]
 
 
 def write_png(path: str | Path, picture: Picture) -> None:
-    """Write a picture as PNG.
-
-    Raises:
-        HandSimError: The name does not end in .png.
-        OSError: The file cannot be written.
-    """
+    """Write a picture as PNG."""
     if Path(path).suffix.lower() != ".png":
         raise HandSimError(f"{path}: expected a file name that ends in .png")
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
@@ -130,13 +122,7 @@ def with_names(
     names: Sequence[str],
     colors: Float[np.ndarray, "M 3"] | None = None,
 ) -> Picture:
-    """The picture between two columns of names, with a thin line from each name to its point in the picture.
-
-    Args:
-        pixels: Points in it, x right and y down [px]; NaN rows get no name.
-        names: One per point.
-        colors: sRGB in [0, 1] of each name; ink when not given.
-    """
+    """The picture between columns of names, with a thin line from each name to its point [px], if finite."""
     shown = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     column = 2 * _PADDING + max((text_width(name) for name in names), default=0)
     width = picture.shape[1]
@@ -162,7 +148,7 @@ def with_names(
     return result
 
 
-def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> NDArray[np.float64]:
+def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> Doubles:
     """Ascending heights near the desired ones, at least `step` apart, between `low` and `high` [px].
 
     They are the least-squares solution, by pooling adjacent violators.
@@ -177,8 +163,7 @@ def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: f
         blocks.append((mean, count))
     means = np.repeat([mean for mean, _ in blocks], [count for _, count in blocks]) if blocks else slots
     most = max(low, high - (slots[-1] if len(slots) else 0.0))
-    heights: NDArray[np.float64] = np.clip(means, low, most) + slots
-    return heights
+    return np.asarray(np.clip(means, low, most) + slots)
 
 
 def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Picture:
@@ -212,9 +197,6 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
     """Some frames in rows of `columns`, at most so wide each [px]; hidden keypoints are hollow.
 
     A frame without colors shows its depth alone.
-
-    Raises:
-        HandSimError: There are no frames, or one has neither colors nor depth.
     """
     if not frames:
         raise HandSimError("a contact sheet needs at least one frame")
@@ -230,13 +212,7 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
 
 
 def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float = 1.0) -> Picture:
-    """The picture with the hands' skeletons in it, in the digits' colors.
-
-    Args:
-        picture: The picture; not changed.
-        hands: Hands whose `pixels` are drawn where they are known.
-        scale: Pixels of this picture per pixel of the camera.
-    """
+    """The picture with the hands' skeletons in it, in the digits' colors."""
     drawn = np.ascontiguousarray(picture).copy()
     colors = np.rint(255 * bone_colors()).astype(int)
     inks = [tuple(colors[0 if digit < 0 else 1 + 3 * digit].tolist()) for digit in KEYPOINT_DIGITS]
@@ -261,7 +237,7 @@ def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float
 def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
     """Depth as colors, the nearest red, the farthest blue; background where there is nothing."""
     present = depth > 0.0
-    picture: NDArray[np.uint8] = np.empty((*depth.shape, 3), dtype=np.uint8)
+    picture: Bytes = np.empty((*depth.shape, 3), dtype=np.uint8)
     picture[:] = _EMPTY
     if present.any():
         near, far = depth[present].min(), depth[present].max()
@@ -290,8 +266,7 @@ def _scaled(picture: Picture, scale: float) -> Picture:
     if scale == 1.0:
         return picture
     size = [max(1, round(scale * length)) for length in picture.shape[1::-1]]
-    smaller: NDArray[np.uint8] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return smaller
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 def _padded(picture: Picture, height: int, width: int) -> Picture:

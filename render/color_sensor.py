@@ -13,16 +13,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from render.fields import quantiles, random_words
+from render.frames import Bytes, Floats
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
@@ -86,73 +86,56 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
 
 def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
-    light: NDArray[np.float32] = cv2.LUT(rgb, _decoded())
-    return light
+    return np.asarray(cv2.LUT(rgb, _decoded()))
 
 
 def expose(
     linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture that a sensor takes of light (1 is white, more is as white), sRGB.
-
-    Raises:
-        ArgumentError: The light is not a picture of three colors.
-    """
-    if linear.ndim != 3 or linear.shape[2] != 3:
-        raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
+    """The picture that a sensor takes of light (1 is white, more is as white), sRGB."""
     height, width = linear.shape[:2]
     rgb = np.empty((height, 3 * width), np.uint8)
     white = exposure.white_electrons
     words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
     away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
-    numbers = _Sensor(
-        np.float32(2.0**exposure.stops),
-        np.float32(exposure.vignetting),
-        np.float32(1.0 / white if white > 0.0 else 0.0),
-        np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0),
-    )
+    gain, lost = np.float32(2.0**exposure.stops), np.float32(exposure.vignetting)
+    shot = np.float32(1.0 / white if white > 0.0 else 0.0)
+    dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
     balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
     light = np.ascontiguousarray(linear, dtype=np.float32)
     if exposure.blur > 0.0:
         light = cv2.GaussianBlur(light, _SPREAD, exposure.blur)
     light = light.reshape(height, 3 * width)
-    _expose(light, *numbers, words.reshape(-1, 3 * width), quantiles(), away, balance, _root_curve(), rgb)
+    words, curve = words.reshape(-1, 3 * width), _root_curve()
+    _expose(light, gain, lost, shot, dark, words, quantiles(), away, balance, curve, rgb)
     rgb = rgb.reshape(linear.shape)
-    return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
-
-
-class _Sensor(NamedTuple):
-    """Numbers of a picture's exposure."""
-
-    gain: np.float32
-    """Factor on the light in the middle of the picture."""
-    lost: np.float32
-    """Share that is missing in the corners; it grows with the squared distance from the middle."""
-    shot: np.float32
-    """One over the electrons of white; 0 for no noise."""
-    dark: np.float32
-    """Variance of the noise in the dark, 1 for white."""
+    if exposure.jpeg_quality is None:
+        return rgb
+    done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])
+    assert done
+    return np.asarray(cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
 
 
 @kernel
 def _expose(
-    linear: NDArray[np.float32],
+    linear: Floats,
     gain: np.float32,
     lost: np.float32,
     shot: np.float32,
     dark: np.float32,
     words: NDArray[np.uint16],
-    normal: NDArray[np.float32],
-    away: NDArray[np.float32],
-    balance: NDArray[np.float32],
-    curve: NDArray[np.uint8],
-    rgb: NDArray[np.uint8],
+    normal: Floats,
+    away: Floats,
+    balance: Floats,
+    curve: Bytes,
+    rgb: Bytes,
 ) -> None:
     """Write what a sensor makes of light (H, 3 W), row by row, in loops that compile to vector instructions.
 
-    `gain`, `lost`, `shot` and `dark` are those of `_Sensor`; `words` are random, and empty for no noise;
-    `away` is the squared distance of a row's values from the middle column [px^2], `balance` a factor on
-    each.
+    `gain` is a factor on the light in the middle, `lost` the share that is missing in the corners, `shot` one
+    over the electrons of white, `dark` the variance of the noise in the dark; `words` are random, and empty
+    for no noise; `away` is the squared distance of a row's values from the middle column [px^2], `balance` a
+    factor on each.
     """
     height, width = linear.shape
     corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))
@@ -177,40 +160,22 @@ def _expose(
             rgb[row, n] = curve[level[n]]
 
 
-def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
-    """The sRGB picture of light, clipped to what it can show: the inverse of `linear_of`."""
-    scaled = light * np.float32(_LEVELS - 1)
-    scaled += np.float32(0.5)
-    np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
-    return _curve().take(scaled.astype(np.uint16), mode="clip")
-
-
-def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    assert done
-    picture: NDArray[np.uint8] = cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    return picture
-
-
 @functools.cache
-def _decoded() -> NDArray[np.float32]:
+def _decoded() -> Floats:
     """Light of the 256 sRGB values (IEC 61966-2-1)."""
     value = np.arange(256) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @functools.cache
-def _root_curve() -> NDArray[np.uint8]:
+def _root_curve() -> Bytes:
     """The sRGB values of light in even steps of its root: sixteen or more to each."""
-    return encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
-
-
-@functools.cache
-def _curve() -> NDArray[np.uint8]:
-    """The sRGB values of light in even steps."""
     light = np.arange(_LEVELS) / (_LEVELS - 1)
     value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * value).astype(np.uint8)
+    roots = ((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32)
+    return np.rint(255.0 * value).astype(np.uint8)[
+        (roots * np.float32(_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,24 +217,7 @@ def shutter_times(
 
     The time in which any row is open is cut into as many equal pieces; a moment is a piece's middle, and a
     row's weights are the shares of its exposure that fall into the pieces.
-
-    Args:
-        exposure: Of a row [s].
-        readout: From the first row's opening to the last one's [s].
-        sub_frames: How many moments.
-        height: Rows of the picture.
-
-    Returns:
-        Times [s], 0 in the middle, and weights, which add up to 1 in every row.
-
-    Raises:
-        ArgumentError: A time is negative or not finite, or there is no moment or no row.
     """
-    if not (0.0 <= exposure < np.inf and 0.0 <= readout < np.inf) or sub_frames < 1 or height < 1:
-        raise ArgumentError(
-            f"a shutter of {exposure:g} s, read out in {readout:g} s, with {sub_frames} sub-frames of "
-            f"{height} rows; expected times of at least 0 and counts of at least 1"
-        )
     total = exposure + readout
     cuts = total * (np.arange(sub_frames + 1) / sub_frames - 0.5)
     times = 0.5 * (cuts[:-1] + cuts[1:])
@@ -292,25 +240,14 @@ def combine(
 
     Moments come in their order, as sRGB bytes or as light; one is held at a time. Weights are those of
     `shutter_times`.
-
-    Raises:
-        ArgumentError: There are not as many moments as weights, or one has another size.
     """
-    total: NDArray[np.float32] | None = None
-    count = 0
-    for number, frame in enumerate(sub_frames):
-        count = number + 1
-        if number >= weights.shape[1] or len(frame) != len(weights):
-            break
-        if total is None:
-            total = np.zeros(frame.shape, np.float32)
-        (rows,) = np.nonzero(weights[:, number])
+    total: Floats | None = None
+    for frame, share in zip(sub_frames, weights.T, strict=True):
+        total = np.zeros(frame.shape, np.float32) if total is None else total
+        (rows,) = np.nonzero(share)
         if len(rows):
             part = slice(rows[0], rows[-1] + 1)
             light = linear_of(np.ascontiguousarray(frame[part])) if frame.dtype == np.uint8 else frame[part]
-            total[part] += light * weights[part, number, None, None].astype(np.float32)
-    if total is None or count != weights.shape[1] or len(total) != len(weights):
-        raise ArgumentError(
-            f"{count} or more sub-frames of some height, expected {weights.shape[1]} of {len(weights)} rows"
-        )
+            total[part] += light * share[part, None, None].astype(np.float32)
+    assert total is not None
     return total

@@ -11,19 +11,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice, check_number
-from handsim.errors import ArgumentError
+from handsim._checks import check_choice
 from handsim.kernels import kernel
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
+from handsim.settings import Limits, Settings
+from handsim.space.camera import Camera, Lens, camera_matrix
 from render.fields import normal_numbers, quantiles, random_words
+from render.frames import Flags, Floats, Integers
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
 _FIXED: Final = 32.0  # disparities are compared in 1/32 px, which fit sixteen bits up to 1023 px
@@ -58,36 +58,23 @@ class StructuredLight:
     """What is measured at all [m]."""
 
 
-def measure_disparity(
-    depth: Float32[np.ndarray, "H W"],
-    cosines: Float32[np.ndarray, "H W"] | None,
-    noise: StructuredLight,
-    focal: float,
-    *,
-    rng: np.random.Generator,
-) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
-
-    Cosines are of the angles between normals and the rays that come back (None: all surfaces face), `focal`
-    is the camera's horizontal focal length [px].
-    """
+def _measure_disparity(
+    depth: Floats, cosines: Floats, noise: StructuredLight, focal: float, *, rng: np.random.Generator
+) -> Floats:
+    """Depth (H, W) as the sensor has it [m], 0 where it has none; `focal` is horizontal [px]."""
     scale, height, width = np.float32(noise.baseline * focal), *depth.shape
     with np.errstate(divide="ignore"):
         ideal = np.where(depth > 0.0, scale / depth, np.float32(0.0))
     kept = (depth >= noise.nearest) & (depth <= noise.farthest)
-    if cosines is not None:
-        kept &= cosines >= np.cos(noise.steepest)
+    kept &= cosines >= np.cos(noise.steepest)
     if noise.support > 0.0:
         coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
         needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
         _keep_supported(ideal, needed.astype(np.int64), int(noise.agreement * _FIXED), kept)
     if noise.shadow:
-        _keep_lit(ideal, kept)
-    if max(noise.shift, noise.disparity_noise, noise.step) <= 0.0:
-        return np.where(kept, depth, np.float32(0.0))
-    moved, wavering = noise.shift > 0.0, noise.disparity_noise > 0.0
-    shifts = random_words((2, height, width) if moved else (2, 0, 0), rng=rng)
-    words = random_words((height, width) if wavering else (0, 0), rng=rng)
+        keep_lit(ideal, kept)
+    shifts = random_words((2, height, width) if noise.shift > 0.0 else (2, 0, 0), rng=rng)
+    words = random_words((height, width) if noise.disparity_noise > 0.0 else (0, 0), rng=rng)
     measured = np.zeros_like(depth)
     table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
     step = np.float32(noise.step)
@@ -95,26 +82,15 @@ def measure_disparity(
     return measured
 
 
-def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels that a nearer surface hides from the projector, which stands to the right in the same row.
+@kernel
+def keep_lit(disparity: Floats, kept: Flags) -> None:
+    """Clear pixels of `kept` (H, W) that a nearer surface hides from the projector, to the right in the row.
 
     A pixel of disparity d is d columns further left in the projector's picture. Where several pixels fall on
     one of its columns, the nearest one is visible to it.
     """
-    lit = np.ones(disparity.shape, np.bool_)
-    _keep_lit(disparity, lit)
-    return ~lit
-
-
-@kernel
-def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
-    """Clear what is `shadowed` of `kept` (H, W)."""
     height, width = disparity.shape
-    most = (
-        np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
-        if disparity.size
-        else np.float32(1.0)
-    )
+    most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
     first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
     for row in range(height):
         first[:] = 0.0
@@ -130,9 +106,7 @@ def _keep_lit(disparity: NDArray[np.float32], kept: NDArray[np.bool_]) -> None:
 
 
 @kernel
-def _keep_supported(
-    disparity: NDArray[np.float32], needed: NDArray[np.int64], most: int, kept: NDArray[np.bool_]
-) -> None:
+def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags) -> None:
     """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
 
     `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
@@ -157,16 +131,16 @@ def _keep_supported(
 
 @kernel
 def _match(
-    disparity: NDArray[np.float32],
-    kept: NDArray[np.bool_],
+    disparity: Floats,
+    kept: Flags,
     shifts: NDArray[np.uint16],
     offsets: NDArray[np.int32],
     words: NDArray[np.uint16],
-    noise: NDArray[np.float32],
+    noise: Floats,
     step: np.float32,
     least: np.float32,
     scale: np.float32,
-    depth: NDArray[np.float32],
+    depth: Floats,
 ) -> None:
     """Write the depth [m] of the pixels that are kept.
 
@@ -231,23 +205,20 @@ class TimeOfFlight:
     """What is measured at all [m]."""
 
 
-def measure_flight(
-    depth: Float32[np.ndarray, "H W"],
-    cosines: Float32[np.ndarray, "H W"] | None,
-    reflectance: Float32[np.ndarray, "H W"] | None,
-    noise: TimeOfFlight,
-    *,
-    rng: np.random.Generator,
-) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis as the sensor has it [m], 0 where it has none.
-
-    Cosines are of the angles between normals and the rays that come back (None: all surfaces face),
-    reflectance the share of light that surfaces send back (None: all are white walls).
-    """
+def _measure_flight(
+    depth: Floats, cosines: Floats, reflectance: Floats, noise: TimeOfFlight, *, rng: np.random.Generator
+) -> Floats:
+    """Depth (H, W) as the sensor has it [m], 0 where it has none."""
     there = depth > 0.0
     measured = _mixed(depth, noise, rng=rng)
-    sigma = _sigma(depth, cosines, reflectance, noise)
-    if sigma is not None:
+    c0, c1, c2 = (np.float32(c) for c in noise.sigma)
+    if any(noise.sigma) or noise.angle_sigma:
+        sigma = (c2 * depth + c1) * depth + c0
+        if noise.angle_sigma > 0.0:
+            bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+            sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
+        # Shot noise goes with the root of the light.
+        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
         measured += sigma * normal_numbers(depth.shape, rng=rng)
     measured += np.float32(noise.offset)
     if noise.step > 0.0:
@@ -257,13 +228,9 @@ def measure_flight(
     return np.where(there, measured, np.float32(0.0))
 
 
-def _mixed(
-    depth: NDArray[np.float32], noise: TimeOfFlight, *, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _mixed(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> Floats:
     """Depth with flying pixels along edges, and 0 where an edge is not measured."""
     mixed = depth.copy()
-    if noise.flying + noise.dropped <= 0.0:
-        return mixed
     around = np.ones((3, 3), np.uint8)
     far = cv2.dilate(depth, around)
     near = cv2.erode(np.where(depth > 0.0, depth, _NOTHING), around)
@@ -281,53 +248,30 @@ def _mixed(
     return mixed
 
 
-def _sigma(
-    depth: NDArray[np.float32],
-    cosines: NDArray[np.float32] | None,
-    reflectance: NDArray[np.float32] | None,
-    noise: TimeOfFlight,
-) -> NDArray[np.float32] | None:
-    """Standard deviation of each pixel [m]; None: there is none."""
-    c0, c1, c2 = (np.float32(c) for c in noise.sigma)
-    if not (any(noise.sigma) or noise.angle_sigma):
-        return None
-    sigma = (c2 * depth + c1) * depth + c0
-    if cosines is not None and noise.angle_sigma > 0.0:
-        bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
-        sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
-    if reflectance is not None:  # shot noise: as the root of the light
-        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
-    return sigma
-
-
 def _drop_weak(
-    there: NDArray[np.bool_],
-    depth: NDArray[np.float32],
-    cosines: NDArray[np.float32] | None,
-    reflectance: NDArray[np.float32] | None,
+    there: Flags,
+    depth: Floats,
+    cosines: Floats,
+    reflectance: Floats,
     noise: TimeOfFlight,
     *,
     rng: np.random.Generator,
 ) -> None:
     """Take out what is too steep and, within half of the least light above and below it, too dark."""
-    if cosines is not None:
-        last = np.cos(noise.steepest - _FADING)
-        steep = np.flatnonzero(there & (cosines < last))
-        chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
-        there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
+    last = np.cos(noise.steepest - _FADING)
+    steep = np.flatnonzero(there & (cosines < last))
+    chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
+    there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
     if noise.weakest <= 0.0:
         return
-    light = np.float32(1.0) if reflectance is None else reflectance
-    if cosines is not None:
-        light = light * cosines
+    light = reflectance * cosines
     dim = np.flatnonzero(there & (light < np.float32(1.5 * noise.weakest) * depth * depth))
-    bright = np.broadcast_to(light, depth.shape).ravel()[dim] / depth.ravel()[dim] ** 2
-    chance = 1.5 - bright / noise.weakest
+    chance = 1.5 - light.ravel()[dim] / depth.ravel()[dim] ** 2 / noise.weakest
     there.ravel()[dim] = rng.random(len(dim), dtype=np.float32) > chance
 
 
 @functools.lru_cache(maxsize=16)
-def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
+def _angle_terms(angle_sigma: float) -> Floats:
     angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
     angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
     return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
@@ -335,7 +279,7 @@ def _angle_terms(angle_sigma: float) -> NDArray[np.float32]:
 
 DepthNoise = StructuredLight | TimeOfFlight
 # Numbers and their sources are in docs/sensors.md.
-_SENSORS: Final[dict[str, DepthNoise]] = {
+DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
     "kinect1": StructuredLight(),
     "d435": StructuredLight(
         sensor="d435",
@@ -357,14 +301,14 @@ _SENSORS: Final[dict[str, DepthNoise]] = {
         farthest=3.86,
     ),
 }
-SENSORS: Final = tuple(_SENSORS)
+SENSORS: Final = tuple(DEPTH_NOISES)
 
 
 _OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
 @dataclass(frozen=True, slots=True)
-class DepthSensor:
+class DepthSensor(Settings):
     """A depth sensor whose noise is added to depth, or several, one of which is drawn each time.
 
     Raises:
@@ -373,32 +317,24 @@ class DepthSensor:
 
     sensors: tuple[str, ...] = ("kinect2",)
     """Some of `SENSORS`; a name stands for itself alone."""
-    noise: float = 1.0
+    noise: Annotated[float, Limits(0.0)] = 1.0
     """Factor of the noise that was published of it."""
-    spread: float = 0.2
+    spread: Annotated[float, Limits(0.0)] = 0.2
     """Standard deviation of the logarithm of a copy's noise."""
-    offset: float = 0.0035
+    offset: Annotated[float, Limits(0.0)] = 0.0035
     """Standard deviation of a time-of-flight camera's own offset [m]."""
 
-    def __post_init__(self) -> None:
-        given = (self.sensors,) if isinstance(self.sensors, str) else tuple(self.sensors)
-        names = tuple(_OTHER_NAMES.get(name, name) for name in given)
+    def check(self) -> None:
+        """Refuse names of sensors that are unknown."""
+        names = tuple(_OTHER_NAMES.get(name, name) for name in self.sensors)
         for name in names:
             check_choice(name, SENSORS, noun="depth sensor")
-        for name in ("noise", "spread", "offset"):
-            check_number(name, getattr(self, name), 0.0)
         object.__setattr__(self, "sensors", names)
-
-
-def named_sensor(name: str) -> DepthNoise:
-    """A depth sensor as it was published."""
-    check_choice(name, _SENSORS, noun="depth sensor")
-    return _SENSORS[name]
 
 
 def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> DepthNoise | None:
     """One copy of one of the sensors; None if there are none."""
-    sensors = [named_sensor(name) for name in config.sensors]
+    sensors = [DEPTH_NOISES[name] for name in config.sensors]
     if not sensors:
         return None
     noise = sensors[int(rng.integers(len(sensors)))]
@@ -412,40 +348,31 @@ def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> Dept
 
 def apply_depth_noise(
     depth: Float32[np.ndarray, "H W"],
-    normals: Float32[np.ndarray, "H W 3"] | None,
-    noise: DepthNoise | None,
+    normals: Float32[np.ndarray, "H W 3"],
+    noise: DepthNoise,
     *,
     camera: Camera,
-    reflectance: Float32[np.ndarray, "H W"] | None = None,
+    reflectance: Float32[np.ndarray, "H W"] | None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
     """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
 
-    Without normals, in the camera's axes, all surfaces face the camera; without their reflectance for
-    infrared light (`reflectance_of`), which time-of-flight sensors need, all are white. None as noise changes
-    nothing.
+    Normals are in the camera's axes. The reflectance for infrared light counts for time of flight alone.
     """
-    shape = camera.size[1], camera.size[0]
-    for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
-        if picture is not None and picture.shape[:2] != shape:
-            raise ArgumentError(
-                f"{name} has shape {picture.shape}, expected {shape} as camera '{camera.name}' has"
-            )
-    if noise is None:
-        return depth.copy()
-    cosines = None if normals is None else _facing(normals, camera)
+    cosines = _facing(normals, camera)
     if isinstance(noise, StructuredLight):
-        return measure_disparity(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
-    return measure_flight(depth, cosines, reflectance, noise, rng=rng)
+        return _measure_disparity(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
+    assert reflectance is not None
+    return _measure_flight(depth, cosines, reflectance, noise, rng=rng)
 
 
-def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def _facing(normals: Floats, camera: Camera) -> Floats:
     """Cosines between normals and the rays that come back."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     if camera.lens.kind == "pinhole":
         return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
     rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
-    cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
+    cosines: Floats = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
     np.maximum(cosines, np.float32(0.0), out=cosines)
@@ -453,7 +380,7 @@ def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]
 
 
 @kernel
-def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: float, cy: float) -> Any:
+def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float) -> Any:
     """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
     height, width = normals.shape[:2]
     cosines = np.zeros((height, width), np.float32)
@@ -470,9 +397,7 @@ def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: floa
 
 
 @functools.lru_cache(maxsize=16)
-def _back(
-    size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
-) -> NDArray[np.float32]:
+def _back(size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens) -> Floats:
     """Directions (3, H, W) from what is seen to the camera."""
     rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
     return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
@@ -480,10 +405,9 @@ def _back(
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
-    light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
-    return light
+    return np.asarray(cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance()))
 
 
 @functools.cache
-def _luminance() -> NDArray[np.float32]:
+def _luminance() -> Floats:
     return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from handsim.kernels import kernel
+from render.frames import Doubles, Floats
 
 
 @functools.cache
 def quantiles() -> Float32[np.ndarray, "65536"]:
     """Quantiles of the standard normal at the middle of each sixteen-bit number's share."""
     table = ndtri((np.arange(65536) + 0.5) / 65536)
-    scaled: NDArray[np.float32] = (table / table.std()).astype(np.float32)
-    return scaled
+    return np.asarray((table / table.std()).astype(np.float32))
 
 
 def random_words(shape: tuple[int, ...], *, rng: np.random.Generator) -> UInt16[np.ndarray, "..."]:
@@ -43,15 +43,8 @@ _KNOTS: Final = 32
 """Of noise, each way; a power of two. It repeats after as many blots, which nobody sees on a hand."""
 
 
-def noise(
-    positions: NDArray[np.float64], sizes: tuple[float, ...], *, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Smooth noise in space with a standard deviation of about one.
-
-    Args:
-        positions: Where to evaluate it (N, 3) [m].
-        sizes: Size of the blots of each octave [m].
-    """
+def noise(positions: Doubles, sizes: tuple[float, ...], *, rng: np.random.Generator) -> Floats:
+    """Smooth noise in space with a standard deviation of about one."""
     total = np.zeros(len(positions), dtype=np.float32)
     for size in sizes:
         knots = normal_numbers((_KNOTS, _KNOTS, _KNOTS), rng=rng)
@@ -61,13 +54,7 @@ def noise(
 
 
 @kernel
-def _add_octave(
-    positions: NDArray[np.float64],
-    start: NDArray[np.float64],
-    scale: float,
-    knots: NDArray[np.float32],
-    total: NDArray[np.float32],
-) -> None:
+def _add_octave(positions: Doubles, start: Doubles, scale: float, knots: Floats, total: Floats) -> None:
     """Add the trilinear interpolation of knots (32, 32, 32), which repeat, to `total` (N,)."""
     far = float(64 * _KNOTS)  # so that no place is negative
     for number in range(len(positions)):
@@ -89,8 +76,7 @@ def _add_octave(
 def smooth(values: NDArray[Any], low: float | NDArray[Any], high: float | NDArray[Any]) -> NDArray[Any]:
     """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    smoothed: NDArray[Any] = share * share * (3.0 - 2.0 * share)
-    return smoothed
+    return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
 def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:

@@ -8,10 +8,16 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy.typing import NDArray
 
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_BONES
+from handsim.hand.shape import NUM_BONES, HandShape
 from handsim.space.camera import Camera
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""
@@ -51,7 +57,7 @@ class HandTruth:
     qpos: Float[np.ndarray, "27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
     keypoints: Float[np.ndarray, "21 2"]
-    """Keypoints in the picture or beside it [px], see `handsim.hand.keypoints`; NaN where the lens cannot see
+    """Keypoints in the picture or beside it [px], see `handsim.hand.model`; NaN where the lens cannot see
     them."""
     keypoints_world: Float[np.ndarray, "21 3"]
     """The same keypoints in the world [m]; `frame.camera.local` gives them in the camera's axes."""

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Int, UInt8
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, FileError, HandSimError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
+from handsim.errors import ArgumentError, FileError
+from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIZES
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONE_NAMES, NUM_QPOS
+from handsim.hand.shape import BONE_NAMES, SIZES
+from handsim.hand.skin import vertex_normals
 from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from poses.shapes import gesture, make_valid
 from render.captions import (
     BACKGROUND,
@@ -33,6 +28,7 @@ from render.captions import (
     SEEN_COLOR,
     UNLABELED_COLOR,
     Covering,
+    Picture,
     bone_colors,
     captioned,
     covering_material,
@@ -42,54 +38,17 @@ from render.captions import (
     titled,
     with_names,
 )
+from render.frames import Doubles, Integers
 from render.painting.figures import MARKER_COLOR, Drawn, Material, ball_material, linear, sphere_surface
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, Triangles, join, rasterize
 from render.scenery.lights import STUDIO
 
-if TYPE_CHECKING:
-    from render.captions import Picture
-
 _BALL_LEVEL: Final = 3
 _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """A camera: its pose and its field of view.
-
-    Raises:
-        HandSimError: The pose is not (4, 4), or the angle is out of range.
-    """
-
-    T_world_camera: Float[np.ndarray, "4 4"]
-    """Pose in the world [m], OpenCV axes: x right, y down, z into the picture."""
-    field_of_view: float
-    """Full vertical opening angle [rad]."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
-        if not 0.0 < self.field_of_view < np.pi:
-            raise HandSimError(f"field_of_view is {self.field_of_view:g}, expected radians between 0 and pi")
-
-    def camera(self, size: tuple[int, int]) -> Camera:
-        """The pinhole camera of this view; an `ArgumentError` if no picture has that size [px]."""
-        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
-        return pinhole("view", size, float(focal)).at(self.T_world_camera)
-
-    def project(
-        self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
-    ) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of world points [m] in a picture (width, height) [px]; counted as by `Camera`."""
-        rotation, center = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
-        local = (points - center) @ rotation
-        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
-        pixels: NDArray[np.float64] = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
-        return pixels
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Balls:
+class Balls(NamedTuple):
     """Spheres of one radius, such as markers or the points that an optical system sees."""
 
     centers: Float[np.ndarray, "N 3"]
@@ -99,9 +58,19 @@ class Balls:
     colors: Float[np.ndarray, "N 3"] | tuple[float, float, float] = MARKER_COLOR
     """sRGB in [0, 1], one for all or one each."""
 
+    def surfaces(self) -> list[Drawn]:
+        """All balls as one surface, with colors by vertex; nothing where no center is known."""
+        known = np.isfinite(self.centers).all(axis=-1)
+        centers = self.centers[known]
+        if not len(centers):
+            return []
+        vertices, normals, faces = sphere_surface(centers, self.radius, level=_BALL_LEVEL)
+        tint = linear(np.broadcast_to(np.asarray(self.colors, dtype=np.float64), self.centers.shape)[known])
+        colors = np.repeat(tint, len(vertices) // len(centers), axis=0)
+        return [_surface(vertices, normals, faces, colors, ball_material())]
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedHand:
+
+class PosedHand(NamedTuple):
     """A hand in a pose, with or without a glove's markers."""
 
     hand: GloveFit | HandModel
@@ -113,12 +82,6 @@ class PosedHand:
     marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
     """sRGB in [0, 1], one for all markers or one each."""
 
-    def __post_init__(self) -> None:
-        qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
-        if qpos.ndim != 1:
-            raise HandSimError(f"qpos has shape {qpos.shape}, expected ({NUM_QPOS},): one pose per hand")
-        object.__setattr__(self, "qpos", qpos)
-
     @property
     def model(self) -> HandModel:
         """The hand without its glove."""
@@ -126,26 +89,28 @@ class PosedHand:
 
     def vertices(self) -> Float[np.ndarray, "V 3"]:
         """Skin in the world [m]."""
-        vertices: NDArray[np.float64] = self.model.skin(self.qpos[None])[0]
-        return vertices
+        return np.asarray(self.model.skin(self.qpos[None])[0])
 
-    def markers(self) -> Float[np.ndarray, "M 3"]:
-        """Marker centers in the world [m]; none without a glove."""
-        if not isinstance(self.hand, GloveFit):
-            return np.empty((0, 3))
-        markers: NDArray[np.float64] = self.hand.markers(self.qpos[None])[0][0]
-        return markers
+    def surfaces(self) -> list[Drawn]:
+        """Skin with smooth normals, and the glove's markers."""
+        vertices, faces = self.vertices(), self.model.surface.faces
+        colors = skin_tint(self.model) if self.covering == "skin" else np.ones((len(vertices), 3))
+        normals = vertex_normals(vertices, faces)
+        drawn = [_surface(vertices, normals, faces, colors, covering_material(self.covering))]
+        if isinstance(self.hand, GloveFit):
+            markers = self.hand.markers(self.qpos[None])[0][0]
+            drawn += Balls(markers, self.hand.layout.radius, self.marker_colors).surfaces()
+        return drawn
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandScene:
-    """The content of one picture."""
-
-    view: View
-    hands: tuple[PosedHand, ...] = ()
-    balls: tuple[Balls, ...] = ()
-    background: tuple[float, float, float] = BACKGROUND
-    """sRGB in [0, 1]."""
+def _surface(
+    vertices: Doubles, normals: Doubles, faces: Integers, colors: Doubles, material: Material
+) -> Drawn:
+    """A surface without ids, its colors (V, 3) linear factors on the material's."""
+    ids = np.zeros(len(faces), dtype=np.uint8)
+    factors = np.ones((len(vertices), 4), dtype=np.float32)
+    factors[:, :3] = colors
+    return Drawn(Triangles(vertices, faces, normals, ids, ids, ids), factors, None, lambda: material)
 
 
 def view_along(
@@ -156,8 +121,8 @@ def view_along(
     *,
     field_of_view: float = np.deg2rad(24.0),
     margin: float = 0.06,
-) -> View:
-    """The nearest view in a given direction that has all points [m] in the picture.
+) -> Camera:
+    """The nearest pinhole camera that looks along a direction and has all points [m] in its picture.
 
     `up` is the direction in the world that points up in the picture, the field of view its full vertical
     opening angle [rad], and the margin on each side a share of the picture.
@@ -175,100 +140,36 @@ def view_along(
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
-    return View(pose, field_of_view)
+    return pinhole("view", size, float(0.5 * size[1] / np.tan(field_of_view / 2))).at(pose)
 
 
-def scene_surfaces(scene: HandScene) -> list[Drawn]:
-    """The surfaces of a scene: skins with smooth normals, markers and free points."""
-    surfaces: list[Drawn] = []
-    for hand in scene.hands:
-        vertices, faces = hand.vertices(), hand.model.surface.faces
-        colors = skin_tint(hand.model) if hand.covering == "skin" else np.ones((len(vertices), 3))
-        surfaces.append(
-            _surface(
-                vertices, vertex_normals(vertices, faces), faces, colors, covering_material(hand.covering)
-            )
-        )
-        if isinstance(hand.hand, GloveFit):
-            surfaces += _ball_surfaces(Balls(hand.markers(), hand.hand.layout.radius, hand.marker_colors))
-    for balls in scene.balls:
-        surfaces += _ball_surfaces(balls)
-    return surfaces
-
-
-def _ball_surfaces(balls: Balls) -> list[Drawn]:
-    """All balls as one surface, with colors by vertex; nothing where no center is known."""
-    known = np.isfinite(balls.centers).all(axis=-1)
-    centers = balls.centers[known]
-    if not len(centers):
-        return []
-    vertices, normals, faces = sphere_surface(centers, balls.radius, level=_BALL_LEVEL)
-    tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
-    colors = np.repeat(tint, len(vertices) // len(centers), axis=0)
-    return [_surface(vertices, normals, faces, colors, ball_material())]
-
-
-def _surface(
-    vertices: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    colors: NDArray[np.float64],
-    material: Material,
-) -> Drawn:
-    """A surface without ids, its colors (V, 3) linear factors on the material's."""
-    ids = np.zeros(len(faces), dtype=np.uint8)
-    factors = np.ones((len(vertices), 4), dtype=np.float32)
-    factors[:, :3] = colors
-    return Drawn(Triangles(vertices, faces, normals, ids, ids, ids), factors, None, lambda: material)
-
-
-def render_rgb(
-    scene: HandScene, size: tuple[int, int], *, behind: UInt8[np.ndarray, "H W 3"] | None = None
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Color picture, sRGB, before a picture or the scene's background."""
-    width, height = size
-    camera = scene.view.camera(size)
+def draw_things(
+    camera: Camera,
+    *things: PosedHand | Balls,
+    behind: UInt8[np.ndarray, "H W 3"] | tuple[float, float, float] = BACKGROUND,
+) -> Picture:
+    """Hands and balls, sRGB, before a picture or a color."""
+    width, height = camera.size
     K = camera.K.copy()
     K[:2] *= _OVERSAMPLING
     large = dataclasses.replace(camera, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), K=K)
-    painted = cv2.resize(paint(large, scene_surfaces(scene), STUDIO), size, interpolation=cv2.INTER_AREA)
-    if behind is None:
-        paper = np.rint(255.0 * np.array(scene.background))
-        behind = np.broadcast_to(paper.astype(np.uint8), (height, width, 3))
+    surfaces = [surface for thing in things for surface in thing.surfaces()]
+    painted = cv2.resize(paint(large, surfaces, STUDIO), camera.size, interpolation=cv2.INTER_AREA)
+    if isinstance(behind, tuple):
+        behind = np.broadcast_to(np.array(byte_color(behind), dtype=np.uint8), (height, width, 3))
     return put_before(painted, np.ascontiguousarray(behind, dtype=np.float32))
 
 
-def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
-    """Depth picture: distance along the camera's axis [m] at each pixel's center, 0 where there is nothing.
-
-    Raises:
-        ArgumentError: No picture has that size.
-    """
-    camera, surfaces = scene.view.camera(size), scene_surfaces(scene)
-    if not surfaces:
-        return np.zeros(size[::-1], dtype=np.float32)
-    depth = rasterize(camera, join([one.triangles for one in surfaces]), with_normals=False).depth
-    assert depth is not None
-    return depth
-
-
 def unoccluded(
-    depth: Float32[np.ndarray, "H W"], view: View, points: Float[np.ndarray, "N 3"], *, slack: float
+    camera: Camera, hand: PosedHand, points: Float[np.ndarray, "N 3"], *, slack: float
 ) -> Bool[np.ndarray, "N"]:
-    """Which points lie in a depth picture with nothing in front of them.
-
-    Args:
-        depth: The picture [m], 0 where there is nothing.
-        points: Points in the world [m].
-        slack: How far behind the first surface a point still counts [m], such as a marker's radius.
-    """
-    height, width = depth.shape
-    column, row = np.floor(view.project(points, (width, height))).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    first = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    ahead = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
-    free: NDArray[np.bool_] = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
-    return free
+    """Which points are in the picture with nothing more than `slack` [m] before them."""
+    depth = rasterize(camera, join([one.triangles for one in hand.surfaces()]), with_normals=False).depth
+    column, row = np.floor(camera.project(points)).astype(int).T
+    inside = (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
+    first = depth[np.clip(row, 0, camera.size[1] - 1), np.clip(column, 0, camera.size[0] - 1)]
+    ahead = camera.local(points)[:, 2]
+    return np.asarray(inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack)))
 
 
 SUFFIX: Final = ".mp4"
@@ -313,7 +214,7 @@ def write_clip(
                 if not writer.isOpened():
                     raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
                 for frame in frames:
-                    picture = draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
+                    picture = _draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
                     writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
             finally:
                 writer.release()
@@ -332,15 +233,10 @@ def _check_written(path: Path) -> None:
         reader.release()
 
 
-def draw_frame(frame: ClipFrame, view: View, radius: float) -> np.ndarray:
-    """A picture (H, W, 3) of a frame, sRGB; hands without a pose are left out.
-
-    Args:
-        radius: Radius of the points [m].
-    """
-    hands = tuple(PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all())
-    balls = (Balls(frame.points, radius, frame.colors),) if len(frame.points) else ()
-    picture = render_rgb(HandScene(view, hands, balls), _SIZE)
+def _draw_frame(frame: ClipFrame, view: Camera, radius: float) -> Picture:
+    """A picture of a frame; hands without a pose are left out."""
+    hands = [PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all()]
+    picture = draw_things(view, *hands, Balls(frame.points, radius, frame.colors))
     place = (16, _SIZE[1] - 18)
     cv2.putText(picture, frame.caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
     return picture
@@ -367,12 +263,7 @@ def draw_row(
     covering: Covering = "skin",
     width: int = _WIDTH,
 ) -> Picture:
-    """Hands side by side at one scale, wrists on one line, each with its caption.
-
-    Args:
-        hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
-        direction: Direction of view.
-    """
+    """Hands side by side at one scale, wrists on one line, each with its caption."""
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
     posed, centers, extent = [], [], 0.0
@@ -391,8 +282,8 @@ def draw_row(
     size = (width, round(width * min(1.0, tall) * 1.04))
     # A narrow view from far away shows all hands at one scale, and not the sides of the outer ones.
     view = view_along(ahead, FINGERS_UP, points, size, field_of_view=np.deg2rad(4.0), margin=0.015)
-    picture = render_rgb(HandScene(view, tuple(posed)), size)
-    pixels = view.project(np.array(centers), size)[:, 0]
+    picture = draw_things(view, *posed)
+    pixels = view.project(np.array(centers))[:, 0]
     return captioned(picture, [(float(x), hand[0]) for x, hand in zip(pixels, hands, strict=True)])
 
 
@@ -431,15 +322,11 @@ def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:
     return draw_row(rows, direction=(0.0, -0.75, 1.0))
 
 
-def draw_glove(
-    fit: GloveFit,
-    *,
-    sides: Sequence[str] = tuple(SIDES_OF_HAND),
-) -> Picture:
+def draw_glove(fit: GloveFit, *, sides: Sequence[str] = tuple(SIDES_OF_HAND)) -> Picture:
     """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows."""
     colors = marker_colors(fit.layout)
     hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
-    vertices, markers = hand.vertices(), hand.markers()
+    vertices, markers = hand.vertices(), fit.markers(hand.qpos[None])[0][0]
     mirror = np.array([1.0, 1.0 if fit.side == "right" else -1.0, 1.0])
     pictures = []
     for side in sides:
@@ -448,20 +335,15 @@ def draw_glove(
         shape = float(np.ptp(vertices @ across) / np.ptp(vertices[:, 0]))
         size = (round(_HEIGHT * max(0.45, shape)), _HEIGHT)
         view = view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
-        scene = HandScene(view, (hand,))
-        radius = fit.layout.radius
-        shown = unoccluded(render_depth(scene, size), view, markers, slack=1.5 * radius)
-        pixels = np.where(shown[:, None], view.project(markers, size), np.nan)
-        picture = with_names(render_rgb(scene, size), pixels, fit.layout.names, colors)
+        shown = unoccluded(view, hand, markers, slack=1.5 * fit.layout.radius)
+        pixels = np.where(shown[:, None], view.project(markers), np.nan)
+        picture = with_names(draw_things(view, hand), pixels, fit.layout.names, colors)
         pictures.append(titled(picture, side))
     return side_by_side(pictures, gap=40)
 
 
 def draw_camera(
-    fit: GloveFit,
-    qpos: Float[np.ndarray, "27"],
-    rig: CameraRig,
-    camera: int,
+    fit: GloveFit, qpos: Float[np.ndarray, "27"], rig: CameraRig, camera: int
 ) -> tuple[Picture, Bool[np.ndarray, "M"]]:
     """The view of a camera of a rig, zoomed in, and which markers it sees: green, the others red rings."""
     size = _CAMERA_SIZE
@@ -475,21 +357,17 @@ def draw_camera(
     towards = vertices.mean(axis=0) - rig.positions[camera]
     up = np.array([0.0, 0.0, 1.0])
     view = view_along(towards, up, vertices, size, field_of_view=zoom(towards, vertices, up, size))
-    picture = render_rgb(HandScene(view, (hand,)), size)
-    pixels = view.project(markers[0], size)
+    picture = draw_things(view, hand)
+    pixels = view.project(markers[0])
     for x, y in np.rint(pixels[~seen]).astype(int):
         cv2.circle(picture, (x, y), 13, byte_color(HIDDEN_COLOR), 3, cv2.LINE_AA)
     return with_names(picture, pixels, fit.layout.names, colors * 0.8), seen
 
 
-def zoom(
-    towards: NDArray[np.float64], points: NDArray[np.float64], up: NDArray[np.float64], size: tuple[int, int]
-) -> float:
+def zoom(towards: Doubles, points: Doubles, up: Doubles, size: tuple[int, int]) -> float:
     """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
-    for _ in range(
-        20
-    ):  # the nearest position for an angle is known; find the angle whose position is the camera's
+    for _ in range(20):  # until the nearest position for the angle is the camera's
         view = view_along(towards, up, points, size, field_of_view=angle)
         distance = float(np.linalg.norm(points.mean(axis=0) - view.T_world_camera[:3, 3]))
         angle = 2 * np.arctan(np.tan(angle / 2) * distance / float(np.linalg.norm(towards)))
@@ -497,10 +375,7 @@ def zoom(
 
 
 def draw_labels(
-    hand: PosedHand,
-    points: Float[np.ndarray, "N 3"],
-    labels: Int[np.ndarray, "N"],
-    layout: MarkerLayout,
+    hand: PosedHand, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], layout: MarkerLayout
 ) -> Picture:
     """A frame's points [m] without labels, and beside them with their labels (-1: a ghost) and the hand."""
     size = _LABELS_SIZE
@@ -512,13 +387,13 @@ def draw_labels(
     ahead, up = -T_world_wrist[:3, 2], T_world_wrist[:3, 0]
     view = view_along(ahead, up, np.concatenate([vertices, points]), size)
     radius = 1.2 * layout.radius
-    gray = render_rgb(HandScene(view, balls=(Balls(points, radius, UNLABELED_COLOR),)), size)
+    gray = draw_things(view, Balls(points, radius, UNLABELED_COLOR))
     bare = PosedHand(hand.model, hand.qpos, covering=hand.covering)
-    faint = render_rgb(HandScene(view, (bare,)), size).astype(np.float32)
+    faint = draw_things(view, bare).astype(np.float32)
     faint += 0.72 * (255 * np.array(BACKGROUND, dtype=np.float32) - faint)
-    balls = HandScene(view, balls=(Balls(points[~ghost], radius, palette[labels[~ghost]]),))
-    colored = render_rgb(balls, size, behind=np.rint(faint).astype(np.uint8))
-    pixels = view.project(points, size)
+    balls = Balls(points[~ghost], radius, palette[labels[~ghost]])
+    colored = draw_things(view, balls, behind=np.rint(faint).astype(np.uint8))
+    pixels = view.project(points)
     for x, y in np.rint(pixels[ghost]).astype(int):
         cv2.circle(colored, (x, y), 9, byte_color(HIDDEN_COLOR), 2, cv2.LINE_AA)
     named = with_names(colored, pixels, [names[label] for label in labels], palette[labels])

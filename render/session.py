@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.takes.take import RigidBody, Take
-from handsim._checks import check_choice, check_type, make_settings
+from handsim._checks import check_choice, check_type
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
@@ -30,8 +30,7 @@ from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
-from handsim.space.cameras import CameraRig
-from handsim.space.rig_file import check_names
+from handsim.space.rig import CameraRig, check_names
 from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
@@ -42,7 +41,6 @@ from render.formats.webdataset import TAR
 from render.formats.writer import CONFIG, FORMATS, NEED_COLORS, format_folder, open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people
-from render.painting.painter import choose_painter
 from render.scenery.backgrounds import enclose, photo_files
 from render.scenery.lights import sample_surroundings
 from render.skin.look import SkinLook
@@ -88,7 +86,7 @@ def draw(
     Raises:
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
-    config = configured(config, camera, settings)
+    config = configured(config, camera, settings).resolved()
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
     drawing.check_view()
@@ -99,9 +97,7 @@ def configured(
     config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
 ) -> RenderConfig:
     """A configuration with the camera and the settings that were named beside it."""
-    config = RenderConfig() if config is None else config
-    check_type("config", config, RenderConfig, "a RenderConfig")
-    config = make_settings(RenderConfig, "setting of a rendering", settings, default=config)
+    config = RenderConfig.of(config, settings)
     if camera is None:
         return config
     if isinstance(camera, str):
@@ -115,11 +111,7 @@ def configured(
 
 
 class Drawing:
-    """A subject before its cameras: draws any of its frames.
-
-    Raises:
-        HandSimError: The subject has no motion to blur, or no camera has a hand in its picture.
-    """
+    """A subject before its cameras: draws any of its frames."""
 
     def __init__(self, subject: Subject, config: RenderConfig) -> None:
         if config.shutter is not None and not subject.is_motion:
@@ -129,11 +121,7 @@ class Drawing:
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def check_view(self) -> None:
-        """Refuse the user's own cameras where none has a hand in its pictures.
-
-        Raises:
-            RigError: No camera has.
-        """
+        """Refuse the user's own cameras where none has a hand in its pictures."""
         if self.config.view.cameras is not None:
             cameras = self.viewpoints.cameras(0)
             check_hands_in_view(self.config.view.own_cameras, cameras, self.take)
@@ -165,14 +153,7 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
-        """Some frames, seen by all cameras, with the people of a shard and all else that changes with it.
-
-        Args:
-            numbered: For each frame its place in the shard, which its random choices depend on, and its
-                number in the take.
-            leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;
-                without it such a frame is an error.
-        """
+        """Some frames, seen by all cameras, with the people of a shard and all else that changes with it."""
         config, cast = self.config, self.subject.cast
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
         size = self.viewpoints.size
@@ -224,8 +205,8 @@ def open_studio(
     """A studio of one person, whose looks are drawn."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    painter = choose_painter(config.with_chosen_painter().painter)
-    return Studio(hands, people, bodies, colors, config.passes, painter)
+    assert config.painter != "auto"
+    return Studio(hands, people, bodies, colors, config.passes, config.painter)
 
 
 def sample_choices(
@@ -235,15 +216,10 @@ def sample_choices(
     size: tuple[int, int],
     around: Float[np.ndarray, "N 3"] | None = None,
 ) -> FrameChoices:
-    """Random choices of a picture.
-
-    Args:
-        skin: See `sample_surroundings`.
-        size: Of the picture [px].
-        around: Positions that a background of several cameras is around [m].
-    """
+    """Random choices of a picture."""
     background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
-    sensor = config.chosen_depth_sensor
+    sensor = config.depth_sensor
+    assert sensor != "auto"
     return FrameChoices(
         lighting=lighting,
         background=background,
@@ -315,7 +291,7 @@ def render_take(
     """
     check_type("formats", formats, (str, list, tuple), "names of formats", FORMATS)
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    config = configured(config, camera, settings).settled()
+    config = configured(config, camera, settings).resolved()
     _check_formats(formats, config)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
     if not isinstance(place, Path) and _RENAMES in formats:
@@ -383,12 +359,7 @@ def _draw_shards(
 
 
 class _Telling:
-    """Tells of pictures while shards, which take minutes, are being drawn.
-
-    Args:
-        folder: Where workers of this machine leave their `_DRAWN` files.
-        count: Pictures that are there already.
-    """
+    """Tells of pictures while shards, which take minutes, are being drawn."""
 
     def __init__(self, folder: Path, count: int, total: int, progress: Progress) -> None:
         self._folder, self._count, self._total, self._progress = folder, count, total, progress
@@ -435,7 +406,11 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
     if drawing.config.background.shares["photo"] > 0.0:
-        files, _ = photo_files(Path(str(drawing.config.background.photos)))
+        files, broken = photo_files(Path(str(drawing.config.background.photos)))
+        if broken:
+            more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+            told = f"left out: {broken[0]}{more}, not readable as photographs"
+            warnings.warn(told, HandSimWarning, stacklevel=3)
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # they need not be text
         settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"

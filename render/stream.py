@@ -19,17 +19,15 @@ from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.json_files import load_json
-from handsim.files.names import plain_path
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape, pack_hand, sample_shape
-from handsim.hand.topology import NUM_KEYPOINTS, NUM_QPOS, SIDES, Side
+from handsim.files.outputs import plain_path
+from handsim.hand.model import HandModel, hand_keypoints
+from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
 from poses.shapes import load_sampler, mixed_angles
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.depth_sensor import DepthSensor
-from render.frames import HandTruth, RenderedFrame
+from render.frames import Doubles, HandTruth, Integers, RenderedFrame
 from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
@@ -122,7 +120,7 @@ def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Genera
     if scale < 0.5:  # or fine detail would become noise
         photograph = cv2.GaussianBlur(photograph, (0, 0), 0.4 / scale)
     square = cv2.warpAffine(photograph, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
-    keypoints: NDArray[np.float64] = (hand.keypoints - corner) * scale
+    keypoints: Doubles = (hand.keypoints - corner) * scale
     box = np.array([*(low - corner), *(high - low)]) * scale
     return CutOut(
         np.asarray(cv2.cvtColor(square, cv2.COLOR_BGR2RGB)),
@@ -146,7 +144,7 @@ class _Sitting(NamedTuple):
 
     studio: Studio
     subject: Subject
-    frames: NDArray[np.int64]
+    frames: Integers
     """Of the take, in the order in which they are drawn."""
     person: int
     """Number of the person."""
@@ -252,7 +250,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         config = configured(config, None, {} if seed is None else {"seed": seed})
         if config.depth_sensor == "auto":  # of a stream it measures near hands
             config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
-        self.config = config.settled()
+        self.config = config.resolved()
         self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
@@ -343,9 +341,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
         return subject_of_poses(qpos, model=model, glove=self._glove)
 
-    def _drawn_poses(
-        self, model: Model | tuple[Model, Model], rng: np.random.Generator
-    ) -> NDArray[np.float64]:
+    def _drawn_poses(self, model: Model | tuple[Model, Model], rng: np.random.Generator) -> Doubles:
         """Poses for all pictures of a person."""
         if self._poses is not None:
             return self._poses[rng.integers(len(self._poses), size=self._sitting)]
@@ -386,8 +382,8 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         self,
         studio: Studio,
         moment: Moment,
-        keypoints: Sequence[NDArray[np.float64]],
-        qpos: Sequence[NDArray[np.float64]],
+        keypoints: Sequence[Doubles],
+        qpos: Sequence[Doubles],
         rng: np.random.Generator,
     ) -> tuple[Moment, Camera]:
         """The camera somewhere around the hands, outside of all surfaces, and arms that leave its picture."""
@@ -425,7 +421,7 @@ def _camera(camera: Camera | str, crop: int | None) -> Camera:
     return found
 
 
-def _rows(poses: ArrayLike) -> NDArray[np.float64]:
+def _rows(poses: ArrayLike) -> Doubles:
     """A user's poses, a row a pose."""
     try:
         rows = np.asarray(poses, dtype=np.float64)

@@ -16,17 +16,28 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
-from handsim.hand.keypoints import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import DIGITS, PALM, bones_of
+from handsim.hand.model import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
-from render.frames import FOREARM, PARTS_A_HAND, PASSES, BodyTruth, HandTruth, Pictures, RenderedFrame
+from render.frames import (
+    FOREARM,
+    PARTS_A_HAND,
+    PASSES,
+    BodyTruth,
+    Bytes,
+    Doubles,
+    Floats,
+    HandTruth,
+    Pictures,
+    RenderedFrame,
+)
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
-from render.painting.rasterizer import NEAR, faces_for, join, rasterize, warp, warp_depth, warp_normals
+from render.painting.rasterizer import NEAR, Geometry, faces_for, see, warp
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
@@ -41,7 +52,7 @@ def hand_truth(
     qpos: Float[np.ndarray, "27"],
     number: int,
     camera: Camera,
-    pictures: Pictures,
+    pictures: Geometry,
     *,
     recorded: bool = True,
 ) -> HandTruth:
@@ -52,7 +63,6 @@ def hand_truth(
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     pixels = camera.project(keypoints)
-    assert pictures.parts is not None
     worn = figure.look.glove is not None
     return HandTruth(
         shape=model.shape,
@@ -68,19 +78,13 @@ def hand_truth(
 
 
 def _visible(
-    keypoints: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    number: int,
-    camera: Camera,
-    pictures: Pictures,
+    keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
 ) -> Bool[np.ndarray, "21"]:
     """Keypoints whose pixel shows the finger that they are in.
 
     The pixel is one of this hand, of the keypoint's digit (or of the palm, where it is at its edge), and the
     keypoint is no deeper under the surface there than the finger is thick.
     """
-    assert pictures.parts is not None and pictures.instances is not None and pictures.depth is not None
     width, height = camera.size
     inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
@@ -92,8 +96,7 @@ def _visible(
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
     # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
-    visible: NDArray[np.bool_] = own & np.where(ahead, under <= thickness, True)
-    return visible
+    return np.asarray(own & np.where(ahead, under <= thickness, True))
 
 
 def _allowed_parts() -> Bool[np.ndarray, "21 32"]:
@@ -160,7 +163,7 @@ class Moment:
         (before, after), share = self._around(rows, shift)
         if before[3:7] @ after[3:7] < 0.0:
             after = np.concatenate([after[:3], -after[3:7], after[7:]])
-        pose: NDArray[np.float64] = before + share * (after - before)
+        pose: Doubles = before + share * (after - before)
         pose[3:7] /= np.linalg.norm(pose[3:7])
         return pose
 
@@ -171,12 +174,12 @@ class Moment:
             return None
         poses, share = self._around(rows, shift)
         before, after = pose_matrices(poses)
-        T_world_body: NDArray[np.float64] = before + share * (after - before)
+        T_world_body: Doubles = before + share * (after - before)
         left, _, right = np.linalg.svd(T_world_body[:3, :3])
         T_world_body[:3, :3] = left @ right
         return T_world_body
 
-    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[NDArray[np.float64], float]:
+    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[Doubles, float]:
         """The rows before and after a time, and the share of the way between them.
 
         Rows without numbers, and those of others than the frame's person, count as the frame's own.
@@ -193,15 +196,7 @@ class Moment:
 
 
 class Studio:
-    """Draws moments of the same people and rigid bodies.
-
-    Args:
-        hands: The hands, in the order of the takes.
-        bodies: The rigid bodies, in the order of the takes.
-        body_colors: Color of each of them, sRGB in [0, 1].
-        passes: Some of `PASSES`.
-        painter: What paints colors.
-    """
+    """Draws moments of the same people and rigid bodies."""
 
     def __init__(
         self,
@@ -235,16 +230,14 @@ class Studio:
         """Draw one moment of the studio's hands and bodies, with all other choices.
 
         Where `recorded`, the frame has its choices as JSON and the hands' vertices, which take time.
-
-        Raises:
-            HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
         drawn = self._still(moment)
         _check_outside(camera, drawn, frame)
         present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
-        noisy = "depth" in self.passes and choices.depth_noise is not None
-        truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
+        sensor = choices.depth_noise if "depth" in self.passes else None
+        surfaces = [one.triangles for one in drawn]
+        truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
@@ -252,8 +245,8 @@ class Studio:
         seen = truth
         if choices.enclosure is not None:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
-        if noisy:
-            noisy_depth = self._noisy_depth(seen, rgb, present, camera, choices.depth_noise, rng)
+        if sensor is not None:
+            noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)
         hands = tuple(
             hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth, recorded=recorded)
             for index, number in enumerate(present)
@@ -321,40 +314,17 @@ class Studio:
                 drawn += body.drawn(T_world_body, number)
         return drawn
 
-    def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
-        """Depth, normals and ids through the camera's lens."""
-        surface = join([one.triangles for one in drawn]) if drawn else None
-        width, height = camera.size
-        if surface is None:
-            flat = np.zeros((height, width), dtype=np.uint8)
-            bare = np.zeros((height, width, 3), dtype=np.float32)
-            return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
-        faces = [rasterize(face, surface, with_normals=with_normals) for face in faces_for(camera)]
-        if camera.lens.kind == "pinhole":
-            return faces[0]
-        normals = [face.normals for face in faces if face.normals is not None]
-        ids = (
-            warp(camera, [getattr(face, name) for face in faces], "nearest")
-            for name in ("parts", "instances", "markers")
-        )
-        return Pictures(
-            None,
-            warp_depth(camera, [face.depth for face in faces if face.depth is not None]),
-            warp_normals(camera, normals) if normals else None,
-            *ids,
-        )
-
     def _noisy_depth(
         self,
-        truth: Pictures,
-        rgb: NDArray[np.uint8] | None,
+        truth: Geometry,
+        rgb: Bytes | None,
         present: Sequence[int],
         camera: Camera,
-        sensor: DepthNoise | None,
+        sensor: DepthNoise,
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "H W"]:
         """Depth as the sensor has it; only the part of the picture that has depth takes time."""
-        assert truth.depth is not None
+        assert truth.normals is not None
         noisy = np.zeros_like(truth.depth)
         left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
         if width == 0:
@@ -365,17 +335,12 @@ class Studio:
         )
         left, top = max(0, left - _AROUND), max(0, top - _AROUND)
         part = np.s_[top:bottom, left:right]
-        cut = {name: getattr(truth, name) for name in ("depth", "normals", "instances")}
-        inner = dataclasses.replace(
-            truth, **{name: None if picture is None else picture[part] for name, picture in cut.items()}
-        )
-        assert inner.depth is not None
         light = None
         if isinstance(sensor, TimeOfFlight):  # others need none
-            light = self._infrared(inner, None if rgb is None else rgb[part], present)
+            light = self._infrared(truth.instances[part], None if rgb is None else rgb[part], present)
         noisy[part] = apply_depth_noise(
-            inner.depth,
-            inner.normals,
+            truth.depth[part],
+            truth.normals[part],
             sensor,
             camera=camera.part(left, top, right - left, bottom - top),
             reflectance=light,
@@ -383,16 +348,12 @@ class Studio:
         )
         return noisy
 
-    def _infrared(
-        self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
-    ) -> Float32[np.ndarray, "H W"]:
-        """Infrared reflectance of each pixel, from its color; bare skin has its own."""
-        assert truth.instances is not None
-        shape = truth.instances.shape
-        infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
+    def _infrared(self, instances: Bytes, rgb: Bytes | None, present: Sequence[int]) -> Floats:
+        """Infrared reflectance of each pixel (H, W), from its color; bare skin has its own."""
+        infrared = np.ones(instances.shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
         for index, number in enumerate(present):
             if self._people[number].glove is None:
-                infrared[truth.instances == index + 1] = self._people[number].skin.infrared
+                infrared[instances == index + 1] = self._people[number].skin.infrared
         return infrared
 
     def _colors_of(
@@ -400,7 +361,7 @@ class Studio:
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The perfect color picture."""
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
-        whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
+        whole = warp(camera, painted, cv2.INTER_LINEAR)
         if choices.enclosure is None:
             return put_before(whole, self._behind(camera, drawn, choices))
         behind = draw_surroundings(choices.background, choices.enclosure, camera)
@@ -416,16 +377,10 @@ class Studio:
         light = light_behind(camera, drawn, choices.lighting, backdrop)
         if light is None:
             return plain
-        lit: NDArray[np.float32] = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
-        return lit
+        return np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
 
     def _exposed(
-        self,
-        moment: Moment,
-        camera: Camera,
-        rgb: NDArray[np.uint8],
-        choices: FrameChoices,
-        rng: np.random.Generator,
+        self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
     ) -> UInt8[np.ndarray, "H W 3"] | None:
         """The color picture of shutter and sensor; None when they change nothing."""
         if choices.exposure is None and choices.shutter is None:
@@ -439,7 +394,7 @@ class Studio:
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
-    def _requested(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
+    def _requested(self, truth: Geometry, rgb: Bytes | None) -> Pictures:
         ids = "ids" in self.passes
         return Pictures(
             rgb,

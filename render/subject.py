@@ -23,17 +23,21 @@ from handsim.files.inputs import check_regular, checksum
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import (
     HAND_DTYPE,
+    NUM_JOINTS,
+    NUM_QPOS,
+    SIDES,
     HandShape,
+    Side,
     pack_hand,
     sample_shape,
     shape_from_measures,
     unpack_hand,
 )
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
-from handsim.motion_files.joint_table import read_joint_csv
+from handsim.motion_files.joint_files import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
+from render.frames import Doubles, Flags
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"
@@ -60,11 +64,6 @@ def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[Own
     """Poses of an `.npz` that `numpy.savez` wrote, or of a `.csv` of `handsim export`; and whose they are.
 
     docs/rendering.md has the arrays, docs/motion_files.md the columns.
-
-    Args:
-        path: The file; nothing in it is unpickled.
-        sides: Whose poses an `.npz` has, in its order, a right hand's when not given; or which are read of a
-            `.csv`, all when not given.
     """
     if path.suffix.lower() == CSV:
         arrays, sides = _columns(path, sides)
@@ -103,9 +102,6 @@ def check_poses(
     """A user's arrays as poses: (T, 27), (T, H, 27), or (T, 20) without wrists, [m, rad].
 
     Times (T,) increase [s], and poses are no motion without them; `person` (T,) is who is in each frame.
-
-    Raises:
-        ArgumentError: An array has another shape or impossible numbers, or there is no hand in any frame.
     """
     arrays = {"qpos": np.asarray(qpos)}
     if num_hands == 1 and arrays["qpos"].ndim == 2 and arrays["qpos"].shape[1] == NUM_JOINTS:
@@ -157,7 +153,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
     return qpos
 
 
-def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Doubles:
     """An array (T, ...) or, for one hand, (T, ...) without the axis of hands; NaN is allowed."""
     given = arrays[name]
     if given.dtype.kind not in "fiu":
@@ -174,7 +170,7 @@ def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...
     return values
 
 
-def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float64]:
+def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
     poses = _floats(arrays, "T_world_wrist", (count, 4, 4))
     rotations = poses[..., :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(-2, -1))
@@ -189,7 +185,7 @@ def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float6
     return poses
 
 
-def _check_unit_quaternions(quaternions: NDArray[np.float64], lost: NDArray[np.bool_]) -> None:
+def _check_unit_quaternions(quaternions: Doubles, lost: Flags) -> None:
     lengths = np.where(lost, 1.0, np.linalg.norm(quaternions, axis=-1))
     worst = np.abs(lengths - 1.0).argmax()
     if abs(lengths.flat[worst] - 1.0) > 1e-2:
@@ -199,7 +195,7 @@ def _check_unit_quaternions(quaternions: NDArray[np.float64], lost: NDArray[np.b
         )
 
 
-def _check_bounds(qpos: NDArray[np.float64]) -> None:
+def _check_bounds(qpos: Doubles) -> None:
     farthest, widest = np.nanmax(np.abs(qpos[..., :3])), np.nanmax(np.abs(qpos[..., 7:]))
     if farthest > _FARTHEST:
         raise ArgumentError(
@@ -212,7 +208,7 @@ def _check_bounds(qpos: NDArray[np.float64]) -> None:
         )
 
 
-def _tell_beyond(name: str, qpos: NDArray[np.float64]) -> None:
+def _tell_beyond(name: str, qpos: Doubles) -> None:
     angles = qpos[..., 7:]
     beyond = ((angles < LOW - _BEYOND) | (angles > HIGH + _BEYOND)).any(axis=(1, 2))
     if beyond.any():
@@ -223,7 +219,7 @@ def _tell_beyond(name: str, qpos: NDArray[np.float64]) -> None:
         warnings.warn(told, HandSimWarning, stacklevel=3)
 
 
-def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.float64] | None:
+def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> Doubles | None:
     if "times" not in arrays:
         return None
     times = arrays["times"]
@@ -306,11 +302,7 @@ class Cast:
         return SpawnKey.PERSON.rng(self.seed, person, 1)
 
     def hands(self, person: int, worn: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
-        """A person's hands in the gloves of others.
-
-        Raises:
-            LayoutError: A glove does not fit these hands.
-        """
+        """A person's hands in the gloves of others."""
         if self.shapes is not None:
             shape = self.shapes[person if len(self.shapes) > 1 else 0]
         else:
@@ -406,16 +398,7 @@ def _of_file(path: Path) -> Path | PoseFile:
 
 
 def load_subject(source: Source, *, seed: int) -> Subject:
-    """Read what is drawn.
-
-    Args:
-        source: A tracked take or the truth of a simulated one, a file of poses, or what is in memory already.
-        seed: Seed of the people who are not in a file.
-
-    Raises:
-        CaptureError: The file is missing, of another kind or schema, damaged, or without any pose.
-        LayoutError: The glove is unknown or does not fit.
-    """
+    """Read what is drawn."""
     if isinstance(source, Subject):
         return source
     if isinstance(source, PoseFile):
@@ -428,11 +411,7 @@ def load_subject(source: Source, *, seed: int) -> Subject:
 
 
 def subject_of_take(take: Take) -> Subject:
-    """A take in memory.
-
-    Raises:
-        ArgumentError: There is no hand in any frame.
-    """
+    """A take in memory."""
     hands = np.array([pack_hand(hand.model.shape) for hand in take.hands], dtype=HAND_DTYPE)
     return Subject(take, _digest(take.times, take.qpos, hands))
 
@@ -447,23 +426,7 @@ def subject_of_poses(
     glove: MarkerLayout | str = "dense19",
     seed: int = 0,
 ) -> Subject:
-    """A user's own poses.
-
-    Args:
-        qpos: (T, 27), or joint angles (T, 20) with the wrist at the origin, of one hand; (T, 2, 27) of two
-            [m, rad]. NaN is a hand that is not there.
-        model: The hand, or both of them in the order of the poses; right hands of drawn people when not
-            given.
-        times: Time of each frame (T,), increasing [s]; poses are no motion without them.
-        people: Who strikes the poses, instead of the model: a number of drawn people, or their hands.
-        person: Which of the people is in each frame (T,); when not given, a number of people is distributed
-            at random, and of hands there is one, or one for each frame.
-        glove: Marker layout on the hands, where they wear gloves.
-
-    Raises:
-        ArgumentError: An array has another shape or impossible numbers, or the arguments do not fit together.
-        LayoutError: The glove is unknown or does not fit.
-    """
+    """A user's own poses."""
     array = np.asarray(qpos)
     models = models_of(model, 2 if array.ndim == 3 else 1)
     if model is not None and person is not None and people is None:
@@ -497,12 +460,7 @@ def _load_poses(file: PoseFile, seed: int) -> Subject:
     if poses.person is not None and file.people is not None:
         whose = "the hand of one person" if len(poses.shapes or ()) == 1 else "who is in each frame"
         raise CaptureError(f"{file.path}: the file has {whose}; leave out --people")
-    record = {
-        "sha256": checksum(file.path),
-        "sides": list(sides),
-        "people": file.people,
-        "glove": file.glove,
-    }
+    record = {"sha256": checksum(file.path), "sides": list(sides), "people": file.people, "glove": file.glove}
     models = tuple(HandModel.named("M", side=side) for side in sides)
     return _posed(
         file.path.name, poses, models, load_layout(file.glove), _cast(poses, file.people, seed), record

@@ -10,21 +10,21 @@ import dataclasses
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from gloves.takes.take import Take
-from handsim._checks import check_choice, check_number
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
+from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import load_rig
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig import load_rig
+from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix
+from render.frames import Doubles, Flags, Floats, Integers
 
 _KEPT: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that a hand's outline depends on
 _CHUNK: Final = 2048  # frames whose keypoints are computed at once
@@ -51,7 +51,7 @@ class Framing:
         """Middle of the box around all hands of each frame [m]; interpolated over frames without hands."""
         self._window = max(1, round(0.5 * take.rate))
 
-    def _centers(self) -> NDArray[np.float64]:
+    def _centers(self) -> Doubles:
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
         middles = 0.5 * (np.nanmin(flat, axis=1) + np.nanmax(flat, axis=1))
@@ -60,29 +60,21 @@ class Framing:
 
     def middle(self) -> Float[np.ndarray, "3"]:
         """Middle of all places where the hands are [m]."""
-        middle: NDArray[np.float64] = 0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0))
-        return middle
+        return np.asarray(0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0)))
 
     def followed(self) -> Float[np.ndarray, "T 3"]:
         """The centers as a person with a camera follows them [m]: without what is quicker than a second."""
-        smooth: NDArray[np.float64] = uniform_filter1d(self.centers, self._window, axis=0, mode="nearest")
-        return smooth
+        return np.asarray(uniform_filter1d(self.centers, self._window, axis=0, mode="nearest"))
 
     def held(self, distances: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
         """Distances that change slowly and are nowhere shorter than these [m]."""
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
-        slow: NDArray[np.float64] = uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest")
-        return slow
+        return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
     def sides(
         self, rotations: Float[np.ndarray, "F 3 3"], frames: Int[np.ndarray, "F"] | None = None
     ) -> Float[np.ndarray, "F"]:
-        """Longer side of a hand in each frame, seen from afar, the mean of its hands [m]; NaN without hands.
-
-        Args:
-            rotations: Axes of the camera in the world, as columns.
-            frames: Which frames; all when not given.
-        """
+        """Longer side of a hand in each frame from afar, the mean of its hands [m]; NaN without hands."""
         points, there = self._rows(frames)
         local = self._turned(points, rotations)[..., :2]
         longer = np.ptp(local, axis=2).max(axis=-1)
@@ -100,12 +92,6 @@ class Framing:
         """Share of the picture's height that a hand's longer side has, the mean of a frame's hands.
 
         Two hands before one another count for less, by how much of the smaller one's box the other covers.
-
-        Args:
-            camera: Its matrix and size count.
-            poses: Of the camera.
-            most: What a share counts as at most, so that one near hand does not make up for a far one.
-            frames: Which frames; all when not given.
         """
         points, there = self._rows(frames)
         rotations, positions = poses[:, :3, :3], poses[:, None, None, :3, 3]
@@ -113,7 +99,7 @@ class Framing:
         pixels = local[..., :2] / np.maximum(local[..., 2:], 1e-3) * camera.K[1, 1] / camera.size[1]
         low, high = pixels.min(axis=2), pixels.max(axis=2)
         longer = np.where(there, np.minimum((high - low).max(axis=-1), most), 0.0)
-        total: NDArray[np.float64] = longer.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        total: Doubles = longer.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
         if points.shape[1] == 2:
             common = np.clip(high.min(axis=1) - low.max(axis=1), 0.0, None).prod(axis=-1)
             covered = common / np.maximum((high - low).prod(axis=-1).min(axis=1), 1e-9)
@@ -127,13 +113,7 @@ class Framing:
         rotations: Float[np.ndarray, "F 3 3"],
         frames: Int[np.ndarray, "F"] | None = None,
     ) -> Float[np.ndarray, "F"]:
-        """Shortest distance of a camera from the place that it looks at with all hands in its picture [m].
-
-        Args:
-            centers: Where it looks [m].
-            rotations: Its axes in the world, as columns.
-            frames: Which frames; all when not given.
-        """
+        """Shortest distance of a camera from the place that it looks at with all hands in its picture [m]."""
         points, there = self._rows(frames)
         around = points - centers[:, None, None].astype(np.float32)
         local = self._turned(around, rotations).reshape(len(centers), -1, 3)
@@ -147,13 +127,7 @@ class Framing:
         rotations: Float[np.ndarray, "T 3 3"],
         distances: Float[np.ndarray, "T"],
     ) -> Float[np.ndarray, "T 3"]:
-        """Places to look at [m] with all hands in the middle of the picture, as near these as may be.
-
-        Args:
-            centers: Where a camera looks [m].
-            rotations: Its axes in the world, as columns.
-            distances: From what it looks at [m].
-        """
+        """Places to look at [m] with all hands in the middle of the picture, as near these as may be."""
         around = self.points - centers[:, None, None].astype(np.float32)
         local = self._turned(around, rotations).reshape(len(centers), -1, 3)
         there = self._there.any(axis=1)
@@ -161,16 +135,15 @@ class Framing:
         shifts = np.zeros((len(centers), 2))
         shifts[there] = 0.5 * distances[there, None] * (np.nanmin(rays, axis=1) + np.nanmax(rays, axis=1))
         shifts = uniform_filter1d(shifts, self._window, axis=0, mode="nearest")
-        moved: NDArray[np.float64] = centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts)
-        return moved
+        return np.asarray(centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts))
 
-    def _rows(self, frames: NDArray[np.int64] | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _rows(self, frames: Integers | None) -> tuple[Floats, Flags]:
         if frames is None:
             return self.points, self._there
         return self.points[frames], self._there[frames]
 
     @staticmethod
-    def _turned(points: NDArray[np.float32], rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _turned(points: Floats, rotations: Doubles) -> Doubles:
         """Points (T, H, P, 3) in the axes of cameras (T, 3, 3)."""
         flat = points.reshape(len(points), -1, 3)
         return (flat @ rotations).reshape(points.shape)
@@ -182,8 +155,7 @@ def half_view(camera: Camera) -> Float[np.ndarray, "2"]:
     rays = camera.unproject(np.array([[0.0, cy], [width, cy], [cx, 0.0], [cx, height]]))
     ahead = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
     tangents = np.nan_to_num(np.abs(rays[:, :2]).max(axis=1) / ahead, nan=_WIDEST)
-    half: NDArray[np.float64] = (1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST)
-    return half
+    return np.asarray((1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST))
 
 
 def looking(directions: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3 3"]:
@@ -232,7 +204,7 @@ _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at lea
 
 
 @dataclass(frozen=True, slots=True)
-class ViewConfig:
+class ViewConfig(Settings):
     """Cameras of a take.
 
     Raises:
@@ -246,12 +218,12 @@ class ViewConfig:
     lenses as long as it takes, which zoom where hands would be small."""
     camera: str = "vga"
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
-    views: int = 1
+    views: Annotated[int, Limits(1)] = 1
     """Number of cameras; a rig has its own number."""
-    share: float = 1.0 / 3.0
+    share: Annotated[float, Limits(0.01, 1.0)] = 1.0 / 3.0
     """Share of the picture's height that a hand's longer side has, or a little more; less where all hands of
     a frame do not fit into the picture otherwise. Cameras at the eyes keep their distance."""
-    distance: tuple[float, float] | None = None
+    distance: Annotated[tuple[float, float] | None, Limits(0.05, 20.0, ascends=True)] = None
     """Instead of the share, nearest and farthest distance from the center of the hands [m], drawn
     uniformly."""
     rig: str = "six"
@@ -260,7 +232,8 @@ class ViewConfig:
     """Your own cameras, fixed in the world, instead of all these; or a file of them: ours (.toml), OpenCV's
     (.yml, .json), or COLMAP's (the folder of cameras.txt and images.txt)."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse a placement, a camera or views beside your own cameras, and a rig that is not used."""
         if self.cameras is not None and (self.placement, self.camera, self.views) != ("still", "vga", 1):
             raise ArgumentError(
                 f"the cameras are those of {self.own_cameras}; leave out the placement, the camera and the "
@@ -268,17 +241,9 @@ class ViewConfig:
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
-        check_choice(self.placement, PLACEMENTS, noun="placement")
         if self.placement != "rig" and self.rig != "six":
             raise ArgumentError(
                 f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"
-            )
-        if self.views < 1:
-            raise ArgumentError(f"{self.views} views, expected at least 1")
-        check_number("share", self.share, 0.01, 1.0)
-        if self.distance is not None and not 0.05 <= self.distance[0] <= self.distance[1] <= 20.0:
-            raise ArgumentError(
-                f"distances are {self.distance}, expected two of 0.05 to 20 m, the shorter first"
             )
 
     @property
@@ -293,9 +258,9 @@ class _Path(NamedTuple):
     """A camera on its way."""
 
     camera: Camera
-    poses: NDArray[np.float64]
+    poses: Doubles
     """(T, 4, 4)."""
-    zoom: NDArray[np.float64] | None = None
+    zoom: Doubles | None = None
     """Factor on its focal lengths (T,); None: it keeps them."""
 
     def at(self, frame: int) -> Camera:
@@ -307,11 +272,7 @@ class _Path(NamedTuple):
 
 
 class Viewpoints:
-    """Cameras of every frame.
-
-    Args:
-        take: The take whose hands they look at.
-    """
+    """Cameras of every frame."""
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
         if config.cameras is not None:
@@ -351,19 +312,19 @@ def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
     return Framing(take).centers
 
 
-def _along(take: Take) -> NDArray[np.float64]:
+def _along(take: Take) -> Doubles:
     """Direction (T, H, 3) from each wrist to its fingers; NaN where there is no hand."""
     return quaternion_matrix(take.qpos[..., 3:7])[..., 0]
 
 
-def _towards_user(take: Take) -> NDArray[np.float64]:
+def _towards_user(take: Take) -> Doubles:
     """Level unit direction (3,) from the hands to the user's body: where the forearms point."""
     level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
     return level / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
 
 
-def _spherical(azimuth: float, elevation: float) -> NDArray[np.float64]:
+def _spherical(azimuth: float, elevation: float) -> Doubles:
     return np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )
@@ -378,7 +339,7 @@ def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
     front = np.arctan2(-user[1], -user[0])
     spread = np.deg2rad(40.0) * (np.arange(config.views) - 0.5 * (config.views - 1))
 
-    def places(azimuth: float) -> Iterator[NDArray[np.float64]]:
+    def places(azimuth: float) -> Iterator[Doubles]:
         for wider in np.linspace(0.0, 1.0, _PLACES):
             aside = rng.uniform(0.15 * (1.0 - wider), 0.15 + _ASIDE * wider) * rng.choice([-1.0, 1.0])
             direction = _spherical(front + azimuth + aside, rng.uniform(0.1, 0.6 + 0.4 * wider))
@@ -391,7 +352,7 @@ def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
     """Around the hands, and around hands that are far apart more slowly where they are large."""
     turned = 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
 
-    def orbits(first: float) -> Iterator[NDArray[np.float64]]:
+    def orbits(first: float) -> Iterator[Doubles]:
         for attempt in range(_PLACES):
             azimuths = first + rng.uniform(-np.pi, np.pi) + turned
             elevation = rng.uniform(0.0, 0.8)
@@ -405,10 +366,7 @@ def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
 
 
 def _largest(
-    config: ViewConfig,
-    framing: Framing,
-    ways: Iterator[NDArray[np.float64]],
-    rng: np.random.Generator,
+    config: ViewConfig, framing: Framing, ways: Iterator[Doubles], rng: np.random.Generator
 ) -> _Path:
     """The first of some cameras that shows hands as large as asked for; if none does, the best of them.
 
@@ -429,9 +387,7 @@ def _largest(
     return chosen
 
 
-def _lingering(
-    config: ViewConfig, framing: Framing, turned: NDArray[np.float64], elevation: float
-) -> NDArray[np.float64]:
+def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation: float) -> Doubles:
     """Azimuths (T,) in the place of those of an even turn, that pass quickly where hands would be small."""
     camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
     frames = np.unique(np.linspace(0, len(turned) - 1, _SAMPLES).astype(int))
@@ -446,13 +402,13 @@ def _lingering(
     time = np.maximum(time, _QUICKEST * time.max())
     passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
     laps, rest = np.divmod(turned, 2.0 * np.pi)
-    slow: NDArray[np.float64] = 2.0 * np.pi * laps
+    slow: Doubles = 2.0 * np.pi * laps
     slow += np.interp(rest, passed, np.append(azimuths, 2.0 * np.pi))
     return slow
 
 
 def _followed(
-    config: ViewConfig, framing: Framing, directions: NDArray[np.float64], rng: np.random.Generator
+    config: ViewConfig, framing: Framing, directions: Doubles, rng: np.random.Generator
 ) -> tuple[float, _Path]:
     """A camera in these directions (T, 3) of the hands that shows them all, and moves as little as it can.
 
@@ -482,9 +438,7 @@ def _followed(
     return float(np.median(distances)) / farthest, _Path(camera, poses)
 
 
-def _distance_of(
-    camera: Camera, side: NDArray[np.float64] | float, share: NDArray[np.float64] | float
-) -> Any:
+def _distance_of(camera: Camera, side: Doubles | float, share: Doubles | float) -> Any:
     """Distance [m] at which something as long as this [m] has this share of the picture's height."""
     return camera.K[1, 1] * side / (share * camera.size[1])
 
@@ -506,7 +460,7 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     return paths
 
 
-def _past_forearms(take: Take, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def _past_forearms(take: Take, offset: Doubles) -> Doubles:
     """The offset (3,) [m] from the hands, rotated until no forearm usually lies in the line of sight."""
     length = float(np.linalg.norm(offset))
     direction = offset / length
@@ -561,7 +515,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
     return paths
 
 
-def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _behind_arms(qpos: Doubles, positions: Doubles) -> Flags:
     """Whether each frame's position (T, 3) [m] is behind a forearm, where little else is seen, or beside one.
 
     NaN, where there is no hand, never is.
@@ -571,8 +525,7 @@ def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> N
     back = -(away * along).sum(axis=-1)
     behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
     beside = np.linalg.norm(away + np.clip(back, 0.0, _ARM)[..., None] * along, axis=-1) < _ARM_DISTANCE
-    hidden: NDArray[np.bool_] = (behind | beside).any(axis=1)
-    return hidden
+    return np.asarray((behind | beside).any(axis=1))
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
@@ -609,9 +562,7 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
 _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
 
 
-def _turned_to(
-    position: NDArray[np.float64], centers: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _turned_to(position: Doubles, centers: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Ways (T, 3) [m] from places to a camera, their lengths (T,) [m], and its axes (T, 3, 3) then."""
     away = position - centers
     distances = np.linalg.norm(away, axis=1)
@@ -651,12 +602,12 @@ def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> Non
         warnings.warn(told, HandSimWarning, stacklevel=2)
 
 
-def _any_inside(camera: Camera, points: NDArray[np.float64]) -> bool:
+def _any_inside(camera: Camera, points: Doubles) -> bool:
     pixels = camera.project(points)
     return bool(((pixels >= 0.0) & (pixels < camera.size)).all(axis=-1).any())  # never so for NaN
 
 
-def _shown(vector: NDArray[np.float64]) -> str:
+def _shown(vector: Doubles) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in vector + 0.0) + ")"
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
-from handsim.space.cameras import CameraRig
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens, focal_of_angle, look_at, pinhole
+from handsim.space.rig import CameraRig
 
 
 def square_rig(name, poses, field_of_view=np.pi / 3, resolution=1280) -> CameraRig:

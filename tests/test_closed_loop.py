@@ -9,8 +9,7 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from handsim.cli.simulate import simulate
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel
+from handsim.hand.model import HandModel, hand_keypoints
 from render import RenderConfig, draw
 from render.viewpoints import ViewConfig
 from track.captures import track_capture

@@ -55,7 +55,7 @@ def test_wheel_holds_every_source_and_data_file(wheel: zipfile.ZipFile) -> None:
 
 
 def test_wheel_carries_license_command_and_one_version(wheel: zipfile.ZipFile) -> None:
-    stated = re.search(r'__version__ = "(.+)"', (ROOT / "handsim" / "_version.py").read_text())
+    stated = re.search(r'__version__ = "(.+)"', (ROOT / "handsim" / "__init__.py").read_text())
     assert stated is not None
     about = f"handsim-{stated.group(1)}.dist-info"
     texts = {name: wheel.read(f"{about}/{name}").decode() for name in ("METADATA", "entry_points.txt")}

@@ -14,7 +14,7 @@ from handsim import __version__ as __version__  # the first import: it warns abo
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from gloves.takes.status import Status as Status
+    from gloves.takes.points import Status as Status
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch
@@ -44,11 +44,13 @@ if TYPE_CHECKING:
     from track.settings import TrackSettings as TrackSettings
     from track.sinks import SinkGroup as SinkGroup
     from track.sinks import open_sinks as open_sinks
-    from track.streams.addresses import open_source as open_source
     from track.streams.frame_source import StreamedFrame as StreamedFrame
     from track.streams.live_stream import LiveStream as LiveStream
-    from track.streams.natnet_server import PointFrames as PointFrames
-    from track.streams.natnet_server import ReplayServer as ReplayServer
+    from track.streams.live_stream import StreamSettings as StreamSettings
+    from track.streams.live_stream import open_source as open_source
+    from track.streams.natnet import PointFrames as PointFrames
+    from track.streams.natnet import ReplayServer as ReplayServer
+    from track.streams.natnet import ReplaySettings as ReplaySettings
     from track.take_summary import SuspectSpan as SuspectSpan
     from track.take_summary import find_suspect_spans as find_suspect_spans
     from track.tracker import Tracker as Tracker

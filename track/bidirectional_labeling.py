@@ -19,13 +19,11 @@ from scipy.sparse.csgraph import connected_components
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.frames import TrackedHand
 from track.label_confidence import label_confidence
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from track.user import User
-from train.labelers.protocol import Labeler
 
 _WORTH: Final = 6.0  # log-odds of a point that lies exactly where its marker is, against a stray
 _SPREAD: Final = 0.003  # [m] of the RMS distance of labeled markers from a pose
@@ -55,30 +53,20 @@ class _Events(NamedTuple):
 def label_both_ways(
     take: Take,
     frames: Sequence[StreamedFrame],
-    user: User,
-    labeler: Labeler,
-    told: Callable[[int], None] = lambda count: None,
+    new_tracker: Callable[[], Tracker],
+    on_count: Callable[[int], None],
 ) -> Take:
-    """Label frames that follow from each other.
-
-    Args:
-        take: The capture, without labels.
-        frames: Its frames.
-        told: Called with the number of frames that are done; a frame is done in both directions.
-
-    Returns:
-        The take with labels and the confidence in them.
-    """
+    """The take with labels and their confidence; `on_count` is called with the number of frames done."""
     count = len(frames)
-    forward = _track(take, frames, range(count), user, labeler, lambda done: told(done // 2))
-    reverse = range(count)[::-1]
-    backward = _track(take, frames, reverse, user, labeler, lambda done: told((count + done) // 2))
+    order = range(count)
+    forward = _track(take, frames, order, new_tracker(), lambda done: on_count(done // 2))
+    backward = _track(take, frames, order[::-1], new_tracker(), lambda done: on_count((count + done) // 2))
     points, one, other = take.point_list, forward.take.point_list.labels, backward.take.point_list.labels
     is_second = np.zeros(one.shape, dtype=bool)
     events = _events_of(points.frames, one, other)
     is_second[events.points] = _is_likelier(backward.take, forward.take, events)
     is_better = backward.evidence > forward.evidence
-    for run in _exchanges(points, one, other, user.layout.num_markers):  # right and left: the poses tell
+    for run in _exchanges(points, one, other, len(take.hand_labels[0])):  # right and left: the poses tell
         is_better[run] = backward.evidence[run].sum() > forward.evidence[run].sum()
         is_second[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
     labels = np.where(is_second, other, one)
@@ -95,21 +83,20 @@ def _track(
     take: Take,
     frames: Sequence[StreamedFrame],
     order: Sequence[int],
-    user: User,
-    labeler: Labeler,
-    told: Callable[[int], None],
+    tracker: Tracker,
+    on_count: Callable[[int], None],
 ) -> _Track:
     """The hands tracked through frames in an order."""
-    tracker, points = Tracker(user, labeler), take.point_list
+    points, num_hands = take.point_list, len(tracker.hands)
     labels, evidence = points.labels.copy(), np.zeros(len(frames))
-    qpos, rms = np.zeros((len(frames), len(user), NUM_QPOS)), np.zeros((len(frames), len(user)))
+    qpos, rms = np.zeros((len(frames), num_hands, NUM_QPOS)), np.zeros((len(frames), num_hands))
     for count, row in enumerate(order, 1):
         frame = frames[row]
         one = tracker.step(frame.points, frame.ids, abs(frame.time - frames[order[0]].time))
         labels[points.of(row)] = one.labels
         qpos[row], rms[row] = [hand.qpos for hand in one.hands], [hand.rms for hand in one.hands]
         evidence[row] = sum(map(_evidence, one.hands))
-        told(count)
+        on_count(count)
     posed = _posed(take, labels, qpos, rms)
     sure = dataclasses.replace(posed.point_list, confidence=label_confidence(posed))
     return _Track(dataclasses.replace(posed, point_list=sure), evidence)

@@ -1,4 +1,8 @@
-"""From a capture to hands: its labels, their motion, or the hands themselves."""
+"""From a capture to hands: their labels, their motion, or the hands themselves.
+
+All go one way. What is given becomes frames, and hands with their labeler; hands that nobody has measured are
+measured in some of the frames; then all frames are labeled or tracked.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,11 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from gloves.captures.capture import Capture
-from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
@@ -22,60 +25,64 @@ from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning
-from handsim.hand.topology import NUM_QPOS, Side
+from handsim.hand.shape import NUM_QPOS, Side
 from track.association.frame_state import change_of_distances
 from track.association.initialization import FEWEST_POINTS, label_alone
 from track.bidirectional_labeling import label_both_ways
-from track.config import BOTH, Size
+from track.config import BOTH
 from track.corrected_take import correct_take
 from track.frames import TrackedFrame
-from track.hand_check import check_hands, check_scale
-from track.hand_size import sample_frames
-from track.inputs import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_size import measured_user, sample_frames
+from track.inputs import AnyCapture, AnyGlove, AnyLabeler, capture_of, labeler_of
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
-from track.settings import (
-    AnyHands,
-    TrackerSetup,
-    TrackSettings,
-    as_designed,
-    choose_user,
-    found_user,
-    measured_user,
-)
+from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
 from track.sinks import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
-from track.user import MEASURED, User, checked_sides
-from train.labelers.storage import load_labeler
+from track.user import User, nominal_user
 
+OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
 _CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most
 _MOST: Final = 0.5  # share of these pairs that change no more
 
 
+class _Opened(NamedTuple):
+    """A capture, and what tracks it."""
+
+    source: Capture
+    frames: list[StreamedFrame]
+    setup: TrackerSetup
+
+    @classmethod
+    def of(cls, capture: AnyCapture, settings: LabelSettings, *, warns: bool = False) -> _Opened:
+        """The capture of a file, and the hands in it: as they are given, or as they are measured in it."""
+        setup = TrackerSetup.of(settings)
+        source = capture_of(capture)
+        frames = checked_frames(source)
+        return cls(source, frames, setup.measured(sample_frames(frames), warns=warns))
+
+
 def label_capture(
     capture: AnyCapture,
-    glove: AnyGlove = "dense19",
+    settings: LabelSettings | None = None,
     *,
-    hands: AnyHands | None = None,
-    labeler: AnyLabeler = None,
     progress: Progress = no_progress,
+    **options: Any,
 ) -> Take:
     """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
 
-    Their size is measured in the capture unless they are given. The take holds labels alone; `track_capture`
-    gives poses.
+    Frames that follow from each other are labeled by tracking them in both directions, other frames alone.
+    The take holds labels alone; `track_capture` gives poses.
 
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
-        glove: Marker layout, or its shipped name or the path of its .toml file.
-        hands: A user, hands in their gloves or the path of a user's file; or sides, those of the glove when
-            not given.
-        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        settings: How to label; as `LabelSettings()` when not given.
         progress: Called with the number of frames that are done, and of all frames.
+        options: Fields of `LabelSettings` that differ from `settings`, as `glove="dense19"`.
 
     Returns:
         A take whose `labels` (T, N) are indices into its `label_names`, -1 for none, and whose `confidence`
@@ -90,59 +97,32 @@ def label_capture(
     Warns:
         HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
     """
-    layout = load_layout(glove)
-    network = load_labeler(layout, labeler)
-    source = capture_of(capture)
-    frames = checked_frames(source)
-    worn = [side for side in BOTH if side in layout.sides]
-    user, is_measured = choose_user(layout, worn if hands is None else hands, "auto")
-    sample = sample_frames(frames)
-    check_scale(sample, user, network)
-    if is_measured:
-        user = found_user(sample, layout, user.sides, network) or user
-    check_hands(sample, user, network, options=("--glove",))
-
-    def told(count: int) -> None:
-        progress(count, len(frames))
-
-    present = np.isfinite(source.positions[..., 0])
-    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
-    settings["glove"] = str(glove) if isinstance(glove, str | Path) else layout.name
+    source, frames, setup = _Opened.of(capture, LabelSettings.of(settings, options))
+    present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
-        user.hands,
-        np.full((source.num_frames, len(user), NUM_QPOS), np.nan),
+        setup.user.hands,
+        np.full((source.num_frames, len(setup.user), NUM_QPOS), np.nan),
         source.positions,
         number_runs(present),
         np.full(present.shape, -1, dtype=np.int16),
         rate=source.rate,
-        settings=settings,
+        settings={**_named(capture), "glove": glove},
     )
+
+    def on_count(count: int) -> None:
+        progress(count, len(frames))
+
     if _is_continuous(frames):
-        labeled = label_both_ways(take, frames, user, network, told)
+        labeled = label_both_ways(take, frames, setup.tracker, on_count)
     else:
-        found = label_alone([frame.points for frame in frames], user.hands, network, told)
+        found = label_alone([frame.points for frame in frames], setup.user.hands, setup.labeler, on_count)
         labels, confidence = (np.concatenate(values) for values in zip(*found, strict=True))
         points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
         labeled = dataclasses.replace(take, point_list=points)
     if (labeled.point_list.labels < 0).all():
-        none = f"no hand found, expected hands in glove '{settings['glove']}' (--glove names another)"
+        none = f"no hand found, expected hands in glove '{glove}' (--glove names another)"
         warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
     return labeled
-
-
-def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
-    """Whether the frames of a capture follow from each other."""
-    pairs = [
-        (one.points, other.points)
-        for one, other in pairwise(frames)
-        if len(one.points) >= FEWEST_POINTS and len(other.points) >= FEWEST_POINTS
-    ]
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
-    changes = [change_of_distances(*pairs[number]) for number in chosen]
-    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)
-
-
-OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 
 
 def track_capture(
@@ -179,93 +159,25 @@ def track_capture(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    settings = TrackSettings.of(settings, options)
-    setup = TrackerSetup.of(settings)
-    source = capture_of(capture)
+    chosen = TrackSettings.of(settings, options)
+    source, frames, setup = _Opened.of(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
-    frames = checked_frames(source)
-    is_measured = setup.is_measured
-    setup = setup.measured(sample_frames(frames))
-    if settings.calibrate:
-        recorder = record_frames(frames, setup.tracker(), progress=progress)
-        setup = _calibrated(recorder.take(source), setup, is_measured=is_measured)
-    recorder = record_frames(frames, setup.tracker(), sinks, on_frame, progress)
-    take = recorder.take(source)
-    named = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    if chosen.calibrate:
+        setup = _calibrated(record_frames(frames, setup.tracker(), progress=progress).take(source), setup)
+    take = record_frames(frames, setup.tracker(), sinks, on_frame, progress).take(source)
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
-    take = dataclasses.replace(take, point_list=points, settings={**take.settings, **named, **setup.settings})
+    record = {**take.settings, **_named(capture), **setup.settings}
+    take = dataclasses.replace(take, point_list=points, settings=record)
     return take if corrections is None else _corrected(take, Path(corrections), pins)
-
-
-def record_frames(
-    frames: Sequence[StreamedFrame],
-    tracker: Tracker,
-    sinks: SinkGroup | None = None,
-    on_frame: OnFrame | None = None,
-    progress: Progress = no_progress,
-) -> TakeRecorder:
-    """Track all frames; sinks take them at the capture's own rate."""
-    recorder = TakeRecorder(tracker)
-    if sinks:
-        sinks.start(tracker.hands, tracker.bodies)
-    began = monotonic()
-    for frame in frames:
-        tracked = tracker.step(frame.points, frame.ids, frame.time)
-        if sinks:
-            sleep(max(0.0, began + frame.time - monotonic()))
-            sinks.send(frame, tracked)
-        if on_frame is not None:
-            on_frame(frame, tracked)
-        recorder.add(frame, tracked)
-        progress(recorder.num_frames, len(frames))
-    return recorder
-
-
-def _calibrated(take: Take, setup: TrackerSetup, *, is_measured: bool) -> TrackerSetup:
-    """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
-    user = setup.user
-    try:
-        done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, None)
-    except CalibrationError as error:
-        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
-        return setup
-    notes = f"calibrated on the take itself, {user.notes.removeprefix(MEASURED) or user} to begin with"
-    found = kept_user(take, done, user, notes, None)
-    better = {hand.side: hand for hand in found}
-    hands = tuple(better.get(hand.side, hand) for hand in user)
-    settings = {**setup.settings, "user": found.notes}
-    return dataclasses.replace(setup, user=dataclasses.replace(found, hands=hands), settings=settings)
-
-
-def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tuple[Correction, ...]:
-    """The corrections of a file, checked against the capture before the long work."""
-    corrections = load_corrections(path)
-    ids = number_runs(np.isfinite(source.positions[..., 0]))
-    points = PointList.of_tables(source.positions, ids, np.full_like(ids, -1), np.ones(ids.shape))
-    try:
-        find_pins(corrections, points, label_names(setup.user, setup.bodies))
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
-    return corrections
-
-
-def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Take:
-    """The take with its corrections; what does not fit is told."""
-    corrected = correct_take(take, corrections)
-    for sentence in told(path, corrected.unfitting):
-        warnings.warn(sentence, HandSimWarning, stacklevel=3)
-    return corrected.take
 
 
 def calibrate(
     capture: AnyCapture,
-    glove: AnyGlove | None = None,
+    settings: CalibrateSettings | None = None,
     *,
-    hands: AnyHands = BOTH,
-    size: Size = "auto",
-    labeler: AnyLabeler = None,
     progress: Progress = no_progress,
     on_step: OnStep = no_step,
+    **options: Any,
 ) -> User:
     """Fit hands and gloves to their user, from any capture; one in which every joint moves tells most.
 
@@ -276,13 +188,10 @@ def calibrate(
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers
             are not used.
-        glove: Marker layout, or its shipped name or the path of its .toml file; when not given that of
-            `hands`, or dense19 for hands that are measured.
-        hands: Which hands may be in the capture; or hands to begin with, as `track_capture` takes them.
-        size: The size to begin with: XS, S, M, L, XL, or auto, which measures it in the capture.
-        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        settings: Which hands to begin with; as `CalibrateSettings()` when not given.
         progress: Called with what is done of a step, and all there is to do in it.
         on_step: Called with the name of each step, such as "frames".
+        options: Fields of `CalibrateSettings` that differ from `settings`, as `glove="dense19"`.
 
     Returns:
         The hands that are in the capture; its `calibrations` tell of each how it was found: `held_out`,
@@ -296,31 +205,19 @@ def calibrate(
         WeightsError: The labeler is unknown, or knows other markers.
     """
 
-    def told(what: str, done: int, total: int) -> None:
+    def on_part(what: str, done: int, total: int) -> None:
         on_step(what)
         progress(done, total)
 
-    setup = TrackerSetup.of(TrackSettings(glove=glove, hands=hands, size=size, labeler=labeler))
-    source = capture_of(capture)
-    frames, user, network = checked_frames(source), setup.user, setup.labeler
-    sample = sample_frames(frames)
-    check_scale(sample, user, network)
-    if setup.is_measured:
-        user = found_user(sample, user.layout, user.sides, network) or user
-    check_hands(sample, user, network)
-    start = as_designed(user) if setup.is_measured else user.hands
-
-    def labeled(hands: Sequence[GloveFit]) -> Take:
-        return record_frames(frames, Tracker(hands, network), progress=partial(told, "frames")).take(source)
-
-    take = labeled(user)
-    done = calibrate_take(take, start, user, told)
+    source, frames, setup = _Opened.of(capture, CalibrateSettings.of(settings, options))
+    on_label = partial(on_part, "frames")
+    take = record_frames(frames, setup.tracker(), progress=on_label).take(source)
+    done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
-        take = labeled([one.hand for one in done])
-        done = calibrate_take(take, start, user, told)
-    name = Path(capture).name if isinstance(capture, str | Path) else "a capture"
-    notes = f"calibrated from {name}, {user.notes.removeprefix(MEASURED) or user} to begin with"
-    found = kept_user(take, done, user, notes, told)
+        tracker = Tracker([one.hand for one in done], setup.labeler)
+        take = record_frames(frames, tracker, progress=on_label).take(source)
+        done = calibrate_take(take, setup.start, setup.user, on_part)
+    found = kept_user(take, done, setup.user, f"from {_named(capture).get('capture', 'a capture')}", on_part)
     for one in found.calibrations:
         if not one.is_better:
             warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
@@ -352,7 +249,80 @@ def measure_hands(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    sides = checked_sides(hands)
-    layout = load_layout(glove)
+    user = nominal_user(load_layout(glove), USUAL_SIZE, hands)
     frames = checked_frames(capture_of(capture))
-    return measured_user(sample_frames(frames), layout, sides, load_labeler(layout, labeler))
+    return measured_user(sample_frames(frames), user, labeler_of(user.layout, labeler))
+
+
+def record_frames(
+    frames: Sequence[StreamedFrame],
+    tracker: Tracker,
+    sinks: SinkGroup | None = None,
+    on_frame: OnFrame | None = None,
+    progress: Progress = no_progress,
+) -> TakeRecorder:
+    """Track all frames; sinks take them at the capture's own rate."""
+    recorder = TakeRecorder(tracker)
+    if sinks:
+        sinks.start(tracker.hands, tracker.bodies)
+    began = monotonic()
+    for frame in frames:
+        tracked = tracker.step(frame.points, frame.ids, frame.time)
+        if sinks:
+            sleep(max(0.0, began + frame.time - monotonic()))
+            sinks.send(frame, tracked)
+        if on_frame is not None:
+            on_frame(frame, tracked)
+        recorder.add(frame, tracked)
+        progress(recorder.num_frames, len(frames))
+    return recorder
+
+
+def _named(capture: AnyCapture) -> dict[str, str]:
+    """What a take records of the file of its capture."""
+    return {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+
+
+def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
+    """Whether the frames of a capture follow from each other."""
+    pairs = [
+        (one.points, other.points)
+        for one, other in pairwise(frames)
+        if min(len(one.points), len(other.points)) >= FEWEST_POINTS
+    ]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
+    changes = [change_of_distances(*pairs[number]) for number in chosen]
+    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)
+
+
+def _calibrated(take: Take, setup: TrackerSetup) -> TrackerSetup:
+    """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
+    try:
+        done = calibrate_take(take, setup.start, setup.user)
+    except CalibrationError as error:
+        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
+        return setup
+    found = kept_user(take, done, setup.user, "on the take itself")
+    better = {hand.side: hand for hand in found}
+    hands = tuple(better.get(hand.side, hand) for hand in setup.user)
+    return setup.with_user(dataclasses.replace(found, hands=hands))
+
+
+def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tuple[Correction, ...]:
+    """The corrections of a file, checked against the capture before the long work."""
+    corrections = load_corrections(path)
+    ids = number_runs(np.isfinite(source.positions[..., 0]))
+    points = PointList.of_tables(source.positions, ids, np.full_like(ids, -1), np.ones(ids.shape))
+    try:
+        find_pins(corrections, points, label_names(setup.user, setup.bodies))
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+    return corrections
+
+
+def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Take:
+    """The take with its corrections, and warnings of those that do not fit."""
+    corrected = correct_take(take, corrections)
+    for sentence in told(path, corrected.unfitting):
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
+    return corrected.take

@@ -1,4 +1,4 @@
-"""Pose of a rigid constellation of markers from points: by assigned points, or by the distances between markers.
+"""Pose of a rigid constellation of markers from points: from assigned ones, or by distances between markers.
 
 Shapes: Q markers, N points. A pose is position [m] and orientation (wxyz) of the body's frame in the world,
 seven numbers. An assignment (Q,) holds the index of each marker's point, -1 for a marker without a point.

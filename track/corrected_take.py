@@ -14,7 +14,7 @@ from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
-from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.pose_solver import FEWEST_MARKERS, AnglePrior, PoseSolver
 from track.kinematics.pose_spread import SpreadModel
 from track.user import hand_origin

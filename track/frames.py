@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
 
 FARTHEST: Final = 1e3

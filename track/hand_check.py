@@ -16,12 +16,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gloves.captures.plausibility import spacing
+from gloves.captures.capture import spacing
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
 from track.hand_size import fit_size

@@ -6,7 +6,7 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 
 from __future__ import annotations
 
-import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
+from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES, shape_from_measures
-from handsim.hand.topology import Side
+from handsim.hand.shape import SIZES, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.calibration.energy import Estimate, Problem, levenberg_marquardt, shared_covariance, user_hand
 from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, nearest_coordinates
@@ -28,6 +28,7 @@ from track.frames import TrackedHand
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
+from track.user import MEASURED, User
 from train.labelers.protocol import Labeler
 
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
@@ -35,7 +36,6 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longe
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] from the length that the labels were found with
 _PRECISION: Final = 0.001  # [m] of length
-_GOLDEN, _SQRT_EPSILON = 0.5 * (3.0 - math.sqrt(5.0)), math.sqrt(2.2e-16)  # of the search
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
 _MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
@@ -53,6 +53,7 @@ _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 16  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _SURE: Final = 2.0  # standard deviations within which the length is with 95 %
+_USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
@@ -104,13 +105,25 @@ def fit_size(
     Returns:
         The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
-    usual = TrackerConfig()
-    for config in (_LENIENT,) if is_quick else (usual, _LENIENT):
+    for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
-            if fit is not None and (config is usual or _is_found(fit, frames, sides, labeler)):
+            if fit is not None and (config is _USUAL or _is_found(fit, frames, sides, labeler)):
                 return fit
     return None
+
+
+def measured_user(
+    frames: Sequence[StreamedFrame], user: User, labeler: Labeler, *, warns: bool = True
+) -> User:
+    """A user with the hands as measured in some frames; as they are, with a warning, if no hand is found."""
+    size = fit_size(frames, user.layout, user.sides, labeler)
+    if size is not None:
+        return User(size.hands(user.sides), f"{MEASURED}{size}")
+    if warns:
+        none = f"no hand was found to measure its size; size {user.notes} is used, or name a size"
+        warnings.warn(none, HandSimWarning, stacklevel=3)
+    return user
 
 
 def _fit_from(
@@ -259,44 +272,13 @@ class _Search:
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """The argument between two bounds [m] with the least value of a function, by Brent's method (1973).
+    """The argument between two bounds [m] with the least value of a function."""
+    from scipy.optimize import (
+        minimize_scalar,  # a quarter of a second, which a user's known hands do not need
+    )
 
-    The same steps as scipy's, which takes longer to load than to search.
-    """
-    best = second = third = low + _GOLDEN * (high - low)  # arguments with the least values so far
-    values = {best: function(best)}
-    step = before = 0.0  # the last step and the one before it
-    while True:
-        middle, least = 0.5 * (low + high), _SQRT_EPSILON * abs(best) + _PRECISION / 3.0
-        if abs(best - middle) <= 2.0 * least - 0.5 * (high - low):
-            return best
-        first = (best - second) * (values[best] - values[third])
-        other = (best - third) * (values[best] - values[second])
-        over = (best - third) * other - (best - second) * first
-        under = 2.0 * (other - first)
-        over, under = (-over if under > 0.0 else over), abs(under)
-        if (
-            abs(before) > least
-            and abs(over) < abs(0.5 * under * before)
-            and under * (low - best) < over < under * (high - best)
-        ):  # the lowest point of a parabola through all three
-            before, step = step, over / under
-            if min(best + step - low, high - best - step) < 2.0 * least:
-                step = math.copysign(least, middle - best)
-        else:
-            before = low - best if best >= middle else high - best
-            step = _GOLDEN * before
-        tried = best + math.copysign(max(abs(step), least), step)
-        values[tried] = function(tried)
-        if values[tried] <= values[best]:
-            low, high = (best, high) if tried >= best else (low, best)
-            best, second, third = tried, best, second
-        else:
-            low, high = (tried, high) if tried < best else (low, tried)
-            if values[tried] <= values[second] or second == best:
-                second, third = tried, second
-            elif values[tried] <= values[third] or third in (best, second):
-                third = tried
+    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
+    return float(found.x)
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:

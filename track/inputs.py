@@ -10,6 +10,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
 AnyCapture = Capture | Take | str | Path
 """A capture, or a take, of which only the points are used; or the path of one."""
@@ -40,6 +41,11 @@ def read_points(path: str | Path) -> Capture | Take:
     if str(path).lower().endswith((".npz", ".npz.part")):
         return load_take(path)
     return read_capture(path)
+
+
+def labeler_of(worn: MarkerLayout, labeler: AnyLabeler) -> Labeler:
+    """A labeler that knows the markers of a glove; see `load_labeler` for errors."""
+    return load_labeler(worn if hasattr(labeler, "label_frames") else designed_glove(worn), labeler)
 
 
 def designed_glove(worn: MarkerLayout) -> MarkerLayout:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.takes.take import LOST, Take
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, point_distance
 from track.kinematics.pose_spread import resting_prior
 

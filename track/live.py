@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.takes.growing import check_free, growing_path
+from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take
 from handsim.app.messages import LiveStatus
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
@@ -22,9 +22,8 @@ from track.frames import FARTHEST, TrackedFrame
 from track.recorder import Recorder
 from track.settings import TrackerSetup
 from track.sinks import SinkGroup
-from track.streams.addresses import open_source
 from track.streams.frame_source import StreamedFrame
-from track.streams.live_stream import MOST_LAG, LiveStream
+from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them
@@ -118,7 +117,7 @@ def measured_setup(
         seconds: How long to wait [s], ten seconds at most.
     """
     gc.freeze()  # to look through all that was loaded took the collector a quarter of a second now and then
-    if not setup.is_measured:
+    if not setup.is_auto:
         stream.forgive()
         return setup, stream
     first = _first_frames(stream, setup.fewest_points, seconds, status)
@@ -165,7 +164,7 @@ def track_live(
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
         Stopped: A signal came before the recording began, or a second one after that.
     """
-    check_free(growing_path(out))
+    check_unused(growing_path(out))
     until = [math.inf]  # [s], when it is over by this machine's clock
     interrupted = InterruptFlag()
 

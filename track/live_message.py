@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import label_names
 from handsim import __version__
-from handsim._extras import import_extra
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import JOINT_NAMES, Side
+from handsim._plugins import import_extra
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import JOINT_NAMES, Side
 from track.frames import TrackedFrame, TrackedHand
 from track.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame

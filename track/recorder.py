@@ -1,7 +1,7 @@
 """Recording of tracked frames: in memory, or on disk, as they come, so that memory does not grow.
 
-A recording on disk grows in `take.npz.part` (`gloves.takes.growing`), which is readable at any time and holds
-all but the last half second, whatever ends the process. `finish` turns it into `take.npz`.
+A recording on disk grows in `take.npz.part` (`gloves.takes.archives`), which is readable at any time and
+holds all but the last half second, whatever ends the process. `finish` turns it into `take.npz`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL, POINTS
-from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
+from gloves.takes.archives import GrowingArchive, GrownArchive, finish_archive, growing_path
+from gloves.takes.points import FRAMES, KEYPOINTS, OPTIONAL, POINTS
 from gloves.takes.take import (
     RATED_FRAMES,
     Take,
@@ -30,7 +30,7 @@ from gloves.takes.take import (
 )
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
-from handsim.files.atomic import remove_abandoned
+from handsim.files.outputs import remove_abandoned
 from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, TrackedFrame
 from track.streams.frame_source import StreamedFrame

@@ -18,15 +18,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.captures.capture import Capture
-from gloves.captures.plausibility import check_unit
-from gloves.takes.status import Status
+from gloves.captures.capture import Capture, check_unit
+from gloves.takes.points import Status
 from gloves.takes.take import RigidBody
 from handsim._checks import check_array, check_type
 from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices
-from handsim.files.atomic import atomic_write, read_toml
-from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
-from handsim.hand.topology import SIDES
+from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import SIDES
 from handsim.kernels import move, velocity_of
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import quaternion_matrix

@@ -23,11 +23,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim._checks import check_type
-from handsim._closing import Closing
-from handsim._extras import import_extra
-from handsim._plugins import is_plugin, list_plugins, make_plugin
+from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
 from track.frames import TrackedFrame
 from track.live_message import (
@@ -157,9 +156,7 @@ def open_sink(address: str) -> LiveSink:
     """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
-        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS)
-        if scheme != "ws" and parts.port == 0:
-            raise ArgumentError(f"'{address}' is not an address, expected a port from 1 to 65535")
+        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS, any_port=scheme == "ws")
         if scheme == "osc":
             return DatagramSink(parts.host, parts.port, osc_format())
         format = document_format(parts.options["format"], points=parts.options["points"] == "yes")

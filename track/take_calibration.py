@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, TRACKED, Take
 from handsim.errors import CalibrationError
-from handsim.hand.topology import BONES, Side
+from handsim.hand.shape import BONES, Side
 from track.calibration.energy import Progress
 from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
-from track.user import AS_MEASURED, User
+from track.user import AS_MEASURED, MEASURED, User
 
-CalibrationProgress = Callable[[str, int, int], None]
-"""Called with what is done, such as "frames", how much of it, and of how much."""
+OnPart = Callable[[str, int, int], None]
+"""Called with the name of a step, such as "frames", what is done of it, and all there is to do in it."""
 _SHOWN: Final = 0.05  # share of the frames in which a hand must be tracked to be calibrated
 _NEAR: Final = 0.015  # [m]: largest residual of a marker on a hand of another size
 _LEFT_OVER: Final = 0.005  # share of the markers that the first round may leave unlabeled
@@ -39,7 +39,7 @@ def calibrate_take(
     take: Take,
     start: Sequence[GloveFit],
     before: Sequence[GloveFit],
-    progress: CalibrationProgress | None,
+    on_part: OnPart = lambda step, done, total: None,
 ) -> tuple[Calibration, ...]:
     """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
 
@@ -59,7 +59,7 @@ def calibrate_take(
     for hand in shown:
         markers = _markers(take, hand.side)
         seen = np.where(out[:, None, None], np.nan, markers)
-        one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, progress))
+        one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, on_part))
         tried = _tried(markers[out], worn[hand.side], one.hand)
         if tried is not None and tried.is_better:
             tried = tried._replace(hidden=_hidden(markers, out, one, tried.after, take.rate))
@@ -102,33 +102,30 @@ def kept_user(
     take: Take,
     done: Sequence[Calibration],
     before: User,
-    notes: str,
-    progress: CalibrationProgress | None,
+    source: str,
+    on_part: OnPart = lambda step, done, total: None,
 ) -> User:
     """The user with the hands that fit held-out frames better: calibrated on all frames, or as before.
 
     Args:
-        done: What `calibrate_take` made of it.
+        done: What `calibrate_take` made of the take.
         before: The hands that it was labeled with, for each side in `done`.
-        notes: Where the user is from.
+        source: Where the frames are from, as "from take.c3d".
     """
-    whole = tuple(_solved_again(take, one, progress) if one.is_better else one for one in done)
-    worn = {hand.side: hand for hand in before}
-    hands = tuple(one.hand if one.is_better else worn[one.hand.side] for one in whole)
-    told = [f"{one.hand.side} hand: {one}{_remark(one, before)}" for one in whole]
-    return User(hands, "; ".join([notes, *told]), whole)
-
-
-def _remark(one: Calibration, before: User) -> str:
-    """What `is_calibrated` knows a hand by that is no better calibrated than measured."""
-    return "" if one.is_better or before.is_calibrated(one.hand.side) else AS_MEASURED
-
-
-def _solved_again(take: Take, one: Calibration, progress: CalibrationProgress | None) -> Calibration:
-    """A calibration on all frames, with what it did on held-out ones."""
-    side = one.hand.side
-    whole = calibrate_hand(_markers(take, side), one.start, take.rate, progress=_steps(side, progress))
-    return dataclasses.replace(whole, held_out=one.held_out)
+    worn, hands, whole = {hand.side: hand for hand in before}, [], []
+    notes = [f"calibrated {source}, {before.notes.removeprefix(MEASURED) or before} to begin with"]
+    for one in done:
+        side, remark = one.hand.side, ""
+        if one.is_better:
+            markers, on_step = _markers(take, side), _steps(side, on_part)
+            again = calibrate_hand(markers, one.start, take.rate, progress=on_step)
+            one = dataclasses.replace(again, held_out=one.held_out)  # noqa: PLW2901
+        elif not before.is_calibrated(side):
+            remark = AS_MEASURED  # by which `is_calibrated` knows it
+        hands.append(one.hand if one.is_better else worn[side])
+        notes.append(f"{side} hand: {one}{remark}")
+        whole.append(one)
+    return User(tuple(hands), "; ".join(notes), tuple(whole))
 
 
 def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
@@ -158,11 +155,9 @@ def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFi
     return HeldOut(off[0], off[1], len(seen))
 
 
-def _steps(side: Side, progress: CalibrationProgress | None) -> Progress | None:
+def _steps(side: Side, on_part: OnPart) -> Progress:
     """The progress of one hand."""
-    if progress is None:
-        return None
-    return lambda step, rms, gap: progress(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
+    return lambda step, rms, gap: on_part(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
 
 
 def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:

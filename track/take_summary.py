@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import minimum_filter1d
 
-from gloves.captures.capture import runs_of
-from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
+from gloves.captures.capture import AT_ORIGIN, all_at_origin, runs_of, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.association.initialization import distances_to_nearest
 from track.label_confidence import Evidence, evidence_of, label_confidence
 

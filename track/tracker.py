@@ -17,9 +17,10 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
-from handsim._checks import check_type
-from handsim.hand.topology import NUM_QPOS
+from gloves.takes.points import Status
+from handsim._checks import shown_value
+from handsim.errors import ArgumentError
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.frame_state import FrameState, Numbering, PointHistory, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction
@@ -34,10 +35,10 @@ from track.association.label_consistency import (
 from track.association.label_new_points import SETTLED_EVIDENCE, digit_table, label_new_points
 from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
-from track.inputs import AnyLabeler, designed_glove
+from track.inputs import AnyLabeler, labeler_of
 from track.rigid_body import BodyTracker, RigidTemplate
 from track.user import User, as_user
-from train.labelers.storage import load_labeler
+from train.labelers.protocol import Labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
@@ -49,6 +50,8 @@ _FIRST_WAIT: Final = 0.005  # [s] after a vain attempt to initialize lost hands;
 _WAIT_FACTOR: Final = 1.5  # of that time after each vain attempt
 _LONGEST_WAIT: Final = 0.1  # [s]
 _MORE_POINTS: Final = 3  # with which hands are looked for at once
+_HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
+_UNSURE_EXTENT: Final = 0.12  # [m] of clouds that no labeler is sure of
 
 
 class _Outcome(NamedTuple):
@@ -83,12 +86,13 @@ class Tracker:
         bodies: Sequence[RigidTemplate] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
-        check_type("config", config, TrackerConfig, "a TrackerConfig")
+        if not isinstance(config, TrackerConfig):
+            raise ArgumentError(f"config is {shown_value(config)}, expected a TrackerConfig")
         self.user = as_user(hands)
         self.hands = self.user.hands
         self.bodies = tuple(bodies)
         self.config = config
-        asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
+        asked = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [HandState(hand, config, origin=self.user.origin(hand.side)) for hand in self.hands]
@@ -329,3 +333,21 @@ def _tracked_hand(
     filled = np.flatnonzero(~present)
     spreads = state.pose_spread(frame.time)
     return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)
+
+
+def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
+    """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
+
+    Otherwise the first frames of a stream would have to wait.
+    """
+    tracker = Tracker(hands, labeler)
+    qpos = np.zeros((len(hands), NUM_QPOS))
+    qpos[:, 0], qpos[:, 3] = _HAND_SPACING * np.arange(len(hands)), 1.0
+    points = np.concatenate([hand.markers(row[None])[0][0] for hand, row in zip(hands, qpos, strict=True)])
+    for number in range(3):  # initialized, tracked, and labeled again
+        ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
+        for hand in tracker.step(points, ids, 0.01 * number).hands:
+            _ = hand.angle_spread
+    unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
+    for cloud in unsure:  # labels that a pose has to verify
+        labeler.label_frames([cloud])

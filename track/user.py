@@ -14,13 +14,12 @@ import numpy as np
 from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
-from handsim._checks import check_choice, check_type
+from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import ArgumentError, FileError, HandSimError
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, Size
 
@@ -63,10 +62,13 @@ class User(Sequence[GloveFit]):
     """How `calibrate` found each hand, and how well it fits frames that were held out; not in a file."""
 
     def __post_init__(self) -> None:
-        check_type("hands", self.hands, Sequence, "a left hand, a right hand, or one of each in its glove")
+        expected = "a left hand, a right hand, or one of each in its glove"
+        if not isinstance(self.hands, Sequence):
+            raise ArgumentError(f"hands is {shown_value(self.hands)}, expected {expected}")
         object.__setattr__(self, "hands", tuple(self.hands))
         for hand in self.hands:
-            check_type("one of hands", hand, GloveFit, "a GloveFit, a hand in its glove")
+            if not isinstance(hand, GloveFit):
+                raise ArgumentError(f"one of hands is {shown_value(hand)}, expected a GloveFit")
         sides = [hand.side for hand in self.hands]
         if not sides or len(set(sides)) < len(sides):
             raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
@@ -185,24 +187,17 @@ def _left_as_measured(notes: str) -> list[str]:
     return [told for told in notes.split("; ") if told.endswith(AS_MEASURED)]
 
 
-def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User:
-    """Hands of one of the five sizes in gloves as designed.
+def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) -> User:
+    """Hands of one of the five sizes in gloves as designed, of one side or both.
 
     Raises:
         ArgumentError: There is no such size, a side is named twice, or none is.
         LayoutError: The glove is for the other hand.
     """
-    sides = checked_sides(sides)
-    return User(tuple(nominal_fit(layout, size, side) for side in sides), size)
-
-
-def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
-    """One side, or both."""
-    check_type("hands", sides, Sequence, "right, left, or one of each")
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
-    return cast("tuple[Side, ...]", sides)
+    return User(tuple(nominal_fit(layout, size, cast("Side", side)) for side in sides), size)
 
 
 def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
@@ -215,8 +210,10 @@ def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
     if isinstance(hands, str | Path):
         user = load_user(hands)
         return dataclasses.replace(user, notes="; ".join([Path(hands).name, *_left_as_measured(user.notes)]))
-    check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
-    return hands if isinstance(hands, User) else User(tuple(hands))
+    if not isinstance(hands, User):
+        check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
+        return User(tuple(hands))
+    return hands
 
 
 def load_user(path: str | Path) -> User:

@@ -10,8 +10,9 @@ that is right.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,18 +21,18 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, select_hands
 from gloves.captures.formats import find_captures, read_markers
-from gloves.captures.markers import select_hands
 from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_count, check_rng, check_type
+from handsim._checks import check_rng, check_type
 from handsim.errors import ArgumentError, CaptureError
 from train.data.batches import Cloud, Corruption, OwnCorruption, draw_cloud, paper_corruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
+from train.settings import EvaluateSettings
 
 BINS: Final = 15
 """Equally wide bins of confidence."""
@@ -250,8 +251,8 @@ class LabelingReport:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.evaluation`; and from `train.evaluation` the expected
-    calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
+    """Shares in [0, 1]: those of `LabelCounts`, the expected calibration error, and the share of points
+    labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
     confusion: Int[np.ndarray, "M+1 M+1"]
@@ -261,7 +262,35 @@ class LabelingReport:
     right: Bool[np.ndarray, "N"]
     """Whether that label is right."""
     numbers: dict[str, int] = field(default_factory=dict)
-    """Slots, points, occlusions and ghosts counted, see `train.evaluation.LabelCounts.numbers`."""
+    """Slots, points, occlusions and ghosts counted."""
+
+
+Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
+"""Points of some frames [m], and the marker of each; -1 for a ghost."""
+
+
+def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport:
+    """Label points whose truth is known, and count errors."""
+    num_labels = len(labeler.marker_names)
+    counts = LabelCounts(confusion=np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64))
+    right_by_marker = np.zeros(num_labels)
+    confidences: list[NDArray[np.float64]] = [np.zeros(0)]
+    right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
+    for clouds, truths in parts:
+        for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True):
+            right_by_marker += counts.add(labeling.labels, truth, num_labels)
+            confidences.append(labeling.confidence)
+            right.append(labeling.labels == truth)
+    confidence, is_right = np.concatenate(confidences), np.concatenate(right)
+    figures = {
+        **counts.figures(),
+        "calibration_error": expected_calibration_error(confidence, is_right),
+        "error_without_least_sure": error_without(confidence, is_right),
+    }
+    by_marker = right_by_marker / max(1, counts.frames)
+    return LabelingReport(
+        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers()
+    )
 
 
 def evaluate_markers(
@@ -272,16 +301,9 @@ def evaluate_markers(
     rng: np.random.Generator,
 ) -> LabelingReport:
     """Corrupt known markers [m], NaN where missing, label them and count errors."""
-    count = LabelingCount(labeler)
-    count.add_markers(markers, corruption, rng=rng)
-    return count.report()
-
-
-def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> LabelingReport:
-    """Label clouds whose truth is known, and count errors."""
-    count = LabelingCount(labeler)
-    count.add_cloud(cloud)
-    return count.report()
+    firsts = range(0, len(markers), _CHUNK)
+    clouds = (draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng) for first in firsts)
+    return evaluate_frames(labeler, map(cloud_frames, clouds))
 
 
 def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
@@ -291,7 +313,23 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
     return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
-def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
+def cloud_frames(cloud: Cloud) -> Frames:
+    """The points and labels of clouds without their padding."""
+    return (
+        [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
+        [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
+    )
+
+
+def _take_frames(take: Take) -> Iterator[Frames]:
+    """The points of every hand of every frame of a take, separated by the truth."""
+    for hand in range(len(take.hands)):
+        clouds, truths = _hand_frames(take, hand)
+        for first in range(0, len(clouds), _CHUNK):
+            yield clouds[first : first + _CHUNK], truths[first : first + _CHUNK]
+
+
+def _hand_frames(take: Take, hand: int) -> Frames:
     """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
 
     A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of a body
@@ -318,64 +356,6 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
     return distance
 
 
-class LabelingCount:
-    """Labels clouds and counts errors."""
-
-    def __init__(self, labeler: Labeler) -> None:
-        self.labeler = labeler
-        self.num_labels = len(labeler.marker_names)
-        classes = self.num_labels + 1
-        self.counts = LabelCounts(confusion=np.zeros((classes, classes), dtype=np.int64))
-        self.right_by_marker = np.zeros(self.num_labels)
-        self.confidences: list[NDArray[np.float64]] = [np.zeros(0)]
-        self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
-
-    def add_cloud(self, cloud: Cloud) -> None:
-        """Label clouds [m] and count."""
-        self.add(
-            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
-            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
-        )
-
-    def add_markers(
-        self,
-        markers: Float[np.ndarray, "T M 3"],
-        corruption: Corruption | OwnCorruption | str,
-        *,
-        rng: np.random.Generator,
-    ) -> None:
-        """Corrupt markers [m], label the clouds and count."""
-        for first in range(0, len(markers), _CHUNK):
-            self.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
-
-    def add_take(self, take: Take) -> None:
-        """Label every hand of every frame of a take, separated by the truth."""
-        for hand in range(len(take.hands)):
-            clouds, truths = hand_clouds(take, hand)
-            for first in range(0, len(clouds), _CHUNK):
-                self.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
-
-    def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
-        """Label points [m] and count; a truth is the marker of each, -1 for a ghost."""
-        for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
-            self.right_by_marker += self.counts.add(labeling.labels, truth, self.num_labels)
-            self.confidences.append(labeling.confidence)
-            self.right.append(labeling.labels == truth)
-
-    def report(self) -> LabelingReport:
-        """Figures of all that was counted."""
-        frames = self.counts.frames
-        confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
-        figures = {
-            **self.counts.figures(),
-            "calibration_error": expected_calibration_error(confidences, right),
-            "error_without_least_sure": error_without(confidences, right),
-        }
-        by_marker = self.right_by_marker / max(1, frames)
-        numbers = self.counts.numbers()
-        return LabelingReport(figures, by_marker, frames, self.counts.confusion, confidences, right, numbers)
-
-
 CLEAN: Final = Corruption(occlude=0, ghosts=0)
 """No corruption but the order of points."""
 Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
@@ -386,10 +366,11 @@ labeled capture, the path of one of the three, or a folder of captures."""
 def evaluate_labeler(
     labeler: MarkerLayout | Labeler | str | Path,
     truth: Truth | Sequence[Truth],
-    corruption: Corruption | OwnCorruption | str = CLEAN,
+    corruption: Corruption | OwnCorruption | str | None = None,
     *,
-    every: int = 1,
+    settings: EvaluateSettings | None = None,
     rng: np.random.Generator | None = None,
+    **options: Any,
 ) -> LabelingReport:
     """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
 
@@ -398,10 +379,11 @@ def evaluate_labeler(
         truth: True markers (T, M, 3) [m] in the labeler's order, NaN where missing; a training set, a labeled
             capture or a take with its truth; the path of one of these or of a folder of captures; or several.
             Each hand is counted by itself.
-        corruption: Occlusion, ghosts and jitter to draw; none when not given. Or a corruption of your own, as
-            `CloudStream` takes it.
-        every: Take one frame of this many; 1 takes all.
-        rng: Source of all randomness; one of seed 0 when not given.
+        corruption: Occlusion, ghosts and jitter to draw, instead of those of the settings. Or a corruption of
+            your own, as `CloudStream` takes it.
+        settings: How to evaluate; every frame without any corruption when not given.
+        rng: Source of all randomness; one of the settings' seed when not given.
+        options: Settings of `EvaluateSettings` that differ from `settings`: `occlude=5, ghosts=2, every=10`.
 
     Returns:
         Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
@@ -412,32 +394,27 @@ def evaluate_labeler(
         CaptureError: A file cannot be read, its glove has other markers than the labeler knows, takes are
             given with others or to be corrupted, or there is nothing to count.
     """
-    network = load_labeler(labeler)
-    check_count("every", every, 1)
-    rng = np.random.default_rng(0) if rng is None else rng
+    network, settings = load_labeler(labeler), EvaluateSettings.of(settings, options)
+    corruption = Corruption(settings.occlude, settings.ghosts) if corruption is None else corruption
+    rng = np.random.default_rng(settings.seed) if rng is None else rng
     check_rng(rng)
     several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
     given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
-    count, takes = LabelingCount(network), [one for one in given if _is_take(one)]
-    if len(takes) < len(given) and takes:
-        raise CaptureError(
-            f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
-        )
-    for one in takes:
-        take = one if isinstance(one, Take) else load_take(one)
-        if take.made_by_tracker:
-            raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
-        if corruption != CLEAN or every > 1:
+    if takes := [one for one in given if _is_take(one)]:
+        if len(takes) < len(given):
+            raise CaptureError(
+                f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
+            )
+        if corruption != CLEAN or settings.every > 1:
             raise CaptureError(
                 "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
                 "(--occlude, --ghosts) and every (--every), which labeled captures take"
             )
-        for hand in take.hands:
-            _check_markers("the take's glove", hand.layout.names, network.marker_names)
-        count.add_take(take)
-    if not takes:
-        count.add_markers(_markers(given, network.marker_names)[::every], corruption, rng=rng)
-    report = count.report()
+        simulated = [_simulated_take(one, network.marker_names) for one in takes]
+        report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
+    else:
+        markers = _markers(given, network.marker_names)[:: settings.every]
+        report = evaluate_markers(network, markers, corruption, rng=rng)
     if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
         raise CaptureError(
             f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
@@ -453,6 +430,16 @@ def _shown(take: Any) -> str:
 
 def _is_take(truth: Any) -> bool:
     return isinstance(truth, Take) or (isinstance(truth, str | Path) and Path(truth).suffix == ".npz")
+
+
+def _simulated_take(given: Take | str | Path, names: tuple[str, ...]) -> Take:
+    """A take with its truth, of a glove whose markers the labeler knows."""
+    take = given if isinstance(given, Take) else load_take(given)
+    if take.made_by_tracker:
+        raise CaptureError(f"{_shown(given)}: a tracked take, expected the truth of a simulated capture")
+    for hand in take.hands:
+        _check_markers("the take's glove", hand.layout.names, names)
+    return take
 
 
 def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:

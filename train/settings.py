@@ -1,132 +1,113 @@
-"""Settings of the labelers and their training; without torch, so that a command's help is fast."""
+"""Settings of the labelers, their training and their evaluation; without torch, so that help is fast."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
-import numpy as np
-
-from handsim._checks import check_callable, check_choice, check_count, check_number, fill_settings
-from handsim._plugins import plugin_name
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError
+from handsim.settings import Expected, Limits, Settings
 from train.data.batches import BatchRecipe, Corruption, OwnCorruption, paper_corruption
 
 Kind = Literal["set", "cnn"]
-"""`set` is the default labeler (`train.labelers.networks`), `cnn` the paper's
-(`train.labelers.cnn_network`)."""
-
+"""`set` is the default labeler, `cnn` the paper's (`train.labelers.cnn_network`)."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+Preset = Literal["han2018"]
+PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
+EPOCHS: Final = 75
+"""How often the paper's training goes through its frames."""
+Views = Literal["aligned", "random"]
+"""`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
+for labeling the one of ten on which the cloud spreads best."""
 _MOST_CLOUDS: Final = 1_000_000  # in a batch
 _MOST_POINTS: Final = 100  # to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
-class SetLabelerConfig:
-    """Size of the set labeler."""
+class SetLabelerConfig(Settings):
+    """Size of the set labeler; a network beyond the limits would not fit into memory."""
 
-    num_labels: int = 19
-    width: int = 64
+    num_labels: Annotated[int, Limits(1, 1000)] = 19
+    width: Annotated[int, Limits(1, 4096)] = 64
     """Channels of a point."""
-    gates: int = 16
+    gates: Annotated[int, Limits(1, 4096)] = 16
     """Groups of message channels; the channels of a group share a gate."""
-    depth: int = 5
+    depth: Annotated[int, Limits(1, 100)] = 5
     """Rounds of messages."""
-    num_distances: int = 24
+    num_distances: Annotated[int, Limits(2, 1000)] = 24
     """Gaussian basis functions that encode a distance."""
-    reach: float = 0.24
+    reach: Annotated[float, Limits(0.001, 10.0)] = 0.24
     """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
 
-    def __post_init__(self) -> None:
-        for name, (low, high) in _SIZES.items():
-            check_count(name, getattr(self, name), low, high)
+    def check(self) -> None:
+        """Refuse groups of different sizes."""
         if self.width % self.gates:
             raise ArgumentError(f"gates is {self.gates}, expected a divisor of width, {self.width}")
-        check_number("reach", self.reach, 0.001, 10.0)
-
-
-_SIZES: Final = {  # least and greatest; a network beyond these would not fit into memory
-    "num_labels": (1, 1000),
-    "width": (1, 4096),
-    "gates": (1, 4096),
-    "depth": (1, 100),
-    "num_distances": (2, 1000),
-}
-
-
-Views = Literal["aligned", "random"]
-"""`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
-for labeling the one of ten on which the cloud spreads best."""
 
 
 @dataclass(frozen=True, slots=True)
-class CNNConfig:
+class CNNConfig(Settings):
     """How the paper's network sees a cloud, and how labels follow from the positions that it predicts."""
 
-    num_labels: int = 19
+    num_labels: Annotated[int, Limits(1, 1000)] = 19
     views: Views = "aligned"
-    reject: float | None = None
+    reject: Annotated[float | None, Limits(0.0, above=True)] = None
     """Cost of a point without a label [m]: no point is matched over a larger distance. Chosen on held-out
     simulated frames when not given."""
-    spread: float | None = None
+    spread: Annotated[float | None, Limits(0.0, above=True)] = None
     """Distance over which a label's weight in the confidence falls by a factor of e [m]; chosen likewise."""
-
-    def __post_init__(self) -> None:
-        for name in ("reject", "spread"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < np.inf:
-                raise HandSimError(f"{name} is {value}, expected more than 0")
-        check_count("num_labels", self.num_labels, *_SIZES["num_labels"])
-        check_choice(self.views, get_args(Views), noun="views")
 
 
 NetworkConfig = SetLabelerConfig | CNNConfig
 
 
 @dataclass(frozen=True, slots=True)
-class TrainSettings:
+class TrainSettings(Settings):
     """How a labeler is trained; the defaults made the shipped weights."""
+
+    noun = "setting of a training"
 
     labeler: Kind = "set"
     """Kind of network."""
-    samples: int = 5_000_000
-    """Clouds to learn from; rows are used repeatedly, corrupted anew each time."""
-    batch: int = 256
+    samples: Annotated[int, Limits(0)] = 5_000_000
+    """Clouds to learn from; rows are used repeatedly, corrupted anew each time. 0 stands for the paper's 75
+    epochs of the training set."""
+    batch: Annotated[int, Limits(1, _MOST_CLOUDS)] = 256
     optimizer: Literal["adamw", "sgd"] = "adamw"
-    learning_rate: float = 2e-3
+    learning_rate: Annotated[float, Limits(0.0, 10.0, above=True)] = 2e-3
     """Peak learning rate."""
     schedule: Literal["cosine", "steps"] = "cosine"
     """`cosine` warms up over the first hundredth and falls to zero as a half cosine; `steps` falls tenfold
     at 2/3 and 14/15 of the way, the paper's epochs 50 and 70 of 75."""
-    weight_decay: float = 0.01
-    average: float = 0.999
+    weight_decay: Annotated[float, Limits(0.0, 10.0)] = 0.01
+    average: Annotated[float, Limits(0.0, 1.0)] = 0.999
     """Decay of the running mean of the weights, which is what is saved; 0 saves the last weights."""
-    average_every: int = 1
+    average_every: Annotated[int, Limits(1)] = 1
     """Steps between two updates of that mean."""
     precision: Literal["auto", "32", "bf16"] = "32"
     """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate. `auto` takes
     it there."""
-    devices: int = 1
-    """GPUs of this machine, or processes where there are none, that share each batch; under torchrun and srun
-    these say it."""
-    jitter: float = 0.005
+    jitter: Annotated[float, Limits(0.0, 0.1)] = 0.005
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
-    rig_share: float = 0.5
+    rig_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
-    occlude: int | None = None
+    occlude: Annotated[int | None, Limits(0, _MOST_POINTS)] = None
     """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
     in the paper for its 19 and 13 markers."""
-    ghosts: int = 2
+    ghosts: Annotated[int, Limits(0, _MOST_POINTS)] = 2
     """Most ghosts added in the paper's corruption."""
-    corruption: OwnCorruption | str | None = None
+    corruption: Annotated[
+        OwnCorruption | str | None, Expected("a function (markers, *, rng), or its module:name")
+    ] = None
     """A corruption of your own instead of the paper's: module:name, or the name of an entry point."""
-    anisotropy: float = 0.06
+    anisotropy: Annotated[float, Limits(0.0, 1.0)] = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
-    knee: float = 0.02
+    knee: Annotated[float, Limits(0.0, above=True)] = 0.02
     """Distance at which the loss of the paper's network turns from quadratic to linear [half an image's
     width]."""
-    seed: int = 0
+    seed: Annotated[int, Limits(0)] = 0
     network: SetLabelerConfig = dataclasses.field(default_factory=SetLabelerConfig)
     cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)
 
@@ -135,84 +116,46 @@ class TrainSettings:
         """The settings of the network of this kind."""
         return self.cnn if self.labeler == "cnn" else self.network
 
-    def record(self) -> dict[str, Any]:
-        """The settings as JSON; a corruption by its name."""
-        name = None if self.corruption is None else plugin_name(self.corruption)
-        return dataclasses.asdict(dataclasses.replace(self, corruption=name))
+    def batch_recipe(self, num_markers: int) -> BatchRecipe:
+        """How batches are drawn for a layout of this many markers."""
+        occlude = paper_corruption(num_markers).occlude if self.occlude is None else self.occlude
+        corruption = Corruption(occlude, self.ghosts) if self.corruption is None else self.corruption
+        return BatchRecipe(self.batch, corruption, self.jitter, self.rig_share, self.anisotropy)
 
-    def __post_init__(self) -> None:
-        fill_settings(self)
-        if self.corruption is not None and not isinstance(self.corruption, str):
-            check_callable("corruption", self.corruption, "a function (markers, *, rng), or its module:name")
-        for name, valid in (
-            ("labeler", KINDS),
-            ("optimizer", ("adamw", "sgd")),
-            ("schedule", ("cosine", "steps")),
-            ("precision", ("auto", "32", "bf16")),
-        ):
-            check_choice(getattr(self, name), valid, noun=name)
-        for name in ("samples", "batch", "devices", "average_every"):
-            check_count(name, getattr(self, name), 1)
-        check_count("seed", self.seed, 0)
-        check_count("batch", self.batch, 1, _MOST_CLOUDS)
-        check_count("ghosts", self.ghosts, 0, _MOST_POINTS)
-        if self.occlude is not None:
-            check_count("occlude", self.occlude, 0, _MOST_POINTS)
-        check_number("learning_rate", self.learning_rate, 0.0, 10.0, above=True)
-        check_number("weight_decay", self.weight_decay, 0.0, 10.0)
-        check_number("average", self.average, 0.0, 1.0)
-        check_number("jitter", self.jitter, 0.0, 0.1)
-        check_number("rig_share", self.rig_share, 0.0, 1.0)
-        check_number("anisotropy", self.anisotropy, 0.0, 1.0)
-        check_number("knee", self.knee, 0.0, above=True)
+    def for_set(self, num_markers: int, num_frames: int) -> TrainSettings:
+        """The same settings for a training set of this size."""
+        return dataclasses.replace(
+            self,
+            samples=self.samples or EPOCHS * num_frames,
+            network=dataclasses.replace(self.network, num_labels=num_markers),
+            cnn=dataclasses.replace(self.cnn, num_labels=num_markers),
+        )
 
 
-def batch_recipe(config: TrainSettings, num_markers: int) -> BatchRecipe:
-    """How a labeler's batches are drawn for a layout of this many markers."""
-    usual = paper_corruption(num_markers).occlude
-    occlude = usual if config.occlude is None else config.occlude
-    return BatchRecipe(
-        config.batch,
-        Corruption(occlude, config.ghosts) if config.corruption is None else config.corruption,
-        config.jitter,
-        config.rig_share,
-        config.anisotropy,
-    )
-
-
-Preset = Literal["han2018"]
-PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
-EPOCHS: Final = 75
-
-
-def preset_config(preset: Preset, num_frames: int) -> TrainSettings:
-    """The settings of a published recipe for a training set of `num_frames`.
+def usual_settings(labeler: Kind = "set", preset: Preset | None = None) -> TrainSettings:
+    """The settings that a labeler of this kind is trained with when no others are given, or of a preset.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
     and ghosts, views from anywhere, a smooth L1 loss with its usual knee of one, and points matched over
     15 mm at most. The paper does not give the jitter; ours is that of its published data (±3 mm). A 16-bit
     precision on hardware that has it is not the paper's either.
     """
-    del preset  # one so far
-    return TrainSettings(
-        labeler="cnn",
-        samples=EPOCHS * num_frames,
-        optimizer="sgd",
-        learning_rate=0.6,
-        schedule="steps",
-        weight_decay=0.0,
-        average=0.0,
-        precision="auto",
-        jitter=0.003,
-        rig_share=0.0,
-        anisotropy=0.0,
-        knee=1.0,
-        cnn=CNNConfig(views="random", reject=0.015),
-    )
-
-
-def default_config(labeler: Kind) -> TrainSettings:
-    """The settings that a labeler of this kind is trained with when no others are given."""
+    if preset == "han2018":
+        return TrainSettings(
+            labeler="cnn",
+            samples=0,
+            optimizer="sgd",
+            learning_rate=0.6,
+            schedule="steps",
+            weight_decay=0.0,
+            average=0.0,
+            precision="auto",
+            jitter=0.003,
+            rig_share=0.0,
+            anisotropy=0.0,
+            knee=1.0,
+            cnn=CNNConfig(views="random", reject=0.015),
+        )
     if labeler == "set":
         return TrainSettings()
     return TrainSettings(
@@ -226,3 +169,26 @@ def default_config(labeler: Kind) -> TrainSettings:
         jitter=0.003,
         rig_share=0.2,
     )
+
+
+def train_settings(settings: TrainSettings | None, options: Mapping[str, Any]) -> TrainSettings:
+    """The settings with those that are given by name; a `labeler` alone stands for its usual settings."""
+    if settings is None and options.get("labeler") in KINDS:
+        settings = usual_settings(options["labeler"])
+    return TrainSettings.of(settings, options)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateSettings(Settings):
+    """Which true frames a labeler is evaluated on, and how they are corrupted."""
+
+    noun = "setting of an evaluation"
+
+    occlude: Annotated[int, Limits(0, _MOST_POINTS)] = 0
+    """Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse)."""
+    ghosts: Annotated[int, Limits(0, _MOST_POINTS)] = 0
+    """Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2)."""
+    every: Annotated[int, Limits(1)] = 1
+    """Take one frame of this many of captures; 1 takes all."""
+    seed: Annotated[int, Limits(0)] = 0
+    """Seed of the corruption."""

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.errors import ArgumentError
 from handsim.kernels import move, velocity_of
 from track.frames import TrackedFrame, TrackedHand

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gloves.fit import Attachment, GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import PALM
+from handsim.hand.shape import PALM
 from handsim.space.transforms import rigid_fit
 
 

@@ -27,7 +27,7 @@ from train.evaluation import LabelingReport, evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler, shipped_labelers
 from train.loop import train_labeler
-from train.settings import Kind, default_config
+from train.settings import Kind, usual_settings
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
@@ -100,15 +100,15 @@ def table2(
 
 def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samples: int, seed: int) -> None:
     drawn = augmentations(len(dataset.marker_names))[name]
-    usual = dataclasses.replace(default_config(kind), samples=samples, seed=seed, rig_share=0.0)
+    usual = dataclasses.replace(usual_settings(kind), samples=samples, seed=seed, rig_share=0.0)
     config = dataclasses.replace(usual, occlude=drawn.occlude, ghosts=drawn.ghosts)
-    with progress_bar("samples") as (bar, task):
+    with progress_bar("samples") as bar:
         train_labeler(
             dataset,
             run,
             config,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-            on_step=lambda step: bar.update(task, description=f"{kind} {name}, {step}"),
+            progress=bar,
+            on_step=lambda step: bar.step(f"{kind} {name}, {step}"),
         )
 
 
@@ -200,9 +200,9 @@ def _print_tests(
 
 
 def _simulate(glove: str, seed: int) -> dict[str, Take]:
-    with progress_bar("captures") as (bar, task):
-        bar.update(task, total=len(KINDS))
-        return simulate_takes(glove, seed, lambda: bar.advance(task))
+    with progress_bar("captures") as bar:
+        bar(0, len(KINDS))
+        return simulate_takes(glove, seed, bar.advance)
 
 
 class TakeMeasures(NamedTuple):

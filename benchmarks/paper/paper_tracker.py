@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from track.frames import TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
 

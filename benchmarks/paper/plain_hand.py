@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
-from handsim.hand.topology import NUM_QPOS
+from gloves.takes.points import Status
+from handsim.hand.shape import NUM_QPOS
 from track.frames import TrackedHand
 from track.kinematics.pose_solver import PoseFit, PoseSolver
 

@@ -16,8 +16,7 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS, SIZES
 from track.frames import FrameTracker, TrackedFrame
 from track.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame

@@ -124,27 +124,25 @@ def _measure_on(
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     network = load_labeler(config.glove, config.labeler)
     takes: dict[str, Take] = {}
-    with progress_bar("captures") as (bar, task):
-        bar.update(task, total=len(twins))
+    with progress_bar("captures") as bar:
+        bar(0, len(twins))
         for kind, twin in twins.items():
             takes[kind] = record_config(twin)
-            bar.advance(task)
+            bar.advance()
     bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())
-    with progress_bar("frames") as (bar, task):
-        bar.update(task, total=frames * len(USERS) * len(trackers(network, config.seed)))
-        measured = compare_trackers(
-            bare, network, seed=config.seed, trials=trials, done=lambda: bar.advance(task)
-        )
+    with progress_bar("frames") as bar:
+        bar(0, frames * len(USERS) * len(trackers(network, config.seed)))
+        measured = compare_trackers(bare, network, seed=config.seed, trials=trials, done=bar.advance)
     return takes, measured
 
 
 def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
     """Our tracker on the capture whose object has markers, with the object tracked as well."""
     network = load_labeler(config.glove, config.labeler)
-    with progress_bar("frames") as (bar, task):
-        bar.update(task, total=take.num_frames * len(USERS))
-        return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))
+    with progress_bar("frames") as bar:
+        bar(0, take.num_frames * len(USERS))
+        return measure_with_body(_WITH_BODY, take, network, done=bar.advance)
 
 
 def table5_figures(measured: Sequence[Measurement]) -> Figures:

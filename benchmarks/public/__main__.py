@@ -26,9 +26,8 @@ from benchmarks.record import describe
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
-from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
-from handsim.files.outputs import check_outputs, shown_bytes
+from handsim.files.outputs import atomic_write, check_outputs, shown_bytes
 
 _TABLE: Final = ("frame_accuracy", "slot_accuracy", "mpjpe", "angle_error")
 _MOST_SHOWN: Final = 3  # files that differ
@@ -46,12 +45,12 @@ def make(
         size: Which benchmark; results name it.
         workers: Processes; all cores when not given.
     """
-    with progress_bar("frames") as (bar, task):
+    with progress_bar("frames") as bar:
         benchmark = make_benchmark(
             SIZES[size],
             out,
             workers=workers,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=bar,
         )
     frames = sum(one.num_frames for one in benchmark.captures)
     taken = shown_bytes(sum((out / file).stat().st_size for file in benchmark.files))
@@ -87,11 +86,9 @@ def run(
     """
     benchmark = load_benchmark(folder)
     check_outputs((folder, folder / "captures", folder / "truth"), [out])
-    with progress_bar("frames") as (bar, task):
-        bar.update(task, total=sum(one.num_frames for one in benchmark.captures))
-        run_baseline(
-            benchmark, tracker, out, users=users, progress=lambda frames: bar.update(task, advance=frames)
-        )
+    with progress_bar("frames") as bar:
+        bar(0, sum(one.num_frames for one in benchmark.captures))
+        run_baseline(benchmark, tracker, out, users=users, progress=bar.advance)
     print_line(
         f"{out}: results of {len(benchmark.captures)} captures; python -m benchmarks.public score counts them"
     )
@@ -113,9 +110,9 @@ def score(
     benchmark = load_benchmark(folder)
     inputs = [folder / file for file in benchmark.files] if json is not None else []
     check_outputs((*inputs, *(results.glob("*") if json is not None else ())), [json])
-    with progress_bar("captures") as (bar, task):
-        bar.update(task, total=len(benchmark.captures))
-        counted = score_results(benchmark, results, done=lambda: bar.advance(task))
+    with progress_bar("captures") as bar:
+        bar(0, len(benchmark.captures))
+        counted = score_results(benchmark, results, done=bar.advance)
     console = Console()
     for table in score_tables(counted):
         console.print(table)

@@ -19,8 +19,8 @@ from gloves.fit import GloveFit
 from gloves.takes.take import keypoints_of
 from handsim.errors import FileError
 from handsim.files.arrays import read_npz
-from handsim.files.atomic import atomic_write
-from handsim.hand.topology import NUM_JOINTS, NUM_KEYPOINTS, Side
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
 
 SIDES: Final[tuple[Side, ...]] = ("right", "left")
 """The hands of every capture, in the order of labels and arrays."""
@@ -47,7 +47,7 @@ class Answers:
     """Label of each point, -1 for a point of no marker and where there is no point."""
     joints: Float[np.ndarray, "T 2 21 3"] | None = None
     """Keypoints of the right hand and the left one in the world [m], in the order of
-    `handsim.hand.keypoints.KEYPOINT_NAMES`; NaN where one is not known."""
+    `handsim.hand.model.KEYPOINT_NAMES`; NaN where one is not known."""
     angles: Float[np.ndarray, "T 2 20"] | None = None
     """Their joint angles as docs/conventions.md defines them [rad]; NaN where one is not known."""
 

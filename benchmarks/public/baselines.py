@@ -20,7 +20,7 @@ from benchmarks.public.manifest import Benchmark
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from handsim.files.json_files import claim
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.captures import measure_hands
 from track.frames import FrameTracker
 from track.streams.frame_source import capture_frames

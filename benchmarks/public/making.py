@@ -28,17 +28,15 @@ from benchmarks.public.manifest import (
     user_path,
     write_manifest,
 )
-from gloves.captures.capture import Capture
+from gloves.captures.capture import UNLABELED, Capture
 from gloves.captures.formats import write_capture
-from gloves.captures.markers import UNLABELED
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
-from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.json_files import claim
-from handsim.files.outputs import check_free
+from handsim.files.outputs import atomic_write, check_free, remove_leftovers
 from handsim.hand.model import HandModel
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from track.user import User, load_user
 from train.simulation.room import record_take
 from train.simulation.scenes import Kind, sample_real_like_scene

@@ -17,11 +17,11 @@ from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import DatasetError
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
-from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim.hand.model import KEYPOINT_NAMES
 from track.user import User, load_user
 from train.simulation.scenes import RATE
 

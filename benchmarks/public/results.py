@@ -26,10 +26,9 @@ from benchmarks.public.answers import (
     poses_of,
     unpack_answers,
 )
-from gloves.captures.capture import Capture
+from gloves.captures.capture import UNLABELED, Capture
 from gloves.captures.formats import read_capture
-from gloves.captures.markers import UNLABELED
-from gloves.captures.motive_csv import MOTIVE_BEGIN
+from gloves.captures.text_formats import MOTIVE_BEGIN
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular, read_bytes

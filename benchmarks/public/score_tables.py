@@ -11,8 +11,8 @@ from rich.table import Table
 
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES
 from benchmarks.public.scoring import Score
-from handsim._version import __version__
-from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim import __version__
+from handsim.hand.model import KEYPOINT_NAMES
 
 _FIGURES: Final = {
     "frame_accuracy": "frames [%]",

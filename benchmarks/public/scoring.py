@@ -21,7 +21,7 @@ from benchmarks.public.answers import Answers
 from benchmarks.public.manifest import Benchmark, BenchmarkCapture, label_names
 from benchmarks.public.results import find_results, read_result
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import NUM_KEYPOINTS
+from handsim.hand.shape import NUM_KEYPOINTS
 from train.evaluation import LabelCounts
 
 NEAR: Final = 0.005

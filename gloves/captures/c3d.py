@@ -1,28 +1,349 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
-Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file,
-pads a cut one silently, and stops at 65,535 frames. Only what a capture needs is read: the points,
-their labels, units and rate; analog channels, events and force plates are passed over.
+Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file, pads a cut
+one silently, and stops at 65,535 frames. Only what a capture needs is read: the points, their labels, units
+and rate; analog channels, events and force plates are passed over.
+
+Header and parameters both state where the frames lie and how numbers are written, and some programs write one
+of them wrong. Where they contradict each other, the size of the data decides and the user is told; where it
+does not decide, the file is refused.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
-from gloves.captures._c3d_frames import BLOCK, MOST_FRAMES, Header, read_points
-from gloves.captures._c3d_parameters import Parameters
-from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
-from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
+from gloves.captures.text import StatedTimes, Tell, check_same_rate, meters_per, timed_positions, warn
 from handsim.errors import CaptureError, shortened
-from handsim.files.atomic import unwritten
-from handsim.files.names import plain_path
+from handsim.files.outputs import plain_path, unwritten
 
 if TYPE_CHECKING:
     import ezc3d
+
+
+_INTEL, _DEC, _SGI = 84, 85, 86
+INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
+FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
+_CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
+_BLOCK: Final = 512
+_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # which say where points are; damage to others does not matter
+_MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
+_LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
+
+
+def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
+    """Floats of a file as doubles; a DEC float has its halves swapped and is four times too big."""
+    if processor != _DEC:
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
+            return values.astype(np.float64)
+    bits = values.astype(np.uint32)
+    swapped = ((bits >> np.uint32(16)) | (bits << np.uint32(16))).astype("<u4")
+    return to_native(swapped.view("<f4"), _INTEL) / 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Parameters by upper-case group and name: numbers, or strings for characters."""
+
+    processor: int
+    """Which of the three number formats the whole file uses."""
+    values: dict[tuple[str, str], list[float] | list[str]]
+
+    @staticmethod
+    def parse(data: bytes, start: int, tell: Tell) -> Parameters:
+        """Read the records from byte `start` of a file of a block or more; nothing outside it is touched."""
+        if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
+            raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
+        processor = data[start + 3]
+        try:
+            groups, found = _walk(data, start + 4, processor, tell)
+            read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
+            if sum(_num_bytes(raw) for _, _, raw in read) > _MOST_BYTES:
+                raise CaptureError(f"damaged: the parameters hold more than {_MOST_BYTES} bytes")
+            values = {(group, name): _read_values(bytes(raw), processor) for group, name, raw in read}
+        except (ValueError, IndexError) as error:
+            raise CaptureError("damaged: the parameter section cannot be read") from error
+        return Parameters(processor, values)
+
+    def number(self, group: str, name: str, *, default: float | None = None) -> float:
+        """The first number of a parameter.
+
+        Raises:
+            CaptureError: It is not finite, or there is none and no default.
+        """
+        values = self.values.get((group, name), [])
+        if values and isinstance(values[0], float):
+            if not math.isfinite(values[0]):
+                raise CaptureError(f"damaged: {group}:{name} is {values[0]}")
+            return values[0]
+        if default is None:
+            raise CaptureError(f"damaged: the file states no number {group}:{name}")
+        return float(default)
+
+    def words(self, group: str, name: str) -> list[int]:
+        """A parameter as unsigned 16-bit words; empty if it is absent or holds other values."""
+        values = self.values.get((group, name), [])
+        numbers = [value for value in values if isinstance(value, float) and math.isfinite(value)]
+        return [int(value) & 0xFFFF for value in numbers]
+
+    def strings(self, group: str, name: str) -> list[str]:
+        """A parameter of characters as strings without padding; empty if it is absent."""
+        return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
+
+
+def _walk(
+    data: bytes, at: int, processor: int, tell: Tell
+) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
+    """Names of groups by number; and of each parameter its group, name and record from the type on."""
+    order: Literal["little", "big"] = "big" if processor == _SGI else "little"
+    groups: dict[int, str] = {}
+    found: list[tuple[int, str, memoryview]] = []
+    view = memoryview(data)
+    points_at = (int.from_bytes(data[16:18], order) - 1) * _BLOCK
+    end = points_at if points_at > at else len(data)  # of the section
+    while at + 2 <= len(data):
+        name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
+        group = int.from_bytes(data[at + 1 : at + 2], "little", signed=True)
+        if name_length == 0:
+            break
+        offset_at = at + 2 + name_length
+        name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
+        offset = int.from_bytes(data[offset_at : offset_at + 2], order)
+        if group < 0:
+            groups[-group] = name
+        else:
+            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]))
+        if offset == 0:
+            break
+        at = offset_at + offset
+        if at > end:
+            tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
+            break
+    return groups, found
+
+
+def _num_bytes(raw: memoryview) -> int:
+    """Bytes that a parameter record takes and states."""
+    return 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
+
+
+def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
+    """The values of one parameter record, `raw` beginning at its type."""
+    kind = int.from_bytes(raw[:1], "little", signed=True)
+    dimensions = list(raw[2 : 2 + raw[1]])
+    count = math.prod(dimensions)
+    size = abs(kind)
+    body = raw[2 + raw[1] : 2 + raw[1] + count * size]
+    if (
+        kind not in {_CHARACTER, _BYTE, _INTEGER, _FLOAT}
+        or len(body) < count * size
+        or len(dimensions) < raw[1]
+    ):
+        raise ValueError("not a parameter")
+    if kind == _CHARACTER:
+        width = dimensions[0] if dimensions else 1
+        return [_text(body[at : at + width]) for at in range(0, count, width)] if count else []
+    if kind == _BYTE:
+        return [float(value) for value in body]
+    if kind == _INTEGER:
+        return [float(value) for value in np.frombuffer(body, INTEGER_DTYPES[processor])]
+    return [float(value) for value in to_native(np.frombuffer(body, FLOAT_DTYPES[processor]), processor)]
+
+
+def _text(raw: bytes) -> str:
+    raw = raw.partition(b"\0")[0].strip(b" ")  # what follows a zero byte is left over from another text
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+BLOCK: Final = 512
+MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
+_MOST_FILLING: Final = 2 * BLOCK  # bytes behind the last frame
+_SAME_SCALE: Final = 1e-3  # by which the two scales of a file may differ, of themselves
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the first block of a file states."""
+
+    num_points: int
+    per_frame: int
+    """Analog numbers of a frame."""
+    num_frames: int
+    """By the numbers of the first and the last frame."""
+    scale: float
+    """Negative where positions are written as floats; otherwise the size of one step of integers."""
+    start: int
+    """First byte of the frames."""
+    samples: int
+    """Analog samples of a channel in a frame."""
+    rate: float
+
+    @staticmethod
+    def parse(data: bytes, processor: int) -> Header:
+        """The header of a file of at least one block, in one of the three number formats."""
+        integers = np.frombuffer(data[:BLOCK], INTEGER_DTYPES[processor].replace("i", "u"))
+        floats = to_native(np.frombuffer(data[:BLOCK], FLOAT_DTYPES[processor]), processor)
+        words = [int(word) for word in integers[:10]]
+        return Header(
+            num_points=words[1],
+            per_frame=words[2],
+            num_frames=words[4] - words[3] + 1,
+            scale=float(floats[3]),
+            start=(words[8] - 1) * BLOCK,
+            samples=words[9],
+            rate=float(floats[5]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Extent:
+    """Bytes that the frames have room for, and the number of frames."""
+
+    room: int
+    stated: int | None
+    """None where a long take states its length nowhere."""
+
+    def fits(self, frame_bytes: int) -> bool:
+        """Whether frames of this size fill the room, but for the blocks that fill a file."""
+        return self.stated is not None and 0 <= self.room - self.stated * frame_bytes < _MOST_FILLING
+
+
+def read_points(
+    data: bytes, parameters: Parameters, header: Header, tell: Tell
+) -> Float[np.ndarray, "T N 4"]:
+    """Coordinates in the file's unit and residuals of all frames."""
+    processor = parameters.processor
+    num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
+    if not num_points:
+        raise CaptureError("no markers: the file holds no points")
+    if header.start < BLOCK:
+        raise CaptureError("damaged: the header names no block where the points begin")
+    parameters_at = (data[0] - 1) * BLOCK
+    end = parameters_at if parameters_at > header.start else len(data)
+    extent = _Extent(max(0, end - header.start), _stated_frames(parameters, header.num_frames))
+    scale = _scale(parameters, header, extent, num_points, tell)
+    dtype = FLOAT_DTYPES[processor] if scale < 0.0 else INTEGER_DTYPES[processor]
+    size = np.dtype(dtype).itemsize
+    analog = _analog_numbers(parameters, header, extent, size, num_points, tell)
+    words = 4 * num_points + analog  # points, then the analog samples of the frame
+    count = _num_frames(data, header, extent, words, size, num_points == header.num_points, tell)
+    frames = np.frombuffer(data, dtype, count=count * words, offset=header.start).reshape(-1, words)
+    if extent.stated is None:
+        frames = _without_padding(frames)
+    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
+    if scale < 0.0:
+        return to_native(points, processor)
+    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
+    return scaled
+
+
+def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
+    """POINT:SCALE, or the header's where there is none; see `Header.scale`."""
+    scale = parameters.number("POINT", "SCALE", default=header.scale)
+    if scale == 0.0 or not np.isfinite(scale):
+        raise CaptureError(f"POINT:SCALE is {scale:g}, expected a number that is not 0")
+    other = header.scale
+    if other == 0.0 or not np.isfinite(other):
+        return scale
+    text = f"POINT:SCALE is {scale:g} and the header's scale {other:g}"
+    if (scale < 0.0) != (other < 0.0):
+        words = 4 * num_points + header.per_frame
+        as_floats, as_integers = extent.fits(4 * words), extent.fits(2 * words)
+        if as_floats == as_integers:
+            raise CaptureError(
+                f"{text}: one says integers, the other floats, and the file's size does not decide"
+            )
+        tell(f"{text}; by the file's size its numbers are {'floats' if as_floats else 'integers'}")
+        return scale if (scale < 0.0) == as_floats else other
+    if scale > 0.0 and abs(scale - other) > _SAME_SCALE * scale:
+        raise CaptureError(f"{text}: the size of the positions is not known; export the file again")
+    return scale
+
+
+def _analog_numbers(
+    parameters: Parameters, header: Header, extent: _Extent, size: int, num_points: int, tell: Tell
+) -> int:
+    """Analog numbers of a frame, which lie between its points and those of the next."""
+    channels = int(parameters.number("ANALOG", "USED", default=0.0 if header.per_frame == 0 else -1.0))
+    stated = header.per_frame
+    if channels < 0 or stated == channels * header.samples:  # less than none: nothing is stated
+        return stated
+    rates = [parameters.number(group, "RATE", default=0.0) for group in ("ANALOG", "POINT")]
+    ratio = round(rates[0] / rates[1]) if rates[1] > 0.0 else 0
+    if stated == channels * ratio:
+        return stated
+    candidates = {stated, channels * header.samples, channels * ratio}
+    fitting = [number for number in candidates if extent.fits(size * (4 * num_points + number))]
+    text = (
+        f"the header states {stated} analog numbers a frame, and the parameters {channels} channels of "
+        f"{max(header.samples, ratio)} samples"
+    )
+    if len(fitting) != 1:
+        raise CaptureError(f"damaged: {text}; export the file again, without analog data")
+    tell(f"{text}; by the file's size they are {fitting[0]}")
+    return fitting[0]
+
+
+def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
+    """Number of frames: POINT:FRAMES or the header; where 16 bits are full, the fields for long takes.
+
+    None means that a long take states its length nowhere, as ezc3d writes it; the data itself decides.
+    """
+    frames = int(parameters.number("POINT", "FRAMES", default=in_header))
+    frames = frames & 0xFFFF if frames < 0 else frames
+    if frames != MOST_FRAMES:
+        return frames
+    first = parameters.words("TRIAL", "ACTUAL_START_FIELD")
+    last = parameters.words("TRIAL", "ACTUAL_END_FIELD")
+    if len(first) == len(last) == 2:
+        return max(0, last[0] + (last[1] << 16) - first[0] - (first[1] << 16) + 1)
+    return int(parameters.number("POINT", "LONG_FRAMES", default=0.0)) or None
+
+
+def _num_frames(
+    data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, tell: Tell
+) -> int:
+    """Number of frames to read, each of so many words (numbers) of so many bytes."""
+    present, stated = extent.room // (words * size), extent.stated
+    if stated == 0 or (stated is None and present == 0):
+        raise CaptureError("no frames: the file holds no frame")
+    if stated is None:
+        return present
+    if present < stated:
+        if not 0 < header.num_frames == present:
+            raise CaptureError(f"truncated: the file states {stated} frames and has room for {present}")
+        tell(f"POINT:FRAMES is {stated}, and header and data have {present} frames; these are read")
+        return present
+    used = stated * words * size
+    behind = data[header.start + used + _MOST_FILLING : header.start + extent.room]
+    if extent.room - used >= _MOST_FILLING and any(behind):
+        frames = f"{stated} frames of {words} numbers"
+        text = f"the file states {frames}, which are {used} bytes, and has {extent.room}"
+        if not agreed or stated != header.num_frames:
+            raise CaptureError(f"damaged: {text}")
+        tell(f"{text}; what follows them is not read")
+    return stated
+
+
+def _without_padding(frames: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Frames without the zeros that fill the last block."""
+    most = BLOCK // frames[:1].nbytes
+    end = len(frames)
+    while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
+        end -= 1
+    return frames[:end]
+
 
 _MOST_LABEL_BYTES: Final = 255
 

@@ -1,18 +1,24 @@
-"""The content of a marker file: named trajectories at a frame rate, and their gaps.
+"""Marker files: trajectories at a frame rate, their gaps, labels, and mistakes of units and places.
 
-Gaps are counted as in Table 3 of Han et al. 2018, and per marker.
+Gaps are counted as in Table 3 of Han et al. 2018, and per marker. Positions tell of a wrong unit or place,
+and of zeros that stand for gaps.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
-from gloves.captures.frame_times import check_rate
-from handsim.errors import CaptureError
+from gloves.captures.text import check_rate
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices
+from handsim.kernels import kernel, squared_distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,3 +108,205 @@ def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
     """The first and the last frame of each unbroken stretch of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+
+
+UNLABELED: Final = "Unlabeled"
+"""Columns of points without a marker are called Unlabeled1, Unlabeled2, ..."""
+
+
+def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    """The columns of the named markers, in their order; a subject's prefix ("Anna:ThumbTip") is ignored."""
+    bare = [column.rsplit(":", 1)[-1].strip() for column in capture.names]
+    for name in names:
+        if name not in bare:
+            raise CaptureError(
+                f"the glove's marker is not among the columns: {choices(name, bare, noun='column')}"
+            )
+        if bare.count(name) > 1:
+            raise CaptureError(f"marker '{name}' has {bare.count(name)} columns in the capture, expected one")
+    return capture.positions[:, [bare.index(name) for name in names]]
+
+
+def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarray, "T M 3"]]:
+    """The named markers of every hand of a labeled capture, in their order.
+
+    A capture of one hand has one column per marker, as `select_markers` takes it. One of two hands, as
+    `handsim track` and `handsim label` write it, has a set of columns for each: "right:ThumbTip" and so on.
+    Of such a set, the frames without a marker are left out: the hand was not there.
+    """
+    columns = [_split_name(column) for column in capture.names]
+    sets = list(dict.fromkeys(prefix for prefix, name in columns if name in names))
+    held = [name for _, name in columns if name in names]
+    if len(sets) < 2 or len(held) == len(set(held)):
+        return [select_markers(capture, names)]
+    hands = []
+    for prefix in sets:
+        mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
+        part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
+        try:
+            markers = select_markers(part, names)
+        except CaptureError as error:
+            raise CaptureError(f"columns '{prefix}:...': {error}") from error
+        hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
+    return hands
+
+
+def _split_name(column: str) -> tuple[str, str]:
+    """What is before the last colon of a column's name, and what is behind it."""
+    prefix, _, name = column.rpartition(":")
+    return prefix.strip(), name.strip()
+
+
+def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
+    """The points of every frame [m] without their labels; an empty frame is (0, 3)."""
+    there = np.isfinite(capture.positions).all(axis=-1)
+    return [points[seen] for points, seen in zip(capture.positions, there, strict=True)]
+
+
+def labeled_columns(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    labels: Sequence[Int[np.ndarray, "N"]],
+    names: Sequence[str],
+    rate: float,
+) -> Capture:
+    """Labeled points as a capture: one column per marker, then columns for the points without one.
+
+    Args:
+        labels: Marker of every point, -1 for none.
+        names: Marker names in label order.
+    """
+    extra = max((int((label < 0).sum()) for label in labels), default=0)
+    positions = np.full((len(frames), len(names) + extra, 3), np.nan)
+    for frame, (points, label) in enumerate(zip(frames, labels, strict=True)):
+        column = label.copy()
+        column[label < 0] = len(names) + np.arange((label < 0).sum())
+        positions[frame, column] = points
+    columns = [*names, *(f"{UNLABELED}{number + 1}" for number in range(extra))]
+    return Capture(tuple(columns), positions, rate)
+
+
+MAX_SPAN: Final = 30.0
+"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
+AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
+"""What is wrong with such clouds."""
+_MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
+_MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
+_MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
+_MIN_FRAMES: Final = 10  # from which small or wide clouds count; a few frames may show strays alone
+_SAMPLED: Final = 200  # frames that are looked at, evenly spread
+
+
+class UnitFault(NamedTuple):
+    """Clouds in a wrong unit."""
+
+    found: str
+    """What is wrong with them as meters."""
+    guess: str
+    """The unit of length that they probably had before they were scaled."""
+
+    @property
+    def hint(self) -> str:
+        """The guess as a question about positions that should be in meters."""
+        return "; scaled twice?" if self.guess == "meters" else f"; {self.guess}?"
+
+
+def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
+    """Median distance of a point from its nearest neighbor [m], of two points or more."""
+    return float(np.median(np.sqrt(_nearest_squared(np.ascontiguousarray(cloud, dtype=np.float64)))))
+
+
+def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
+    """What tells that clouds are not in meters, if anything does.
+
+    Medians over the frames decide, since strays of a real system lie anywhere.
+
+    Args:
+        only_wide: Ask only whether they span more than a room, since they may be parts of one frame.
+    """
+    shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
+    step = -(-len(shown) // _SAMPLED) or 1
+    shown = shown[::step]
+    if not shown:
+        return None
+    spans = [float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in shown]
+    span = max(spans)
+    if span > MAX_SPAN:  # the median costs more than all else here
+        span = float(np.median(spans))
+    if span > MAX_SPAN:
+        return UnitFault(f"the points of a frame span {span:.0f} m", "millimeters")
+    if only_wide or len(shown) < _MIN_FRAMES:
+        return None
+    span = float(np.median(spans))
+    if span < _MIN_SPAN:
+        return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", "meters")
+    apart = float(np.median([spacing(cloud) for cloud in shown]))
+    if apart > _MAX_SPACING:
+        return UnitFault(f"the points of a frame are {apart:.2g} m apart", "centimeters")
+    return None
+
+
+@kernel
+def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
+    """Squared distance (N,) of each point from the nearest other one [m^2]."""
+    nearest = np.full(len(cloud), np.inf)
+    for i in range(len(cloud)):
+        for j in range(i):
+            squared = squared_distance(cloud[i], cloud[j])
+            nearest[i] = min(nearest[i], squared)
+            nearest[j] = min(nearest[j], squared)
+    return nearest
+
+
+def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
+    """Whether there are several points, and each of them is at exactly (0, 0, 0)."""
+    return sum(map(len, clouds)) > 1 and not any(cloud.any() for cloud in clouds)
+
+
+def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
+    """Refuse clouds that are not in meters, see `unit_fault`."""
+    if not only_wide and all_at_origin(clouds):
+        raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
+    fault = unit_fault(clouds, only_wide=only_wide)
+    if fault is not None:
+        raise ArgumentError(f"{fault.found}, expected a hand in meters{fault.hint}")
+
+
+def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
+    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
+
+    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
+    in which nothing moves is left as it is.
+    """
+    positions = capture.positions
+    zero = (positions == 0.0).all(axis=-1)
+    count = int(zero.sum())
+    if count < 2 or not _moves(positions, np.isfinite(positions[..., 0]) & ~zero):
+        return capture, 0
+    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
+
+
+def check_place(capture: Capture, farthest: float) -> None:
+    """Warn of points that will be left out, farther than this from the origin in a coordinate [m]."""
+    there = np.isfinite(capture.positions[..., 0])
+    far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())
+    points = int(there.sum())
+    if far > points / 2:
+        raise CaptureError(
+            f"{far} of {points} points lie {farthest:.0f} m or more from the origin, expected hands in a "
+            "room; move the origin of the capture into the room"
+        )
+    if far:
+        warnings.warn(
+            f"{far} of {points} points lie {farthest:.0f} m or more from the origin and are left out",
+            HandSimWarning,
+            stacklevel=2,
+        )
+
+
+def _moves(positions: Float[np.ndarray, "T N 3"], there: Bool[np.ndarray, "T N"]) -> bool:
+    """Whether any trajectory takes more than one position."""
+    for column in range(positions.shape[1]):
+        track = positions[there[:, column], column]
+        if len(track) and (track != track[0]).any():
+            return True
+    return False

@@ -13,20 +13,31 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from gloves.captures._text import Tell, separator_behind, split_lines
 from gloves.captures.c3d import read_c3d, write_c3d
-from gloves.captures.capture import Capture
-from gloves.captures.markers import select_hands, unlabeled_frames
-from gloves.captures.motive_csv import MOTIVE_BEGIN, read_motive_csv, write_motive_csv
-from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault, zeros_as_missing
-from gloves.captures.qtm_tsv import read_qtm_tsv
-from gloves.captures.trc import read_trc, write_trc
-from gloves.captures.vicon_csv import read_vicon_csv, vicon_sections
+from gloves.captures.capture import (
+    AT_ORIGIN,
+    Capture,
+    all_at_origin,
+    select_hands,
+    unit_fault,
+    unlabeled_frames,
+    zeros_as_missing,
+)
+from gloves.captures.text import Tell, separator_behind, split_lines
+from gloves.captures.text_formats import (
+    MOTIVE_BEGIN,
+    read_motive_csv,
+    read_qtm_tsv,
+    read_trc,
+    read_vicon_csv,
+    vicon_sections,
+    write_motive_csv,
+    write_trc,
+)
 from handsim._checks import check_type
 from handsim.errors import CaptureError, HandSimWarning, choices
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
-from handsim.files.names import as_text
+from handsim.files.outputs import as_text, atomic_write
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:

@@ -13,7 +13,7 @@ from handsim._checks import check_number, check_span
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 
 def reflect(

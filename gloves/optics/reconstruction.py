@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel, squared_distance
-from handsim.space.cameras import CameraRig
-from handsim.space.lens import PINHOLE, distort_jacobian
+from handsim.space.camera import PINHOLE, distort_jacobian
+from handsim.space.rig import CameraRig
 
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""

@@ -13,10 +13,10 @@ from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.capsules import bounding_spheres
 from handsim.hand.shape import named_shape
-from handsim.hand.skin.surface import build_surface
+from handsim.hand.skin import build_surface
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import in_picture
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 
 _PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
 

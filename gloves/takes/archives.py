@@ -1,21 +1,329 @@
-"""Takes as files: named arrays and a JSON header in one .npz, whole or not at all, and never unpickled."""
+"""Takes as files: arrays and a JSON header in one .npz, written at once, or growing while recorded.
+
+What has been added to a growing archive is on disk half a second later, however the recording ends. It begins
+with a JSON header and the arrays that do not grow. Then come blocks, each with some frames, their number and
+a checksum; a block that was cut off is left out. `finish_archive` turns it into the usual .npz, block by
+block, so that its memory does not grow with the recording. Both forms list points as they came, so that their
+size goes with the number of points, and not with that of the fullest frame.
+"""
 
 from __future__ import annotations
 
+import errno
+import io
 import json
+import math
+import os
+import struct
 import sys
+import time
 import warnings
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gloves.takes.growing import GrownArchive, growing_path, is_growing
+from gloves.takes.points import POINT_COUNTS, Column
+from handsim.callbacks import Closing
 from handsim.errors import CaptureError, HandSimError, HandSimWarning, shortened
-from handsim.files.arrays import Member, read_npz, write_npz
-from handsim.files.atomic import atomic_write
+from handsim.files.arrays import Member, check_npy_header, check_npz, read_npz, write_npz
 from handsim.files.inputs import check_regular
+from handsim.files.outputs import atomic_write, make_folder_of
+from handsim.files.signals import signals_wait
+
+GROWING_SUFFIX: Final = ".part"
+"""Added to the name of the archive."""
+_MAGIC: Final = b"handsim recording 1\n"
+_SIZE: Final = struct.Struct("<I")
+_BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
+_MARK: Final = b"blk\n"
+_INTERVAL: Final = 0.5  # [s] between two blocks
+_LARGEST_HEADER: Final = 1 << 26  # bytes
+_FULL_FRAMES: Final = 1 << 16  # frames with which a block is written before its time,
+_FULL_POINTS: Final = 1 << 21  # and points; a block of half a second has far fewer
+
+
+def growing_path(archive: Path) -> Path:
+    """Where an archive grows until it is finished."""
+    return archive.with_name(archive.name + GROWING_SUFFIX)
+
+
+def check_unused(path: Path) -> None:
+    """Refuse to record to a file that exists: a recording that was cut off is never overwritten."""
+    if os.path.lexists(path):
+        raise CaptureError(
+            f"{path} exists: a recording that was cut off, or one that is still running; give it another "
+            "name or remove it, or name another output"
+        )
+
+
+class GrowingArchive(Closing):
+    """Writes an archive while it grows; the end of a `with` block or `close` writes what still waits.
+
+    Args:
+        path: The file, which must not exist; `growing_path` names it.
+        header: The header, as JSON.
+        arrays: The arrays that do not grow, by name.
+        columns: Those that do, with numbers for all letters but T and P.
+
+    Raises:
+        CaptureError: The file exists: a recording that was cut off is never overwritten.
+        OSError: It cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: Mapping[str, Any],
+        arrays: Mapping[str, NDArray[Any]],
+        columns: Sequence[Column],
+    ) -> None:
+        self.path = path
+        self._columns = (POINT_COUNTS, *columns)
+        self._waiting: list[list[bytes]] = []  # a frame's entries of each column
+        self._points = self._block = self._written = 0
+        self._due = math.inf
+        text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
+        parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
+        if max(map(len, parts)) > _LARGEST_HEADER:  # it could not be read again
+            raise CaptureError(f"{path}: the settings take more than {_LARGEST_HEADER} bytes")
+        make_folder_of(path)
+        try:
+            self._file = open(path, "xb", buffering=0)
+        except FileExistsError:
+            check_unused(path)
+            raise
+        self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
+
+    @property
+    def num_frames(self) -> int:
+        """Number of added frames."""
+        return self._written + len(self._waiting)
+
+    def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
+        """Add a frame; columns of points have an entry for each of its points.
+
+        Raises:
+            OSError: The disk is full, or the file cannot be written.
+        """
+        rows: Mapping[str, Any] = {**values, POINT_COUNTS.name: num_points}
+        packed = []
+        for column in self._columns:
+            row = np.asarray(rows[column.name], column.dtype)
+            if row.shape != ((num_points,) if column.of_points else ()) + column.entry:
+                raise ValueError(f"{column.name} has shape {row.shape}")
+            packed.append(row.tobytes())
+        self._waiting.append(packed)  # at once: an interrupt leaves no half of a frame
+        self._points += num_points
+        self._due = min(self._due, time.monotonic() + _INTERVAL)
+        self.flush_due()
+
+    def flush_due(self) -> None:
+        """Write the frames that wait, if they have waited long enough."""
+        is_full = len(self._waiting) >= _FULL_FRAMES or self._points >= _FULL_POINTS
+        if is_full or time.monotonic() >= self._due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the frames that wait."""
+        if not self._waiting:
+            return
+        with signals_wait():  # until the block is whole and counted
+            rows, self._waiting, self._points, self._due = self._waiting, [], 0, math.inf
+            counts, *others = (b"".join(column) for column in zip(*rows, strict=True))
+            points = int(np.frombuffer(counts, POINT_COUNTS.dtype).sum(dtype=np.int64))
+            content = b"".join((counts, *others))
+            head = _BLOCK.pack(_MARK, self._block, len(rows), points, zlib.crc32(content))
+            self._write(head + content)
+            self._block, self._written = self._block + 1, self._written + len(rows)
+
+    def close(self) -> None:
+        """Write what waits, and close the file."""
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+
+    def _write(self, content: bytes) -> None:
+        rest = memoryview(content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+
+class _Block(NamedTuple):
+    """A block of a file."""
+
+    at: int
+    """Where its columns begin [bytes]."""
+    frames: int
+    points: int
+
+
+class GrownArchive:
+    """Reads an archive that grew, or still grows, up to its last whole block.
+
+    Args:
+        check: Whether checksums are compared.
+
+    Raises:
+        ValueError: It is damaged before its first block.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, path: Path, *, check: bool = True) -> None:
+        self.path = path
+        self._size = os.path.getsize(path)
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise ValueError("not a recording")
+            self.header: dict[str, Any] = json.loads(_take_part(file))
+            """The header, as JSON."""
+            self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
+            self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
+            self._end = file.tell()
+            self._blocks = list(self._scan(file, check))
+        self.num_lost_bytes = self._size - self._end
+        """Bytes after the last whole block, which are left out."""
+        self.num_frames = sum(block.frames for block in self._blocks)
+        """Number of whole frames."""
+
+    def read(self, step: int = 1) -> dict[str, NDArray[Any]]:
+        """All arrays, with the frames of every `step`-th block."""
+        blocks = self._blocks[::step]
+        return {**self._arrays, **{column.name: self._joined(column, blocks) for column in self._columns}}
+
+    def first(self, name: str, most: int) -> NDArray[Any]:
+        """At least the first `most` entries of a column of frames, or all."""
+        column = next(column for column in self._columns if column.name == name)
+        before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
+        return self._joined(column, self._blocks[: int((before < most).sum())])
+
+    def step_for(self, most: int) -> int:
+        """The `step` of `read` with which about `most` frames are read."""
+        return max(1, -(-self.num_frames // most))
+
+    def members(self, told: Callable[[], None]) -> Iterator[Member]:
+        """Every array, read block by block; `told` is called after each block."""
+        yield from (Member.of(name, array) for name, array in self._arrays.items())
+        num_points = sum(block.points for block in self._blocks)
+        for column in self._columns:
+            shape = (num_points if column.of_points else self.num_frames, *column.entry)
+            yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, told))
+
+    def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
+        """The whole blocks."""
+        number = 0
+        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+            mark, index, frames, points, checksum = _BLOCK.unpack(head)
+            if mark != _MARK or index != number:
+                return
+            block = _Block(file.tell(), frames, points)
+            size = sum(column.size * (points if column.of_points else frames) for column in self._columns)
+            if not frames or size > self._size - block.at:
+                return
+            if check and zlib.crc32(file.read(size)) != checksum:
+                return
+            if int(self._column(POINT_COUNTS, block).sum(dtype=np.int64)) != points:
+                return
+            file.seek(block.at + size)
+            number += 1
+            self._end = file.tell()
+            yield block
+
+    def _joined(self, column: Column, blocks: Sequence[_Block]) -> NDArray[Any]:
+        """A column of several blocks."""
+        none = np.empty((0, *column.entry), column.dtype)
+        return np.concatenate([none, *(self._column(column, block) for block in blocks)])
+
+    def _parts(self, column: Column, told: Callable[[], None]) -> Iterator[NDArray[Any]]:
+        """A column, block by block."""
+        for block in self._blocks:
+            yield self._column(column, block)
+            told()
+
+    def _column(self, column: Column, block: _Block) -> NDArray[Any]:
+        """A column of one block as it is in the file."""
+        at = block.at
+        for other in self._columns:
+            count = block.points if other.of_points else block.frames
+            if other.name == column.name:
+                break
+            at += other.size * count
+        with self.path.open("rb") as file:
+            file.seek(at)
+            content = file.read(column.size * count)
+        return np.frombuffer(content, column.dtype).reshape(count, *column.entry)
+
+
+def is_growing(path: Path) -> bool:
+    """Whether a file is an archive that grew and was not finished."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
+def finish_archive(
+    grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
+) -> None:
+    """Write an archive that grew in its usual form, whole or not at all, and read it back.
+
+    Memory does not grow with the archive.
+
+    Raises:
+        OSError: The file cannot be written, or is not what was written when it is read back.
+    """
+    with atomic_write(path) as temporary:
+        write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
+        try:
+            check_npz(temporary)
+        except ValueError as error:
+            raise OSError(errno.EIO, f"read back, it is {error}", str(path)) from error
+
+
+def _take_part(file: io.BufferedReader) -> bytes:
+    (size,) = _SIZE.unpack(file.read(_SIZE.size).ljust(_SIZE.size, b"\xff"))
+    if size > _LARGEST_HEADER:
+        raise ValueError("a header that is too large")
+    content = file.read(size)
+    if len(content) < size:
+        raise ValueError("a header that was cut off")
+    return content
+
+
+def _pack_array(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _unpack_array(content: bytes) -> NDArray[Any]:
+    """An array of the .npy format, whose size is that of its bytes; raises a ValueError if it is not."""
+    buffer = io.BytesIO(content)
+    check_npy_header(buffer, len(content))
+    buffer.seek(0)
+    return np.lib.format.read_array(buffer, allow_pickle=False)
+
+
+def _column(stored: Mapping[str, Any]) -> Column:
+    leading, *entry = stored["shape"]
+    if entry[:1] == ["N"]:  # until schema 3 points were described as a table with a row per frame
+        leading, entry = "P", entry[1:]
+    column = Column(str(stored["name"]), str(stored["dtype"]), (leading, *map(int, entry)))
+    if (
+        leading not in ("T", "P")
+        or np.dtype(column.dtype).hasobject
+        or not 0 <= column.size <= _LARGEST_HEADER
+        or min(column.entry, default=0) < 0
+    ):
+        raise ValueError("a column of no size")
+    return column
+
 
 Content = TypeVar("Content")
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from gloves.takes.points import PointList
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, HandSimError, choices
-from handsim.files.atomic import atomic_write, read_toml
-from handsim.files.toml_values import check_keys, numbers, quoted, shown, tables_of, text_of, written
+from handsim.files.inputs import check_keys, numbers, quoted, read_toml, shown, tables_of, text_of, written
+from handsim.files.outputs import atomic_write
 
 SUFFIX: Final = ".corrections.toml"
 """How the names of such files end."""

@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from gloves.captures.capture import Capture
-from gloves.captures.markers import labeled_columns
+from gloves.captures.capture import Capture, labeled_columns
+from gloves.captures.formats import write_capture
 from gloves.fit import Attachment, GlovedHand, GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import SCHEMA, names_of, read_archive, settings_of, write_archive
-from gloves.takes.columns import (
+from gloves.takes.points import (
     ATTACHMENT,
     BODY_MARKERS,
     FRAMES,
@@ -33,23 +33,83 @@ from gloves.takes.columns import (
     POINTS,
     SPREADS,
     Column,
+    PointList,
+    Status,
     check_stored,
     fitted,
     spans,
 )
-from gloves.takes.formats import motion_format
-from gloves.takes.points import PointList
-from gloves.takes.status import Status
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model import HandModel
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
-from handsim.hand.shape import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
+from handsim.hand.shape import (
+    HAND_DTYPE,
+    JOINT_NAMES,
+    NUM_JOINTS,
+    NUM_KEYPOINTS,
+    Side,
+    pack_hand,
+    unpack_hand,
+)
+from handsim.motion_files.joint_files import (
+    OPENXR_SUFFIX,
+    write_bvh,
+    write_joint_csv,
+    write_joint_parquet,
+    write_mot,
+    write_openxr,
+)
+from handsim.motion_files.motion import Motion, posed_hands
+from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import UpAxis
+
+
+class MotionFormat(NamedTuple):
+    """A format of motion."""
+
+    write: Callable[[Path, Motion, UpAxis], None]
+    without_pose: str
+    """What a hand without a pose is in it."""
+    steady: bool = False
+    """Whether its frames have no times of their own, and must come at a steady rate."""
+
+
+def motion_format(path: Path) -> MotionFormat:
+    """The format that the end of a name says."""
+    for ending, form in MOTION_FORMATS.items():
+        if path.name.lower().endswith(ending):
+            return form
+    endings = ", ".join(MOTION_FORMATS)
+    raise ArgumentError(f"cannot write a take as '{path}', expected a name that ends in {endings}")
+
+
+def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
+    """The keypoints of all hands as markers, in the take's axes, so that they lie among its markers."""
+    del up
+    positions, names = [], []
+    for hand in posed_hands(motion):
+        keypoints = hand_keypoints(hand.model, hand.qpos)
+        positions.append(np.where(hand.present[:, None, None], keypoints, np.nan))
+        names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
+    write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
+
+
+MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
+    ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
+    ".bvh": MotionFormat(write_bvh, "held at its last pose", steady=True),
+    ".usda": MotionFormat(write_usd, "invisible"),
+    ".usdc": MotionFormat(write_usd, "invisible"),
+    ".csv": MotionFormat(write_joint_csv, "blank"),
+    ".parquet": MotionFormat(write_joint_parquet, "null"),
+    ".trc": MotionFormat(_write_joint_trc, "blank", steady=True),
+    ".mot": MotionFormat(write_mot, "NaN"),
+    OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
+}
+"""The formats, by the ends of names."""
+
 
 SUFFIX: Final = ".truth.npz"
 """How the names of simulated takes end that lie beside their captures."""
@@ -310,7 +370,7 @@ class Take:
         """A take of frames that were tracked one by one.
 
         Args:
-            frames: By the names of a take's arrays (`gloves.takes.columns.FRAMES` and `numbers`), the entries
+            frames: By the names of a take's arrays (`gloves.takes.points.FRAMES` and `numbers`), the entries
                 of each frame; those of points for the points that it has.
             hands: The hands.
             bodies: The rigid bodies.
@@ -508,7 +568,7 @@ class Take:
     def keypoints(self) -> Float[np.ndarray, "T H 21 3"]:
         """The wrist, the joints and the tips of the hands in the world [m]; NaN where one has no pose.
 
-        Their names are `handsim.hand.keypoints.KEYPOINT_NAMES`.
+        Their names are `handsim.hand.model.KEYPOINT_NAMES`.
         """
         return keypoints_of(self.hands, self.qpos)
 

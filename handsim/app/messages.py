@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final, TextIO
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import HandSimWarning
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal

@@ -17,9 +17,9 @@ from upath import UPath
 
 from handsim.app.workers import Job
 from handsim.errors import ArgumentError, HandSimError, shortened
-from handsim.files.atomic import remove_abandoned, remove_leftovers, temporary_beside
 from handsim.files.inputs import checksum
 from handsim.files.json_files import claim
+from handsim.files.outputs import remove_abandoned, remove_leftovers, temporary_beside
 
 Make = Callable[[Path, int], int]
 """Takes a folder and a number, leaves the number's files in the folder, and returns the number."""

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 
 _STYLE: Final = """
 :root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;

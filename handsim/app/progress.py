@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 import threading
 import time
@@ -29,9 +28,32 @@ EVERY: Final = 10.0
 _PERIOD: Final = 600.0  # [s] that speeds and the time left are means over
 
 
+class ProgressBar:
+    """A bar for one task: called with what is done and all there is to do, it shows both."""
+
+    def __init__(self, bar: Progress, task: TaskID) -> None:
+        self._bar, self._task = bar, task
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show what is done; this is a `handsim.callbacks.Progress`."""
+        self._bar.update(self._task, completed=done, total=total)
+
+    def advance(self, count: int = 1) -> None:
+        """Show that more is done."""
+        self._bar.advance(self._task, count)
+
+    def step(self, name: str) -> None:
+        """Show the name of what is being done; this is a `handsim.callbacks.OnStep`."""
+        self._bar.update(self._task, description=name)
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar, on standard error."""
+        self._bar.console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
 @contextmanager
-def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
-    """A progress bar on standard error and the one task in it."""
+def progress_bar(unit: str) -> Iterator[ProgressBar]:
+    """A progress bar on standard error."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -50,10 +72,10 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
     ) as bar:
         task = bar.add_task("", total=1)
         if console.is_terminal:
-            yield bar, task
+            yield ProgressBar(bar, task)
         else:
             with _lines(console, bar.tasks[0], unit):
-                yield bar, task
+                yield ProgressBar(bar, task)
 
 
 @contextmanager
@@ -81,11 +103,6 @@ def named_steps(first: str) -> Iterator[Callable[[str], None]]:
 
     tell(first)
     yield tell
-
-
-def print_above(bar: Progress) -> Callable[[str], None]:
-    """Takes a line and prints it above the bar, on standard error."""
-    return functools.partial(bar.console.print, soft_wrap=True, markup=False, highlight=False)
 
 
 @contextmanager

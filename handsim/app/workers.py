@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Any, Final
 
 from handsim._checks import check_count
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from handsim.errors import ArgumentError, DatasetError, HandSimError
 from handsim.files.json_files import load_json
 

@@ -10,8 +10,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.names import as_text
-from handsim.files.outputs import check_ending, check_outputs
+from handsim.files.outputs import as_text, check_ending, check_outputs
 from handsim.space.objects import named_object
 
 if TYPE_CHECKING:

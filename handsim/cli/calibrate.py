@@ -11,7 +11,7 @@ import tyro
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.files.outputs import check_ending, check_outputs
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:
@@ -41,19 +41,19 @@ def calibrate(
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
     """
-    from track import capture_calibration
+    from track import captures
 
     check_ending(out, ".json")
     check_outputs((capture, glove, labeler), [out])
-    with progress_bar("") as (bar, task):
-        user = capture_calibration.calibrate(
+    with progress_bar("") as bar:
+        user = captures.calibrate(
             capture,
-            glove,
+            glove=glove,
             hands=hands,
             size=size,
             labeler=labeler,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-            on_step=lambda what: bar.update(task, description=what),
+            progress=bar,
+            on_step=bar.step,
         )
     user.save(out)
     print_line(f"{out}: {len(user)} hands in glove {glove}")

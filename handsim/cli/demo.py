@@ -14,7 +14,7 @@ from handsim._checks import check_count
 from handsim.app.messages import print_line
 from handsim.app.page import write_page
 from handsim.app.progress import named_steps
-from handsim.files.atomic import atomic_write, written_together
+from handsim.files.outputs import atomic_write, written_together
 
 
 def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:

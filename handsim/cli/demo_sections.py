@@ -19,7 +19,7 @@ from handsim import __version__
 from handsim.app.page import Section
 from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from poses.shapes import gesture
 from render.captions import contact_sheet, write_png
 from render.config import RenderConfig

@@ -15,8 +15,8 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Final
 
-from handsim._extras import EGL_PACKAGES
 from handsim._kernel_cache import VARIABLE, kernel_cache
+from handsim._plugins import EGL_PACKAGES
 from handsim._siblings import SIBLINGS, shadowed_siblings
 from handsim.app.workers import usable_cores
 

@@ -29,10 +29,10 @@ def export(
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default.
     """
-    from gloves.takes.growing import SUFFIX as GROWING
+    from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
 
-    if source.lower().endswith((".npz", f".npz{GROWING}")):
+    if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
         _export_take(Path(source), out, fps, up)
     elif source.lower().endswith(".json"):
         check_outputs([source], [out])
@@ -44,8 +44,7 @@ def export(
 
 
 def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None:
-    from gloves.takes.formats import motion_format
-    from gloves.takes.take import load_take
+    from gloves.takes.take import load_take, motion_format
 
     form = motion_format(out)
     check_outputs([source], [out])
@@ -67,7 +66,7 @@ def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None
 
 def _export_labeler(source: str, out: Path) -> None:
     from gloves.captures.formats import READABLE
-    from gloves.takes.formats import MOTION_FORMATS
+    from gloves.takes.take import MOTION_FORMATS
     from train.labelers.storage import export_onnx, load_network
 
     if Path(source).suffix.lower() in READABLE:

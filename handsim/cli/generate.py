@@ -11,10 +11,10 @@ import tyro
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
-from handsim.app.progress import named_steps, print_above, progress_bar
+from handsim.app.progress import named_steps, progress_bar
 from handsim.app.workers import chosen_workers
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
+from handsim.hand.shape import SIDES
+from handsim.space.rig import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
 from train.data.shards import Dataset
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.generation import make_dataset
@@ -43,14 +43,14 @@ def generate(
     """
     place = place_of(out)
     with (
-        progress_bar("frames") as (bar, task),
-        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+        progress_bar("frames") as bar,
+        chosen_workers(cluster, workers, bar.say) as chosen,
     ):
         manifest = make_dataset(
             config,
             place,
             workers=chosen,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=bar,
         )
     print_line(f"{manifest.num_frames} frames of {config.glove} in {place}")
     if isinstance(place, Path):

@@ -23,8 +23,7 @@ from gloves.layout import (
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import LayoutError
-from handsim.files.names import as_text
-from handsim.files.outputs import check_ending, check_outputs, write_starter
+from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Final, Literal
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_ending, check_outputs
-from handsim.hand.topology import NUM_JOINTS, Side
+from handsim.files.outputs import check_ending, check_outputs, written_together
+from handsim.hand.shape import NUM_JOINTS, Side
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit

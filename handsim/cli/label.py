@@ -38,17 +38,17 @@ def label(
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
     from track.captures import label_capture
-    from train.threads import label_on
+    from train.labelers.protocol import label_on
 
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
-    with progress_bar("frames") as (bar, task):
+    with progress_bar("frames") as bar:
         take = label_capture(
             capture,
-            glove,
+            glove=glove,
             labeler=labeler,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=bar,
         )
     right, left = _hands_there(take)
     write_capture(out, take.labeled_capture(sides=bool((right & left).any())))

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from handsim._version import __version__
+from handsim import __version__
 from handsim.app.messages import told_warnings
 from handsim.cli.command_table import COMMANDS, PresetCommand, load
 from handsim.errors import SENTENCE, HandSimError, choices, shortened

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from handsim.errors import ArgumentError
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:

@@ -119,7 +119,9 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
     """The fields of a dataclass of settings, with their docstrings as help."""
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
-    hints, told = get_type_hints(info.type, include_extras=True), _field_docstrings(info.type)
+    hints, told = get_type_hints(info.type, include_extras=True), dict[str, str]()
+    for kind in reversed(info.type.__mro__[:-1]):  # fields of a base have their docstrings there
+        told |= _field_docstrings(kind)
     fields = []
     for one in dataclasses.fields(info.type):
         if not one.init:

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
-import numpy as np
 import tyro
 
-from handsim._checks import check_count
 from handsim.app.messages import LiveStatus, print_line
-from handsim.errors import ArgumentError
 from handsim.files.signals import interrupt_flag
-from track.streams import LOOPBACK
-from track.streams.natnet import COMMAND_PORT
-
-if TYPE_CHECKING:
-    from track.streams.natnet_server import ReplayServer
+from track.streams.natnet import COMMAND_PORT, ReplayServer, ReplaySettings
 
 _LOOK: Final = 0.1  # [s] between two looks at whether it shall end
-_MOST_PORT: Final = 65535
+_USUAL: Final = ReplaySettings(port=COMMAND_PORT)
 
 
 def replay(
     capture: Annotated[Path, tyro.conf.Positional],
-    *,
-    loop: bool = False,
-    rate: float | None = None,
-    host: str = LOOPBACK,
-    port: int = COMMAND_PORT,
+    settings: Annotated[ReplaySettings, tyro.conf.arg(name="")] = _USUAL,
 ) -> None:
     """Play a capture as a NatNet server, for handsim track --live; Ctrl-C ends it.
 
@@ -38,20 +27,9 @@ def replay(
     Args:
         capture: A .trc, .c3d, .csv or .tsv file, whose names are not sent, or a take (.npz), of which only
             points and IDs are sent.
-        loop: Start again at the end.
-        rate: Frames per second [Hz]; the capture's own when not given.
-        host: Address of this machine to listen at; other machines do not reach the default.
-        port: Port to listen at; 0 takes a free one.
+        settings: How to play it.
     """
-    from track.streams.natnet_server import ReplayServer
-
-    if rate is not None and not 0.0 < rate < np.inf:
-        raise ArgumentError(f"--rate is {rate:g}, expected a positive number")
-    check_count("--port", port, 0, _MOST_PORT)
-    with (
-        ReplayServer(capture, rate=rate, host=host, port=port, loop=loop) as server,
-        interrupt_flag() as ended,
-    ):
+    with ReplayServer(capture, settings) as server, interrupt_flag() as ended:
         print_line(f"{capture}: {server.num_frames} frames at {server.rate:g} Hz on {server.url}")
         with LiveStatus() as status:
             while not (ended() or server.finished):

@@ -15,11 +15,9 @@ from rich.text import Text
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import RigError
-from handsim.files.atomic import written_together
 from handsim.files.json_files import save_json
-from handsim.files.names import as_text
-from handsim.files.outputs import check_ending, check_outputs, write_starter
-from handsim.space.cameras import (
+from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter, written_together
+from handsim.space.rig import (
     ROOM_CENTER,
     CameraRig,
     list_rigs,
@@ -27,7 +25,7 @@ from handsim.space.cameras import (
     named_rig,
     rig_description,
 )
-from handsim.space.rig_formats.any_file import import_cameras
+from handsim.space.rig_formats import import_cameras
 from train.rig_advice.mounts import MOUNTS, Mount
 
 if TYPE_CHECKING:

@@ -9,15 +9,13 @@ from typing import Annotated, Final
 
 import tyro
 
-from gloves.captures.capture import Capture, run_lengths
+from gloves.captures.capture import UNLABELED, Capture, run_lengths
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
 from handsim.app.messages import print_line
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.errors import ArgumentError
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_free, check_memory, check_outputs
+from handsim.files.outputs import check_free, check_memory, check_outputs, written_together
 from train.simulation.takes import TakeConfig, record_config
 
 _MEMORY: Final = 20_000

@@ -14,9 +14,8 @@ from rich.console import Console
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, HandSimWarning
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_outputs
-from handsim.hand.topology import Side
+from handsim.files.outputs import check_outputs, written_together
+from handsim.hand.shape import Side
 from track.config import Size
 from track.frames import TrackedFrame
 
@@ -79,9 +78,10 @@ def track(
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
     from track.live import track_live
-    from track.settings import TrackerSetup, TrackSettings, warm_up
+    from track.settings import TrackerSetup, TrackSettings
     from track.sinks import open_sinks
     from track.streams.frame_source import StreamedFrame
+    from track.tracker import warm_up
 
     _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
@@ -124,18 +124,18 @@ def _track_file(
     from track.live import LiveTake
 
     corrections = corrections_path(out)
-    with progress_bar("frames") as (bar, task):
+    with progress_bar("frames") as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.step("calibrating" if settings.calibrate and done == total else "")
+            bar(done, total)
+
         take = track_capture(
             capture,
             settings,
             corrections=corrections if corrections.exists() else None,
             sinks=sinks,
-            progress=lambda done, total: bar.update(
-                task,
-                completed=done,
-                total=total,
-                description="calibrating" if settings.calibrate and done == total else "",
-            ),
+            progress=show,
             on_frame=on_frame,
         )
     with written_together():
@@ -175,7 +175,7 @@ def _check_options(
 ) -> None:
     from gloves.captures.formats import WRITABLE, check_suffix
     from handsim.cli.options import check_take_file
-    from track.streams.addresses import check_address
+    from track.streams.live_stream import check_address
 
     if (capture is None) == (live is None):
         given = (

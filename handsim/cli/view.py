@@ -14,7 +14,7 @@ from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.files.signals import InterruptFlag, interrupt_flag
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from track.config import Size
 from track.streams import LOOPBACK
 from track.viewer.server import address_of, opened_server
@@ -110,13 +110,13 @@ def _draw(name: str, content: Content, video: Path) -> None:
     recording = content.recording
     if recording is None:
         raise ArgumentError(f"--video is {video}, but {name} is a {content.kind}: nothing in it moves")
-    with progress_bar("pictures") as (bar, task):
+    with progress_bar("pictures") as bar:
         count = write_video(
             video,
             recording,
             first_look(recording),
             write_clip=write_clip,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=bar,
         )
     print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
@@ -125,11 +125,11 @@ def _view_live(
     url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
-    from handsim.space.cameras import load_rig
+    from handsim.space.rig import load_rig
     from track.live import measured_setup, recording_kept
     from track.recorder import Recorder
-    from track.settings import warm_up
-    from track.streams.addresses import open_source
+    from track.streams.live_stream import open_source
+    from track.tracker import warm_up
     from track.viewer.live_view import LiveView
 
     cameras = None if rig is None else load_rig(rig)

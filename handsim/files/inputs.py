@@ -1,18 +1,33 @@
-"""Files that somebody else wrote: read only where they are regular files of a bounded size."""
+"""Files that somebody else wrote: regular files of a bounded size, and values of TOML files.
+
+A wrong value raises a `HandSimError` that names the key; the caller, which knows the file, adds its name.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
 import stat
+import tomllib
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from handsim.errors import HandSimError
+import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # object stores' code takes as long to load as a capture to read
+from handsim.errors import HandSimError, choices, shortened
+
+if TYPE_CHECKING:
     from upath import UPath
 
+
+_NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
+_MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_INTEGER_BITS: Final = 63
+_DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 _KINDS: Final = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISSOCK, "a socket"),
@@ -63,4 +78,108 @@ def checksum(path: Path | UPath) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
-_NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
+_LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
+
+
+def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Args:
+        error: What to raise, in one sentence, when the file cannot be read or is not TOML.
+    """
+    data = read_bytes(path, error=error, most=_MOST_TOML)
+    try:
+        text = data.decode("utf-8")
+        deep = _DOTTED.search(text)
+        if deep is not None:
+            raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")
+        table = tomllib.loads(text)
+        if _has_long_integer(table):
+            raise OverflowError
+        return table
+    except UnicodeDecodeError as cause:
+        raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause
+    except tomllib.TOMLDecodeError as cause:
+        raise error(f"{path}: not a TOML file: {cause}") from cause
+    except (ValueError, OverflowError) as cause:  # Python reads no more than some thousand digits
+        raise error(f"{path}: not a TOML file: an integer of more than 64 bits") from cause
+    except RecursionError as cause:
+        raise error(f"{path}: not a TOML file: brackets are nested too deep") from cause
+
+
+def _has_long_integer(value: object) -> bool:
+    """Whether an integer beyond the 64 bits of TOML is in a table, which Python would take."""
+    if isinstance(value, dict | list):
+        return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
+
+
+def check_keys(
+    table: Mapping[str, object], owner: str, valid: Collection[str], *, optional: Collection[str] = ()
+) -> None:
+    """Raise a `HandSimError` unless a table has all the keys that it must have, and no others."""
+    for key in table:
+        if key not in valid:
+            raise HandSimError(f"{owner} has an {choices(key, valid, noun='key')}")
+    for key in valid:
+        if key not in table and key not in optional:
+            raise HandSimError(f"{owner} lacks the key '{key}'")
+
+
+def tables_of(table: Mapping[str, object], key: str) -> list[dict[str, Any]]:
+    """A list of tables; empty if the key is missing."""
+    tables = table.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
+        raise HandSimError(f"{key} is not a list of tables; expected one [[{key}]] table per {key}")
+    return tables
+
+
+def text_of(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
+    """Text of any characters."""
+    value = table.get(key, default)
+    if not isinstance(value, str):
+        raise HandSimError(f"{prefix}{key} is {shown(value)}, expected text in quotes")
+    return value
+
+
+def number_of(
+    table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None
+) -> float:
+    """A finite number."""
+    return float(numbers(f"{prefix}{key}", table.get(key, default), (), "a number"))
+
+
+def numbers(owner: str, value: object, shape: tuple[int, ...], expected: str) -> NDArray[np.float64]:
+    """Nested lists of finite numbers as an array of exactly this shape; `expected` describes it in words."""
+    try:
+        array = np.array(value, dtype=object)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
+    flat = array.ravel().tolist()
+    if array.shape != shape or not all(
+        isinstance(entry, int | float) and not isinstance(entry, bool) and abs(entry) < _LARGEST
+        for entry in flat
+    ):
+        raise HandSimError(f"{owner} is {shown(value)}, expected {expected}")
+    return np.array(flat, dtype=np.float64).reshape(shape)
+
+
+def number_list(owner: str, value: object) -> tuple[float, ...]:
+    """A list of finite numbers, of any length."""
+    count = len(value) if isinstance(value, list) else -1
+    return tuple(numbers(owner, value, (count,), "a list of numbers").tolist())
+
+
+def shown(value: object) -> str:
+    """A value as a sentence shows it, cut where it is long."""
+    return shortened(json.dumps(value, default=str, ensure_ascii=False))
+
+
+def quoted(text: str) -> str:
+    """A TOML basic string, which escapes as JSON does, and the delete character too."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
+
+
+def written(value: float) -> str:
+    """A TOML float without the noise of unit conversion; never '-0.0'."""
+    return repr(round(value, 9) + 0.0)

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError, shortened
-from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.inputs import read_bytes
+from handsim.files.outputs import atomic_write, remove_leftovers
 
 _MOST_SHOWN: Final = 4  # settings that a message lists
 _MISSING: Final = "nothing"

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Final
 
-from handsim._closing import Closing
+from handsim.callbacks import Closing
 from handsim.errors import HandSimError
 
 ENDING: Final = tuple(

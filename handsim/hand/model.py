@@ -1,24 +1,197 @@
-"""One person's hand, ready to move: skeleton, flesh, skin and the compiled MuJoCo model."""
+"""One person's hand, ready to move: skeleton, flesh, skin, the compiled MuJoCo model and the 21 keypoints.
+
+Keypoints are the wrist, and four per digit from its first joint to its tip, in FreiHAND's and MediaPipe's
+order: wrist, thumb, index, middle, ring, little. Joints are centers of rotation; a tip is the far end of the
+last bone, on the skin.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim._checks import check_array, check_type
-from handsim.hand.capsules import Capsules, build_capsules
-from handsim.hand.contact import penetration_depth
-from handsim.hand.mjcf import build_spec
-from handsim.hand.shape import SIZES, HandShape, named_shape
-from handsim.hand.skeleton import Skeleton, bone_transforms, build_skeleton
-from handsim.hand.skin.surface import HandSurface, build_surface, skin_frames
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
+from handsim.hand.capsules import Capsules, build_capsules, penetration_depth
+from handsim.hand.shape import (
+    BONE_NAMES,
+    BONES,
+    DIGITS,
+    JOINTS,
+    NUM_BONES,
+    NUM_JOINTS,
+    NUM_KEYPOINTS,
+    NUM_QPOS,
+    PALM,
+    SIZES,
+    HandShape,
+    Side,
+    bones_of,
+    named_shape,
+)
+from handsim.hand.skin import HandSurface, build_surface, skin_frames
+from handsim.kernels import pose_bones
+from handsim.space.transforms import MIRROR, euler_matrix
 
 if TYPE_CHECKING:
     import mujoco
+
+
+_MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
+_CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
+"""Parent of each bone, and how many joints move it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skeleton:
+    """Rest transforms of the bones relative to their parents, joint axes, and bone lengths."""
+
+    offsets: Float[np.ndarray, "L 3"]
+    """Origin of each bone in its parent's frame [m]; zero for the palm."""
+    rotations: Float[np.ndarray, "L 3 3"]
+    """Orientation of each bone in its parent's frame at zero angles."""
+    axes: Float[np.ndarray, "J 3"]
+    """Unit joint axes in the frames of the bones they move."""
+    ranges: Float[np.ndarray, "J 2"]
+    """Lowest and highest angle of each joint [rad]."""
+    lengths: Float[np.ndarray, "L"]
+    """Length of each bone along its x axis [m]; for the palm, wrist to the middle knuckle."""
+
+    def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
+        """`T_wrist_bone` of every bone at zero angles."""
+        transforms = np.tile(np.eye(4), (NUM_BONES, 1, 1))
+        for number, bone in enumerate(BONES):
+            if bone.parent >= 0:
+                local = np.eye(4)
+                local[:3, :3], local[:3, 3] = self.rotations[number], self.offsets[number]
+                transforms[number] = transforms[bone.parent] @ local
+        return transforms
+
+
+def build_skeleton(shape: HandShape) -> Skeleton:
+    """Skeleton of a hand; a left hand is the mirror image, so equal angles give mirrored poses."""
+    offsets, rotations = np.zeros((NUM_BONES, 3)), np.tile(np.eye(3), (NUM_BONES, 1, 1))
+    lengths = np.zeros(NUM_BONES)
+    lengths[0] = shape.knuckles[2, 0]
+    digits = euler_matrix(shape.base_angles)
+    for number, bone in enumerate(BONES):
+        if bone.digit < 0:
+            continue
+        index = (number - 1) % 3
+        lengths[number] = shape.bone_lengths[bone.digit, index]
+        if index == 0:
+            offsets[number] = shape.knuckles[bone.digit]
+            rotations[number] = digits[bone.digit]
+        else:
+            offsets[number, 0] = shape.bone_lengths[bone.digit, index - 1]
+    axes = np.array([joint.axis for joint in JOINTS])
+    if shape.side == "left":
+        offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
+        axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
+    ranges = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
+    return Skeleton(offsets, rotations, axes, ranges, lengths)
+
+
+def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
+    """`T_world_bone` of every bone in every frame.
+
+    Args:
+        qpos: Wrist position [m], wrist orientation (wxyz, normalized here), joint angles [rad].
+    """
+    transforms: NDArray[np.float64] = pose_bones(
+        np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN
+    )
+    return transforms
+
+
+FLESH_DENSITY: Final = 1100.0
+"""Density of the hand [kg/m^3], soft tissue and bone together."""
+CAPSULE_GROUP: Final = 0
+SERVO_STIFFNESS: Final = 1.0
+"""Torque of a servo per angle off its control [N m/rad]."""
+SERVO_DAMPING: Final = 0.03
+"""Torque of a servo against the speed of its joint [N m s/rad]."""
+
+
+class Site(NamedTuple):
+    """A named point on a bone, drawn as a small sphere."""
+
+    name: str
+    bone: int
+    position: Float[np.ndarray, "3"]
+    radius: float
+
+
+def build_spec(
+    skeleton: Skeleton,
+    capsules: Capsules,
+    *,
+    sites: tuple[Site, ...] = (),
+    actuators: bool = False,
+) -> mujoco.MjSpec:
+    """Editable MuJoCo specification of a hand; compile it, or write it with `.to_xml()`.
+
+    With `actuators` each joint has a position servo of its name: a control is an angle [rad] within the
+    joint's range.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.modelname = "hand"
+    spec.compiler.degree = False
+    spec.option.gravity = np.zeros(3)
+    bodies: list[mujoco.MjsBody] = []
+    for number, bone in enumerate(BONES):
+        parent = spec.worldbody if bone.parent < 0 else bodies[bone.parent]
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, skeleton.rotations[number].ravel())
+        body = parent.add_body(name=bone.name, pos=skeleton.offsets[number], quat=quaternion)
+        if bone.parent < 0:
+            body.add_freejoint(name="wrist")
+        bodies.append(body)
+    for number, joint in enumerate(JOINTS):
+        bodies[joint.bone].add_joint(
+            name=joint.name,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=skeleton.axes[number],
+            range=skeleton.ranges[number],
+            limited=True,
+            damping=0.01,
+        )
+    if actuators:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # light bones with stiff servos
+        for number, joint in enumerate(JOINTS):
+            servo = spec.add_actuator(
+                name=joint.name,
+                target=joint.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                ctrllimited=True,
+                ctrlrange=skeleton.ranges[number],
+            )
+            servo.set_to_position(kp=SERVO_STIFFNESS, kv=SERVO_DAMPING)
+    counts: dict[int, int] = {}
+    for bone, start, end, radius in zip(
+        capsules.bones, capsules.starts, capsules.ends, capsules.radii, strict=True
+    ):
+        counts[bone] = counts.get(bone, 0) + 1
+        bodies[bone].add_geom(
+            name=f"{BONE_NAMES[bone]}_{counts[bone]}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[*start, *end],
+            size=[radius, 0.0, 0.0],
+            density=FLESH_DENSITY,
+            group=CAPSULE_GROUP,
+            rgba=[0.85, 0.65, 0.55, 1.0],
+        )
+    for site in sites:
+        bodies[site.bone].add_site(
+            name=site.name, pos=site.position, size=[site.radius] * 3, rgba=[0.9, 0.9, 0.95, 1.0]
+        )
+    return spec
 
 
 class HandModel:
@@ -140,3 +313,114 @@ def join_qpos(
     qpos[:, 3:7] = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
     qpos[:, 7:] = angles
     return qpos
+
+
+_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
+KEYPOINT_NAMES: Final[tuple[str, ...]] = (
+    "wrist",
+    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
+)
+KEYPOINT_BONES: Final[tuple[int, ...]] = (
+    PALM,
+    *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
+)
+"""Index in `BONES` of the bone that carries each keypoint: the one that begins there, or of a tip ends."""
+KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
+"""Digit of each keypoint, -1 for the wrist."""
+SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
+    (0 if part == 0 else 4 * digit + part, 4 * digit + part + 1)
+    for digit in range(len(DIGITS))
+    for part in range(4)
+)
+"""Pairs of keypoints that are joined by a line."""
+_WRIST: Final = 1.3  # thickness of the wrist, in thicknesses of the palm
+
+
+def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
+    """Keypoints in the world [m].
+
+    Raises:
+        ArgumentError: `qpos` is not (T, 27) or not finite.
+    """
+    transforms = model.forward_kinematics(qpos)
+    points: NDArray[np.float64] = np.empty((len(transforms), NUM_KEYPOINTS, 3))
+    points[:, 0] = transforms[:, PALM, :3, 3]
+    for number, digit in enumerate(DIGITS):
+        bones = bones_of(digit)
+        points[:, 4 * number + 1 : 4 * number + 4] = transforms[:, list(bones)][..., :3, 3]
+        last = transforms[:, bones[-1]]
+        points[:, 4 * number + 4] = last[:, :3, 3] + model.skeleton.lengths[bones[-1]] * last[:, :3, 0]
+    return points
+
+
+def keypoint_thickness(shape: HandShape) -> Float[np.ndarray, "21"]:
+    """Thickness of the hand at each keypoint: of the wrist, or of the finger there [m]."""
+    fingers = 2.0 * shape.radii
+    return np.array([_WRIST * shape.palm_thickness, *fingers.ravel()])
+
+
+NUM_VELOCITIES: Final = 6 + NUM_JOINTS
+"""MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
+
+
+def _moved_bones() -> NDArray[np.bool_]:
+    """Which bones (J, L) each joint moves: its own and all beyond it."""
+    moved = np.zeros((NUM_JOINTS, NUM_BONES), dtype=bool)
+    for number, joint in enumerate(JOINTS):
+        for bone in range(NUM_BONES):
+            ancestor = bone
+            while ancestor >= 0 and ancestor != joint.bone:
+                ancestor = BONES[ancestor].parent
+            moved[number, bone] = ancestor == joint.bone
+    return moved
+
+
+_MOVED: Final = _moved_bones()
+# The first joint of a bone rotates about an axis fixed in the parent, a second one about its own bone's.
+_FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
+_BONE: Final = np.array([joint.bone for joint in JOINTS])
+_PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
+
+
+def joint_axes(
+    model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
+) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T J 3"]]:
+    """Unit axes and anchors [m] of all joints in the world."""
+    skeleton = model.skeleton
+    parent = T_world_bone[:, _PARENT, :3, :3] @ skeleton.rotations[_BONE]
+    own = T_world_bone[:, _BONE, :3, :3]
+    frames = np.where(_FIRST[:, None, None], parent, own)
+    return np.einsum("tjab,jb->tja", frames, skeleton.axes), T_world_bone[:, _BONE][..., :3, 3]
+
+
+def skinned_jacobian(
+    model: HandModel,
+    T_world_bone: Float[np.ndarray, "T L 4 4"],
+    points: Float[np.ndarray, "M 3"],
+    bone_indices: Int[np.ndarray, "M 4"],
+    bone_weights: Float[np.ndarray, "M 4"],
+) -> Float[np.ndarray, "T M 3 26"]:
+    """Derivative of skinned points [m] with respect to MuJoCo's velocities (`NUM_VELOCITIES`).
+
+    Args:
+        T_world_bone: Its bones, from `forward_kinematics`.
+        points: Rest positions in the wrist frame [m].
+    """
+    frames, count = len(T_world_bone), len(points)
+    motion = T_world_bone @ np.linalg.inv(model.rest_transforms)
+    homogeneous = np.concatenate([points, np.ones((count, 1))], axis=1)
+    carried = np.einsum("tmkij,mj->tmki", motion[:, bone_indices, :3], homogeneous)  # by each bone alone
+    placed = np.einsum("mk,tmki->tmi", bone_weights, carried)
+    jacobian = np.zeros((frames, count, 3, NUM_VELOCITIES))
+    jacobian[..., :3] = np.eye(3)
+    wrist = T_world_bone[:, 0]
+    turning = np.swapaxes(wrist[:, :3, :3], 1, 2)  # rows are the wrist's own axes in the world
+    arms = placed - wrist[:, None, :3, 3]
+    jacobian[..., 3:6] = np.cross(turning[:, None], arms[:, :, None]).swapaxes(-1, -2)
+    axes, anchors = joint_axes(model, T_world_bone)
+    # A joint moves the share of a point that its bones carry: axis x (sum of w (p - anchor)).
+    shares = bone_weights * _MOVED[:, bone_indices]  # (J, M, 4)
+    lever = np.einsum("jmk,tmki->tmji", shares, carried)
+    lever -= shares.sum(-1).T[..., None] * anchors[:, None]
+    jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
+    return jacobian

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 
 _MOST_FRAMES: Final = 1 << 22
 _STEADY: Final = 0.01  # of a frame, by which times may differ from those of a steady rate

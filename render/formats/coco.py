@@ -24,12 +24,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import DatasetError
-from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
-from handsim.hand.topology import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.hand.model import KEYPOINT_NAMES, SKELETON
+from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.records import (
     CENTER,
@@ -54,7 +53,7 @@ from render.formats.shards import (
     one_sentence,
     save_text,
 )
-from render.frames import HandTruth, RenderedFrame
+from render.frames import Doubles, HandTruth, RenderedFrame
 from render.skin.look import SkinLook, tone_name
 
 INFO: Final[dict[str, Any]] = {
@@ -182,11 +181,7 @@ class CocoWriter(FolderWriter):
         return record
 
     def finish(self) -> None:
-        """Write `annotations.json`.
-
-        Raises:
-            HandSimError: A shard is damaged, or the disk takes no more.
-        """
+        """Write `annotations.json`."""
 
         def pictures() -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
             return numbered(self._records())
@@ -204,11 +199,7 @@ class YoloWriter(CocoWriter):
         return record
 
     def finish(self) -> None:
-        """Write `annotations.json` and `data.yaml`.
-
-        Raises:
-            HandSimError: A shard is damaged, or the disk takes no more.
-        """
+        """Write `annotations.json` and `data.yaml`."""
         super().finish()
         with one_sentence(self.folder, "writing data.yaml"):
             save_text(self.folder / "data.yaml", [data_yaml()])
@@ -235,11 +226,7 @@ _ORDER: Final[tuple[Side, Side]] = (SIDES[1], SIDES[0])  # right, left
 
 
 def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-    """The picture, its camera and its joints, still without numbers.
-
-    Raises:
-        HandSimError: The camera's lens is not a pinhole, or two hands are of the same side.
-    """
+    """The picture, its camera and its joints, still without numbers."""
     hands = by_side(frame)
     seen = [hand.box for hand in frame.hands if is_seen(hand)]
     joints, valid = _joints(hands)
@@ -362,7 +349,7 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _union(boxes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _union(boxes: list[Doubles]) -> Doubles:
     """Smallest box (left, top, width, height) around some."""
     if not boxes:
         return np.zeros(4)
@@ -384,12 +371,7 @@ class InterhandWriter(FolderWriter):
         return record
 
     def finish(self) -> None:
-        """Write the files in `annotations`.
-
-        Raises:
-            HandSimError: A shard is damaged, pictures of one frame have different hands, or the disk takes
-                no more.
-        """
+        """Write the files in `annotations`."""
         annotations = self.folder / "annotations"
         start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
         cameras = Cameras()

@@ -50,9 +50,6 @@ def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dic
     """The visible hands: their indices in the frame, and their entries in each of the lists.
 
     The skin is added where `vertices`, some 150 kB a hand.
-
-    Raises:
-        HandSimError: The camera's lens is not a pinhole.
     """
     K = centered_K(frame.camera).tolist()
     entries = []
@@ -80,10 +77,6 @@ class FreihandWriter:
     One entry per hand: a picture of two hands comes twice. Shards wait in `parts` until `finish` moves their
     pictures to their numbers, which a shard keeps: what is rendered later comes after it. The shards' lists
     stay in `parts`.
-
-    Args:
-        folder: Where the set shall be.
-        vertices: Whether to write `training_verts.json`, some 150 kB a hand.
     """
 
     def __init__(self, folder: Path, *, vertices: bool = False) -> None:
@@ -96,12 +89,7 @@ class FreihandWriter:
         return shards_in(self.parts)
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard.
-
-        Raises:
-            HandSimError: The shard has its numbers already, a camera is not a pinhole camera, there are no
-                color pictures, or the disk takes no more.
-        """
+        """Write a shard."""
         if str(shard) in self._numbers():
             raise HandSimError(f"{self.folder}: shard {shard} is numbered already and cannot be written anew")
         folder = self.parts / shard_name(shard)
@@ -117,11 +105,7 @@ class FreihandWriter:
             save_index(temporary, entries)
 
     def finish(self) -> None:
-        """Number the pictures and write the lists.
-
-        Raises:
-            HandSimError: A shard is damaged, or the disk takes no more.
-        """
+        """Number the pictures and write the lists."""
         with one_sentence(self.folder, "numbering the pictures"):
             numbers = self._numbered()
             for shard, (first, count) in numbers.items():

@@ -22,27 +22,26 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_choice
 from handsim.errors import ArgumentError, HandSimError
-from handsim.files.atomic import atomic_write, unwritten
-from handsim.files.names import plain_path
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_KEYPOINTS, Side
+from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
-from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
+from render.color_sensor import linear_of
+from render.frames import FOREARM, PARTS_A_HAND, Doubles, Flags, Floats, HandTruth, Pictures, RenderedFrame
 
 CENTER: Final = 0.5
 """Where our count of pixels has the first one's center [px]."""
 
 
-def shifted_K(camera: Camera) -> NDArray[np.float64]:
+def shifted_K(camera: Camera) -> Doubles:
     """K for pixels that are counted from the first one's center; a lens is left to its coefficients."""
     K = camera.K.copy()
     K[:2, 2] -= CENTER
     return K
 
 
-def centered_K(camera: Camera) -> NDArray[np.float64]:
+def centered_K(camera: Camera) -> Doubles:
     """`shifted_K` of a pinhole, which alone projects points; other lenses are refused."""
     if camera.lens.kind != "pinhole":
         raise HandSimError(
@@ -81,7 +80,7 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None
     parts, instances = frame.ideal.parts, frame.ideal.instances
     first = 1 + PARTS_A_HAND * hand
     if instances is not None:
-        mask: NDArray[np.bool_] = instances == hand + 1
+        mask: Flags = instances == hand + 1
         return mask if parts is None else mask & (parts != first + FOREARM)
     if parts is not None:
         return (parts >= first) & (parts < first + FOREARM)
@@ -213,11 +212,7 @@ def joint_order(name: str) -> tuple[int, ...]:
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Our keypoints, or other rows with one per keypoint, in one of `JOINT_ORDERS`; NaN for those we lack.
-
-    Raises:
-        ArgumentError: The order is unknown, or there are not 21 points.
-    """
+    """Our keypoints, or other rows with one per keypoint, in one of `JOINT_ORDERS`; NaN for those we lack."""
     order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
     nowhere = np.full_like(points[..., :1, :], np.nan)
     return np.concatenate([points, nowhere], axis=-2)[..., order, :]
@@ -262,7 +257,7 @@ def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
 
 
 @kernel
-def _depth_steps(depth: NDArray[np.float32]) -> Any:
+def _depth_steps(depth: Floats) -> Any:
     """Depth (H, W) in whole units; 0 for what does not fit."""
     steps = np.zeros(depth.shape, np.uint16)
     for row in range(depth.shape[0]):
@@ -288,7 +283,7 @@ def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
 
 
 @kernel
-def _normal_levels(normals: NDArray[np.float32]) -> Any:
+def _normal_levels(normals: Floats) -> Any:
     """Normals (H, W, 3) as bytes, z first as OpenCV has blue."""
     levels = np.zeros(normals.shape, np.uint8)
     for row in range(normals.shape[0]):
@@ -302,13 +297,7 @@ def _normal_levels(normals: NDArray[np.float32]) -> Any:
 
 
 def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]:
-    """Files of a frame's pictures as its camera has them, and of ideal depth beside noisy, by suffix.
-
-    Args:
-        frame: Its colors have the suffix `.png` or `.jpg`; then come `.depth.png`, `.depth_ideal.png`,
-            `.normals.png` and `.ids.png`, as far as there are such pictures.
-        lossless: Whether colors are PNG instead of JPEG.
-    """
+    """Files of a frame's pictures as its camera has them, and of ideal depth beside noisy, by suffix."""
     pictures = as_sensed(frame)
     files: dict[str, bytes] = {}
     if pictures.rgb is not None:
@@ -340,30 +329,16 @@ _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")
 _IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
 _SENSOR: Final = "sensor."
-# The two branches of sRGB (IEC 61966-2-1).
-_TOE, _TOE_SLOPE, _POWER, _SCALE, _SHIFT = 0.04045, 12.92, 2.4, 1.055, 0.055
-
-
-def linear_light(picture: UInt8[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Linear light in [0, 1] of 8-bit sRGB."""
-    levels = np.arange(256) / 255.0
-    light = np.where(levels <= _TOE, levels / _TOE_SLOPE, ((levels + _SHIFT) / _SCALE) ** _POWER)
-    values: NDArray[np.float32] = light.astype(np.float32)[picture]
-    return values
 
 
 def write_exr(path: str | Path, frame: RenderedFrame) -> None:
     """Write all pictures of a frame and its camera."""
     import OpenEXR
 
-    if Path(path).suffix.lower() != ".exr":
-        raise HandSimError(f"{path}: expected a file name that ends in .exr")
     channels = {
         **_channels(frame.ideal),
         **{_SENSOR + name: values for name, values in _channels(frame.noisy).items()},
     }
-    if not channels:
-        raise HandSimError(f"{path}: frame {frame.number} has no pictures to write")
     record = frame.camera.record()
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
@@ -384,7 +359,7 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
 def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     if pictures.rgb is not None:
-        light = linear_light(pictures.rgb).astype(np.float16)
+        light = linear_of(pictures.rgb).astype(np.float16)
         channels |= {name: light[..., index] for index, name in enumerate(_RGB)}
     if pictures.depth is not None:
         channels["Z"] = pictures.depth.astype(np.float32)

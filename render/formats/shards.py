@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write, temporary_beside
+from handsim.files.outputs import atomic_write, temporary_beside
 from render.formats.records import encode_pictures, to_json, without_colors
 from render.frames import RenderedFrame
 
@@ -77,11 +77,7 @@ def clear_leftovers(path: Path) -> None:
 
 
 class Tar:
-    """A tar file whose bytes depend on its content alone: no times, no owners.
-
-    Args:
-        path: The file, open for writing until `close`.
-    """
+    """A tar file whose bytes depend on its content alone: no times, no owners."""
 
     def __init__(self, path: Path) -> None:
         self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)
@@ -116,11 +112,7 @@ def save_index(folder: Path, records: list[dict[str, Any]]) -> None:
 
 
 def load_indexes(folder: Path, shards: Iterable[int]) -> Iterator[dict[str, Any]]:
-    """The records of some shards, one after another.
-
-    Raises:
-        DatasetError: A shard's index is missing or damaged.
-    """
+    """The records of some shards, one after another."""
     for shard in shards:
         yield from load_index(folder / shard_name(shard))
 
@@ -163,13 +155,7 @@ BESIDE: Final = (*PICTURES, _LABELS)
 
 
 class FolderWriter:
-    """For each shard a folder of pictures, which are named after frames, with an index of records.
-
-    Args:
-        folder: Where all is.
-        inside: The folder of photographs in it.
-        part: A folder in that one, and in those beside it, which holds the shards.
-    """
+    """For each shard a folder of pictures, which are named after frames, with an index of records."""
 
     def __init__(self, folder: Path, *, inside: str = _IMAGES, part: str = ".") -> None:
         self.folder, self.part = folder, part
@@ -180,11 +166,7 @@ class FolderWriter:
         return shards_in(self.pictures)
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard, or write it anew.
-
-        Raises:
-            HandSimError: The format cannot hold these frames, or the disk takes no more.
-        """
+        """Write a shard, or write it anew."""
         with one_sentence(self.folder, f"writing shard {shard}"), self.new_shard(shard) as temporary:
             save_index(temporary, list(self._add_all(temporary, frames, shard_name(shard))))
 

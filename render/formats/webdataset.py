@@ -23,13 +23,10 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.hand.keypoints import KEYPOINT_DIGITS, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import HandShape
-from handsim.hand.topology import JOINTS, NUM_BONES, NUM_JOINTS
+from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import JOINTS, NUM_BONES, NUM_JOINTS, HandShape
 from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
 from render.formats.records import (
@@ -46,7 +43,7 @@ from render.formats.records import (
     to_order,
 )
 from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
-from render.frames import HandTruth, RenderedFrame
+from render.frames import Doubles, HandTruth, RenderedFrame
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset passes over such names."""
@@ -58,11 +55,7 @@ _ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bon
 
 
 def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them.
-
-    Args:
-        T_world_device: Pose of what the sample's cameras are fixed to.
-    """
+    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them."""
     K, lens = camera.K, camera.lens
     coefficients = list(lens.coefficients)
     if lens.kind == "brown":
@@ -89,11 +82,7 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
 
 
 def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
-    """`hands.json` of one time, a frame a stream: `left` and `right`, null for a hand that is not there.
-
-    Raises:
-        HandSimError: Two hands are of the same side.
-    """
+    """`hands.json` of one time, a frame a stream: `left` and `right`, null for a hand that is not there."""
     streams = [(frame.camera.name, by_side(frame)) for frame in frames]
     record: dict[str, Any] = {"left": None, "right": None}
     for side, hand in streams[0][1].items():
@@ -136,11 +125,7 @@ def markers_record(frame: RenderedFrame) -> dict[str, Any]:
         "labels": frame.labels,
         "label_names": frame.label_names,
         "hands": [
-            {
-                "side": hand.shape.side,
-                "marker_names": hand.marker_names,
-                "markers": rounded(hand.markers, 9),
-            }
+            {"side": hand.shape.side, "marker_names": hand.marker_names, "markers": rounded(hand.markers, 9)}
             for hand in frame.hands
         ],
     }
@@ -179,7 +164,7 @@ def _truth(hand: HandTruth) -> dict[str, Any]:
 
 def umetrack_wrist(T_world_wrist: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """`T_world_from_wrist` of a hand whose wrist is there."""
-    pose: NDArray[np.float64] = np.array(T_world_wrist, dtype=np.float64)
+    pose: Doubles = np.array(T_world_wrist, dtype=np.float64)
     pose[:3, :3] = pose[:3, :3] @ _UMETRACK_FROM_OURS.T
     return pose
 
@@ -241,11 +226,7 @@ class WebdatasetWriter:
         return shards_in(self.folder, suffix=TAR)
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard, or write it anew; frames of one number, from different cameras, follow one another.
-
-        Raises:
-            HandSimError: They do not, a frame has two hands of one side, or the disk takes no more.
-        """
+        """Write a shard, or write it anew; frames of one number follow one another."""
         persons: dict[str, HandShape] = {}
         numbers = set()
         path = self.folder / f"{shard_name(shard)}{TAR}"
@@ -298,9 +279,6 @@ def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     """`hand_crops.json` of one time: for each side the crop's camera in each stream that sees the hand.
 
     By stream: `T_world_from_crop_camera`, and `crop_camera_fov`, the full angle of view [rad].
-
-    Raises:
-        HandSimError: Two hands are of the same side.
     """
     record: dict[str, Any] = {"left": {}, "right": {}}
     for frame in frames:
@@ -340,12 +318,12 @@ def crop_camera(
     angle = 2.0 * float(np.arctan(reach))
     if angle > _WIDEST:
         return None
-    T_world_crop: NDArray[np.float64] = camera.T_world_camera.copy()
+    T_world_crop: Doubles = camera.T_world_camera.copy()
     T_world_crop[:3, :3] = T_world_crop[:3, :3] @ rotation
     return T_world_crop, angle
 
 
-def _looking_along(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _looking_along(axis: Doubles) -> Doubles:
     """Rotation whose z axis is this direction, and whose x axis is as level as the camera's."""
     z = axis / np.linalg.norm(axis)
     x = np.cross([0.0, 1.0, 0.0], z)

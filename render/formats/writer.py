@@ -68,22 +68,10 @@ class FrameWriter(Protocol):
         """Numbers of the shards that are complete."""
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard, or write it anew.
-
-        Args:
-            shard: Its number, from 0.
-            frames: What it shall hold; taken one at a time.
-
-        Raises:
-            HandSimError: The format cannot hold these frames, or the disk takes no more.
-        """
+        """Write a shard, or write it anew."""
 
     def finish(self) -> None:
-        """Merge all complete shards into the files that the format requires; may be called again.
-
-        Raises:
-            HandSimError: A shard is damaged, or the disk takes no more.
-        """
+        """Merge all complete shards into the files that the format requires; may be called again."""
 
 
 WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
@@ -106,11 +94,7 @@ def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
-    """The writer of one of `FORMATS`, into a folder that is made when it is not there.
-
-    Raises:
-        HandSimError: There is no such format.
-    """
+    """The writer of one of `FORMATS`, into a folder that is made when it is not there."""
     check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name](Path(folder))
 

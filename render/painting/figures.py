@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Float, Float32, Int, UInt8
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody
-from handsim.hand.keypoints import keypoint_thickness
-from handsim.hand.skin.surface import vertex_normals
-from render.frames import PARTS_A_HAND
+from handsim.hand.model import keypoint_thickness
+from handsim.hand.skin import vertex_normals
+from render.frames import PARTS_A_HAND, Doubles
 from render.painting.rasterizer import Triangles
 from render.skin.look import Forearm, SkinLook, sample_forearm, sample_skin_look
 from render.skin.mesh import PosableSkin
@@ -50,7 +49,7 @@ class Material:
     (0 for -1, 255 for 1) in the axes along u and normal x that, and nothing."""
 
 
-def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> NDArray[np.float64]:
+def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> Doubles:
     """Linear light of an sRGB color, with the plain 2.2 power that pyrender's shader undoes."""
     return np.asarray(color, dtype=np.float64) ** 2.2
 
@@ -95,13 +94,7 @@ class SphereSurface(NamedTuple):
 
 
 def sphere_surface(centers: Float[np.ndarray, "N 3"], radius: float, *, level: int) -> SphereSurface:
-    """Balls around these centers [m].
-
-    Args:
-        centers: Centers; none of them NaN.
-        radius: Of all of them [m].
-        level: How often an icosahedron is refined: 20 times 4 to this power triangles a ball.
-    """
+    """Balls around these centers [m]."""
     ball = _unit_ball(level)
     count, each = len(centers), len(ball.vertices)
     vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
@@ -146,23 +139,14 @@ class Drawn:
 def sample_people(
     count: int, glove: bool, *, tones: Sequence[float], rng: np.random.Generator
 ) -> tuple[Appearance, ...]:
-    """Hands of one person: both have the same skin and the same sleeves.
-
-    Args:
-        glove: Whether the hands wear marker gloves.
-        tones: Ranges of typology angles of the skin [deg]; see `render.skin.look.sample_skin_look`.
-    """
+    """Hands of one person: both have the same skin and the same sleeves."""
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
     cloth = sample_glove_look(rng=rng) if glove else None
     return (Appearance(skin, forearm, cloth),) * count
 
 
 class HandFigure:
-    """One hand to draw; its texture is painted once.
-
-    Args:
-        first_marker: Number of markers of the hands before it.
-    """
+    """One hand to draw; its texture is painted once."""
 
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
@@ -185,12 +169,7 @@ class HandFigure:
     def drawn(
         self, qpos: Float[np.ndarray, "27"], number: int, upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> list[Drawn]:
-        """Skin, and markers where a glove is worn.
-
-        Args:
-            number: Index of the hand among those in the picture.
-            upper_arm: Unit direction of its upper arm; see `PosableSkin.posed`.
-        """
+        """Skin, and markers where a glove is worn."""
         skin, first_part = self._skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
@@ -208,8 +187,7 @@ class HandFigure:
 
     def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Centers of the glove's markers in the world [m]."""
-        markers: NDArray[np.float64] = self.fit.markers(qpos[None])[0][0]
-        return markers
+        return np.asarray(self.fit.markers(qpos[None])[0][0])
 
     def _material(self) -> Material:
         if self._painted is None:
@@ -220,7 +198,7 @@ class HandFigure:
             self._painted = skin_material(texture)
         return self._painted
 
-    def _drawn_markers(self, qpos: NDArray[np.float64], number: int) -> Drawn:
+    def _drawn_markers(self, qpos: Doubles, number: int) -> Drawn:
         balls = sphere_surface(self.markers(qpos), self.fit.layout.radius, level=_BALL_LEVEL)
         each = len(balls.faces) // len(self._marker_bones)
         parts = (1 + PARTS_A_HAND * number + self._marker_bones).astype(np.uint8)
@@ -230,11 +208,7 @@ class HandFigure:
 
 
 class BodyFigure:
-    """One rigid body to draw.
-
-    Args:
-        color: Color of its surface, sRGB in [0, 1].
-    """
+    """One rigid body to draw."""
 
     def __init__(self, body: RigidBody, color: tuple[float, float, float]) -> None:
         self._thing = body.shape
@@ -244,11 +218,7 @@ class BodyFigure:
             self._normals = vertex_normals(self._thing.vertices, self._thing.faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
-        """Its surface, where that is known, and its markers.
-
-        Args:
-            instance: Number of the body among the instances of the picture.
-        """
+        """Its surface, where that is known, and its markers."""
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
         thing = self._thing
         if thing is not None:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from numpy.typing import NDArray
 
-from handsim._extras import EGL_PACKAGES
+from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
+from render.frames import Doubles
 
 if TYPE_CHECKING:
     from handsim.space.camera import Camera
@@ -146,11 +146,7 @@ _SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
-    """See `render.painting.painter.paint`.
-
-    Raises:
-        HandSimError: Drawing is impossible on this machine; the message says what to install.
-    """
+    """See `render.painting.painter.paint`."""
     pyrender = load_pyrender()
     renderer = offscreen_renderer(*camera.size)
     scene = pyrender.Scene(bg_color=[0.0, 0.0, 0.0, 0.0])
@@ -168,17 +164,12 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
     scene.add(lens, pose=camera.T_world_camera @ OPENGL_FROM_OPENCV)
     add_lights(pyrender, scene, lighting, camera.T_world_camera)
     flags = pyrender.RenderFlags
-    painted: NDArray[np.uint8] = renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0]
-    return painted
+    return np.asarray(renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0])
 
 
 @functools.lru_cache(maxsize=16)
 def pyrender_material(material: Material) -> Any:
-    """A material for pyrender; cached, so that textures are uploaded once.
-
-    Raises:
-        HandSimError: Drawing is impossible on this machine; the message says what to install.
-    """
+    """A material for pyrender; cached, so that textures are uploaded once."""
     pyrender, textures = load_pyrender(), {}
     if material.texels is not None:
         # No smaller copies of the texture: they would mix tiles that are no neighbors on the hand.
@@ -204,10 +195,7 @@ def pyrender_material(material: Material) -> Any:
 
 
 def add_lights(
-    pyrender: Any,
-    scene: Any,
-    lighting: Lighting,
-    T_world_camera: Float[np.ndarray, "4 4"],
+    pyrender: Any, scene: Any, lighting: Lighting, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> None:
     """Light a pyrender scene that holds its meshes already; its ambient light is replaced.
 
@@ -238,7 +226,7 @@ def _cast_shadows(pyrender: Any, light: Any, extent: float) -> None:
     )
 
 
-def frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def frame_with_z(direction: Doubles) -> Doubles:
     """Any rotation whose z axis is `direction`."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(np.eye(3)[np.abs(z).argmin()], z)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
+from render.frames import Bytes, Doubles, Floats, Integers
 from render.painting.figures import Drawn
 from render.painting.opengl import opengl_has_hardware, paint_opengl
 from render.painting.rasterizer import NEAR, nearest_faces, project
@@ -49,14 +50,14 @@ class _Mesh(NamedTuple):
 
     begin: int
     """Number of its first face among those of all surfaces."""
-    faces: NDArray[np.int64]
-    corners: NDArray[np.float64]
+    faces: Integers
+    corners: Doubles
     """Of `rasterizer.project` (V, 3) at twice the picture's size."""
-    rows: NDArray[np.float32]
+    rows: Floats
     """Position [m], normal, tint and texture coordinates of each vertex (V, 11)."""
     texels: NDArray[np.uint32]
     """Two words a texel (h, w, 2); empty where there is no texture."""
-    finish: NDArray[np.float64]
+    finish: Doubles
     """Color, roughness, glow and scatter."""
 
 
@@ -86,7 +87,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
 
 
 @kernel
-def _as_bytes(sums: NDArray[np.float32], covered: NDArray[np.int32], painted: NDArray[np.uint8]) -> None:
+def _as_bytes(sums: Floats, covered: NDArray[np.int32], painted: Bytes) -> None:
     """Write the bytes of covered pixels into a picture (P, 4), of their sums over four samples (N, 4)."""
     for place, pixel in enumerate(covered):
         for channel in range(4):
@@ -115,7 +116,7 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
 
 def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
     """Rows for `shading.shade`; lamps in one direction share a row."""
-    rows: dict[tuple[float, float, float], NDArray[np.float64]] = {}
+    rows: dict[tuple[float, float, float], Doubles] = {}
     for number, lamp in enumerate(lighting.lamps):
         towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
         row = rows.setdefault(lamp.direction, np.concatenate([towards, np.zeros(6)]))
@@ -142,23 +143,23 @@ def _covered(first: NDArray[np.int32]) -> Any:
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @kernel
 def _add_surface(
-    nearness: NDArray[np.float32],
+    nearness: Floats,
     first: NDArray[np.int32],
     covered: NDArray[np.int32],
     begin: int,
-    faces: NDArray[np.int64],
-    corners: NDArray[np.float64],
-    rows: NDArray[np.float32],
+    faces: Integers,
+    corners: Doubles,
+    rows: Floats,
     texels: NDArray[np.uint32],
-    finish: NDArray[np.float64],
-    to_linear: NDArray[np.float32],
-    lamps: NDArray[np.float64],
-    ambient: NDArray[np.float64],
-    to_map: NDArray[np.float64],
-    nearest: NDArray[np.float32],
+    finish: Doubles,
+    to_linear: Floats,
+    lamps: Doubles,
+    ambient: Doubles,
+    to_map: Doubles,
+    nearest: Floats,
     bias: float,
-    to_display: NDArray[np.float32],
-    sums: NDArray[np.float32],
+    to_display: Floats,
+    sums: Floats,
 ) -> None:
     """Add one surface's colors, and how many of four samples per pixel it fills.
 
@@ -216,9 +217,7 @@ def _add_surface(
 
 
 @kernel(inline=True)
-def _samples(
-    nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
-) -> Any:
+def _samples(nearness: Floats, first: NDArray[np.int32], begin: int, end: int, row: int, column: int) -> Any:
     """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths."""
     count, most, least = 0, 0.0, np.inf
     for i in range(2):
@@ -232,16 +231,16 @@ def _samples(
 
 @kernel(inline=True)
 def _write_spot(
-    corners: NDArray[np.float64],
-    rows: NDArray[np.float32],
+    corners: Doubles,
+    rows: Floats,
     a: int,
     b: int,
     c: int,
     x: float,
     y: float,
     texels: NDArray[np.uint32],
-    finish: NDArray[np.float64],
-    spots: NDArray[np.float32],
+    finish: Doubles,
+    spots: Floats,
     spot: int,
 ) -> None:
     """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
@@ -257,11 +256,7 @@ def _write_spot(
     first = max(whole - second - third, 0.0) * corners[a, 2]
     second, third = second * corners[b, 2], third * corners[c, 2]
     scale = 1.0 / (first + second + third)
-    first, second, third = (
-        np.float32(first * scale),
-        np.float32(second * scale),
-        np.float32(third * scale),
-    )
+    first, second, third = (np.float32(first * scale), np.float32(second * scale), np.float32(third * scale))
     px = first * rows[a, 0] + second * rows[b, 0] + third * rows[c, 0]
     py = first * rows[a, 1] + second * rows[b, 1] + third * rows[c, 1]
     pz = first * rows[a, 2] + second * rows[b, 2] + third * rows[c, 2]
@@ -290,11 +285,9 @@ _WHITE: Final = np.float32(255.0)
 _STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL reallocate its buffers
 
 
-def choose_painter(choice: PainterChoice) -> Painter:
-    """The painter itself; `auto` is OpenGL where it draws on hardware, and our own painter elsewhere."""
-    if choice == "auto":
-        return "opengl" if opengl_has_hardware() else "compiled"
-    return choice
+def choose_painter() -> Painter:
+    """OpenGL where it draws on hardware, and our own painter elsewhere."""
+    return "opengl" if opengl_has_hardware() else "compiled"
 
 
 def paint(
@@ -303,9 +296,6 @@ def paint(
     """Colors over black (sRGB) by a pinhole camera, and fourth the covered share of each pixel.
 
     Light is in the camera's axes; both painters give nearly the same picture.
-
-    Raises:
-        HandSimError: OpenGL is requested and missing on this machine; the message says what to install.
     """
     paint_colors = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
     width, height = camera.size
@@ -336,9 +326,7 @@ def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]
 
 
 @kernel
-def _widen(
-    local: NDArray[np.float64], K: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> None:
+def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
     """Widen a range (3,) of columns, rows [px] and depths [m] to points in the camera's axes (V, 3)."""
     for point in range(len(local)):
         depth = local[point, 2]
@@ -351,19 +339,14 @@ def _widen(
 def put_before(
     painted: UInt8[np.ndarray, "H W 4"], background: Float32[np.ndarray, "H W 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture of `paint` over a background.
-
-    Args:
-        painted: See `paint`.
-        background: sRGB from 0 to 255.
-    """
+    """A picture of `paint` over a background."""
     mixed = np.empty_like(background, dtype=np.uint8)
     _mix(painted.reshape(-1, 4), background.reshape(-1, 3), mixed.reshape(-1, 3))
     return mixed
 
 
 @kernel
-def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
+def _mix(painted: Bytes, background: Floats, mixed: Bytes) -> None:
     """Write painted colors with coverage (P, 4) over a background; see `put_before`."""
     behind, bare = background.reshape(-1), mixed.reshape(-1)
     for n in range(len(bare)):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
-from handsim.space.camera import Camera, camera_matrix
-from handsim.space.lens import Lens
-from render.frames import Pictures
+from handsim.space.camera import Camera, Lens, camera_matrix
+from render.frames import Bytes, Doubles, Flags, Floats, Integers
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -46,6 +45,32 @@ class Triangles:
     markers: UInt8[np.ndarray, "F"]
 
 
+class Geometry(NamedTuple):
+    """What a camera sees of surfaces; see `render.frames.Pictures`."""
+
+    depth: Float32[np.ndarray, "H W"]
+    normals: Float32[np.ndarray, "H W 3"] | None
+    parts: UInt8[np.ndarray, "H W"]
+    instances: UInt8[np.ndarray, "H W"]
+    markers: UInt8[np.ndarray, "H W"]
+
+
+def see(camera: Camera, surfaces: Sequence[Triangles], *, with_normals: bool) -> Geometry:
+    """Depth, normals and ids of surfaces through any lens."""
+    if not surfaces:
+        flat = np.zeros(camera.size[::-1], dtype=np.uint8)
+        return Geometry(flat.astype(np.float32), np.zeros((*flat.shape, 3), np.float32), flat, flat, flat)
+    whole = join(surfaces)
+    faces = [rasterize(face, whole, with_normals=with_normals) for face in faces_for(camera)]
+    depths, _, *ids = zip(*faces, strict=True)
+    normals = [face.normals for face in faces if face.normals is not None]
+    return Geometry(
+        warp_depth(camera, depths),
+        warp_normals(camera, normals) if with_normals else None,
+        *(warp(camera, pictures) for pictures in ids),
+    )
+
+
 def join(surfaces: Sequence[Triangles]) -> Triangles:
     """Several surfaces as one."""
     counts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
@@ -57,16 +82,11 @@ def join(surfaces: Sequence[Triangles]) -> Triangles:
     return Triangles(vertices, np.concatenate(faces), normals, parts, instances, markers)
 
 
-def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Pictures:
+def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Geometry:
     """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
 
     The surface is closed; the backs of its faces are not drawn.
-
-    Raises:
-        ArgumentError: The camera's lens is not a pinhole.
     """
-    if camera.lens.kind != "pinhole":
-        raise ArgumentError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', expected a pinhole")
     width, height = camera.size
     local = camera.local(surface.vertices)
     faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
@@ -80,7 +100,7 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     if normals is not None:
         local_normals = surface.normals @ camera.T_world_camera[:3, :3]
         _interpolate(faces, local_normals, corners, first, normals)
-    return Pictures(depth=depth, normals=normals, parts=parts, instances=instances, markers=markers)
+    return Geometry(depth, normals, parts, instances, markers)
 
 
 def nearest_faces(
@@ -93,11 +113,6 @@ def nearest_faces(
     """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
 
     Faces that run counter-clockwise in the picture, where y is down, are drawn.
-
-    Args:
-        corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
-            as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
-        farthest: Nearness of nothing.
     """
     nearness = np.full(size[::-1], farthest, dtype=np.float32)
     first = np.full(size[::-1], -1, dtype=np.int32)
@@ -106,7 +121,7 @@ def nearest_faces(
 
 
 @kernel
-def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
+def project(local: Doubles, K: Doubles) -> Any:
     """Pixels [px] and one over the depth [1/m] (V, 3) of points; NaN for those nearer than `NEAR`.
 
     Args:
@@ -134,12 +149,7 @@ def _where_positive(value: float, step: float, low: float, high: float) -> Any:
 
 
 @kernel
-def _draw(
-    corners: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    nearness: NDArray[np.float32],
-    first: NDArray[np.int32],
-) -> None:
+def _draw(corners: Doubles, faces: Integers, nearness: Floats, first: NDArray[np.int32]) -> None:
     """Draw faces into a z-buffer `nearness` with their numbers `first`, both (H, W); see `nearest_faces`."""
     height, width = nearness.shape
     for face in range(len(faces)):
@@ -184,13 +194,13 @@ def _draw(
 
 @kernel
 def _write(
-    inverse: NDArray[np.float32],
+    inverse: Floats,
     first: NDArray[np.int32],
-    labels: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    parts: NDArray[np.uint8],
-    instances: NDArray[np.uint8],
-    markers: NDArray[np.uint8],
+    labels: Bytes,
+    depth: Floats,
+    parts: Bytes,
+    instances: Bytes,
+    markers: Bytes,
 ) -> None:
     """Write depth [m] and ids of the nearest faces, -1 for none; `inverse` is one over the depth (H, W)."""
     height, width = first.shape
@@ -206,11 +216,7 @@ def _write(
 
 @kernel
 def _interpolate(
-    faces: NDArray[np.int64],
-    normals: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    first: NDArray[np.int32],
-    picture: NDArray[np.float32],
+    faces: Integers, normals: Doubles, corners: Doubles, first: NDArray[np.int32], picture: Floats
 ) -> None:
     """Write the unit normals behind the centers of all pixels with a face into `picture` (H, W, 3)."""
     height, width = first.shape
@@ -236,7 +242,6 @@ def _interpolate(
                 picture[row, column, i] *= scale
 
 
-Interpolation = Literal["nearest", "linear"]
 _MARGIN: Final = 2  # [px] around what is looked up
 _WIDEST: Final = 1.4  # tangent up to which one flat picture suffices: 54 degrees
 _ONE_SURFACE: Final = 0.01  # share of the depth by which neighboring pixels of one surface differ
@@ -258,7 +263,7 @@ class _Face:
     size: tuple[int, int]
     focal: float
     center: tuple[float, float]
-    rotation: NDArray[np.float64]
+    rotation: Doubles
     """Rotation (3, 3): the face's axes in the camera's."""
     part: tuple[slice, slice]
     """Rows and columns of the lens's picture that hold all of this face's pixels."""
@@ -274,9 +279,6 @@ def faces_for(camera: Camera) -> list[Camera]:
     """Pinhole cameras at the same position that together see what a camera sees.
 
     A pinhole camera is its only face.
-
-    Raises:
-        ArgumentError: The lens sees nothing, or its faces would be larger than pictures may be.
     """
     if camera.lens.kind == "pinhole":
         return [camera]
@@ -289,20 +291,16 @@ def faces_for(camera: Camera) -> list[Camera]:
     return cameras
 
 
-def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interpolation) -> NDArray[Any]:
+def warp(camera: Camera, pictures: Sequence[NDArray[Any]], flag: int = cv2.INTER_NEAREST) -> NDArray[Any]:
     """The picture through the lens, from one for each of `faces_for`; 0 where it sees nothing.
 
-    The interpolation is `linear` for colors, `nearest` for ids.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
+    The flag is OpenCV's way of interpolation.
     """
     if camera.lens.kind == "pinhole":
-        return pictures[0].copy()
+        return pictures[0]
     width, height = camera.size
     whole = np.zeros((height, width, *pictures[0].shape[2:]), pictures[0].dtype)
-    flag = cv2.INTER_LINEAR if interpolation == "linear" else cv2.INTER_NEAREST
-    for face, picture in _matched(camera, pictures):
+    for face, picture in zip(_faces(camera), pictures, strict=True):
         _fill(whole, face, _resampled(picture, face, flag))
     return whole
 
@@ -312,14 +310,11 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 
     Between pixels of one surface the reciprocal is interpolated, which is exact for planes; at edges the
     nearest pixel counts. What is not ahead of the camera (a fisheye may see it) has depth 0.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
     """
     if camera.lens.kind == "pinhole":
-        return depths[0].copy()
+        return depths[0]
     whole = np.zeros(camera.size[::-1], np.float32)
-    for face, depth in _matched(camera, depths):
+    for face, depth in zip(_faces(camera), depths, strict=True):
         with np.errstate(divide="ignore"):
             reciprocal = np.where(depth > 0.0, np.float32(1.0) / depth, np.float32(0.0))
         nearest = _resampled(reciprocal, face, cv2.INTER_NEAREST)
@@ -334,33 +329,18 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 def warp_normals(
     camera: Camera, normals: Sequence[Float32[np.ndarray, "h w 3"]]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Normals in the camera's axes from those of its faces in theirs, of the nearest pixels; 0 for nothing.
-
-    Raises:
-        ArgumentError: The pictures are not those of the camera's faces.
-    """
+    """Normals in the camera's axes from those of its faces in theirs; 0 where there is nothing."""
     if camera.lens.kind == "pinhole":
-        return normals[0].copy()
+        return normals[0]
     whole = np.zeros((*camera.size[::-1], 3), np.float32)
-    for face, picture in _matched(camera, normals):
+    for face, picture in zip(_faces(camera), normals, strict=True):
         resampled = _resampled(picture, face, cv2.INTER_NEAREST)
         _fill(whole, face, cv2.transform(resampled, face.rotation))
     return whole
 
 
-def _matched(camera: Camera, pictures: Sequence[NDArray[Any]]) -> list[tuple[_Face, NDArray[Any]]]:
-    faces = _faces(camera)
-    expected, given = [face.size[::-1] for face in faces], [picture.shape[:2] for picture in pictures]
-    if expected != given:
-        raise ArgumentError(
-            f"pictures of {given} rows and columns, expected camera '{camera.name}' faces': {expected}"
-        )
-    return list(zip(faces, pictures, strict=True))
-
-
 def _resampled(picture: NDArray[Any], face: _Face, flag: int) -> NDArray[Any]:
-    resampled: NDArray[Any] = cv2.remap(picture, face.pixels, None, flag, borderMode=cv2.BORDER_REPLICATE)
-    return resampled
+    return np.asarray(cv2.remap(picture, face.pixels, None, flag, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _fill(whole: NDArray[Any], face: _Face, part: NDArray[Any]) -> None:
@@ -375,8 +355,7 @@ def _faces(camera: Camera) -> tuple[_Face, ...]:
         largest = max((face.size for face in faces), default=(0, 0))
         raise ArgumentError(
             f"camera '{camera.name}' needs flat pictures of up to {largest[0]} x {largest[1]} pixels, "
-            "expected "
-            "1 to 8192 each way: its lens sees nothing, or too much of a plane"
+            "expected 1 to 8192 each way: its lens sees nothing, or too much of a plane"
         )
     return faces
 
@@ -402,7 +381,7 @@ def _faces_of_lens(
     return tuple(face for face in faces if face is not None)
 
 
-def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], rotation: NDArray[np.float64]) -> _Face | None:
+def _face(rays: Doubles, mine: Flags, rotation: Doubles) -> _Face | None:
     """The face that has some of a picture's pixels."""
     rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
     if not len(rows):
@@ -429,7 +408,7 @@ def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], rotation: NDArray[
     )
 
 
-def _finest(local: NDArray[np.float64], mine: NDArray[np.bool_]) -> float:
+def _finest(local: Doubles, mine: Flags) -> float:
     """Focal length [px] at which no step between the lens's pixels is less than a pixel of the face."""
     near = local[..., 2] > 0.2  # a face's own pixels are, and their neighbors
     flat = np.full_like(local[..., :2], np.nan)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
+from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, nearest_faces, project
 from render.scenery.backgrounds import Backdrop
@@ -51,13 +52,7 @@ def shadow_map(
     towards: Float[np.ndarray, "3"],
     seen: Bool[np.ndarray, "V"],
 ) -> ShadowMap:
-    """The shadows on a surface.
-
-    Args:
-        points: Vertices [m], in any frame.
-        towards: Unit vector to the lamp, in the same frame.
-        seen: Around which of the vertices shadows are needed; all when none is.
-    """
+    """The shadows on a surface."""
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
@@ -67,7 +62,7 @@ def shadow_map(
 
 
 @kernel
-def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: NDArray[np.bool_]) -> Any:
+def _onto_map(points: Floats, rotation: Doubles, seen: Flags) -> Any:
     """Points in a map that has room for those seen (V, 3), `ShadowMap.to_map`, and its texels a meter."""
     corners = np.empty((len(points), 3))
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -90,9 +85,7 @@ def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: 
 
 
 @kernel
-def lit_share(
-    to_map: NDArray[np.float64], nearest: NDArray[np.float32], bias: float, x: float, y: float, z: float
-) -> float:
+def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float, z: float) -> float:
     """Visible share of the lamp at (x, y, z) [m]: the mean over a square of three texels around it.
 
     The map is that of a `ShadowMap`, by its fields.
@@ -147,20 +140,19 @@ def light_behind(
     mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
     light = 1.0 - np.float32(_SHADED * _key_share(lighting, normal)) * mask
     whole = cv2.resize(light, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
-    shown: NDArray[np.float32] = whole[: camera.size[1], : camera.size[0]]
-    return shown
+    return np.asarray(whole[: camera.size[1], : camera.size[0]])
 
 
 @kernel
 def _fall(
-    points: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    towards: NDArray[np.float64],
+    points: Doubles,
+    normal: Doubles,
+    towards: Doubles,
     gap: float,
-    K: NDArray[np.float64],
-    size: NDArray[np.float64],
-    fallen: NDArray[np.float64],
-    distance: NDArray[np.float64],
+    K: Doubles,
+    size: Doubles,
+    fallen: Doubles,
+    distance: Doubles,
 ) -> None:
     """Write where the shadows of points (V, 3) [m] fall on a backdrop, placed by those in the picture.
 
@@ -195,7 +187,7 @@ def _fall(
         distance /= count
 
 
-def _key_share(lighting: Lighting, normal: NDArray[np.float64]) -> float:
+def _key_share(lighting: Lighting, normal: Doubles) -> float:
     """Share of the first lamp in the light that falls on a plane."""
     falls = []
     for lamp in lighting.lamps:
@@ -239,7 +231,7 @@ POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 
 
 
 @kernel
-def display(light: NDArray[np.float32], tint: NDArray[np.float32], table: NDArray[np.float32]) -> None:
+def display(light: Floats, tint: Floats, table: Floats) -> None:
     """Turn linear light (N,) of this tint (N,) into display values in [0, 1]; `table` is `TO_DISPLAY`."""
     for n in range(len(light)):
         value = tint[n] * light[n]
@@ -251,12 +243,7 @@ def display(light: NDArray[np.float32], tint: NDArray[np.float32], table: NDArra
 
 
 @kernel
-def _read_texels(
-    spots: NDArray[np.float32],
-    texels: NDArray[np.uint32],
-    finish: NDArray[np.float64],
-    table: NDArray[np.float32],
-) -> None:
+def _read_texels(spots: Floats, texels: NDArray[np.uint32], finish: Doubles, table: Floats) -> None:
     """Write color, roughness and relief of surface points, bilinear between texels; see `shade`."""
     rows, columns = texels.shape[:2]
     flat, count = texels.reshape(-1), spots.shape[1]
@@ -294,11 +281,7 @@ def _read_texels(
 
 @kernel
 def _mix_bytes(
-    near: NDArray[np.uint32],
-    bits: np.uint32,
-    right: NDArray[np.float32],
-    below: NDArray[np.float32],
-    mixed: NDArray[np.float32],
+    near: NDArray[np.uint32], bits: np.uint32, right: Floats, below: Floats, mixed: Floats
 ) -> None:
     """Write the means (N,) of one byte of four texels (4, N), left and right of above and below."""
     a, b, c, d = near[0], near[1], near[2], near[3]
@@ -313,14 +296,14 @@ def _mix_bytes(
 
 @kernel
 def shade(
-    spots: NDArray[np.float32],
+    spots: Floats,
     texels: NDArray[np.uint32],
-    finish: NDArray[np.float64],
-    table: NDArray[np.float32],
-    lamps: NDArray[np.float64],
-    ambient: NDArray[np.float64],
-    to_map: NDArray[np.float64],
-    nearest: NDArray[np.float32],
+    finish: Doubles,
+    table: Floats,
+    lamps: Doubles,
+    ambient: Doubles,
+    to_map: Doubles,
+    nearest: Floats,
     bias: float,
 ) -> Any:
     """Linear light (3, N) that surface points send to the camera in the origin.
@@ -375,7 +358,7 @@ def shade(
 
 
 @kernel
-def _dot(first: NDArray[np.float32], second: NDArray[np.float32], product: NDArray[np.float32]) -> None:
+def _dot(first: Floats, second: Floats, product: Floats) -> None:
     """Write the scalar products (N,) of vectors (3, N)."""
     x, y, z, u, v, w = first[0], first[1], first[2], second[0], second[1], second[2]
     for n in range(len(product)):
@@ -383,9 +366,7 @@ def _dot(first: NDArray[np.float32], second: NDArray[np.float32], product: NDArr
 
 
 @kernel
-def _add_scaled(
-    target: NDArray[np.float32], vectors: NDArray[np.float32], factor: NDArray[np.float32]
-) -> None:
+def _add_scaled(target: Floats, vectors: Floats, factor: Floats) -> None:
     """Add vectors (3, N) times factors (N,) to others (3, N)."""
     for i in range(3):
         row, other = target[i], vectors[i]
@@ -394,7 +375,7 @@ def _add_scaled(
 
 
 @kernel
-def _normalize(vectors: NDArray[np.float32]) -> None:
+def _normalize(vectors: Floats) -> None:
     """Scale vectors (3, N) to unit length; what has no length stays."""
     length = np.empty_like(vectors[0])
     _dot(vectors, vectors, length)
@@ -407,9 +388,7 @@ def _normalize(vectors: NDArray[np.float32]) -> None:
 
 
 @kernel
-def _map_normals(
-    normals: NDArray[np.float32], tangents: NDArray[np.float32], bumps: NDArray[np.float32]
-) -> None:
+def _map_normals(normals: Floats, tangents: Floats, bumps: Floats) -> None:
     """Replace unit normals (3, N) by those of a relief.
 
     Tangents are any vectors on the side of the way in which u grows, and are made unit tangents; bumps are
@@ -442,13 +421,7 @@ def _map_normals(
 
 
 @kernel
-def _add_ambient(
-    spots: NDArray[np.float32],
-    around: NDArray[np.float32],
-    glow: np.float32,
-    i: int,
-    light: NDArray[np.float32],
-) -> None:
+def _add_ambient(spots: Floats, around: Floats, glow: np.float32, i: int, light: Floats) -> None:
     """Write what one color of light from everywhere (9,) and a glow give to surface points (N,)."""
     x, y, z, color = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2], spots[COLOR + i]
     a, b, c, d, e = around[0], around[1], around[2], around[3], around[4]
@@ -462,13 +435,13 @@ def _add_ambient(
 
 @kernel
 def _reflect(
-    spots: NDArray[np.float32],
+    spots: Floats,
     x: np.float32,
     y: np.float32,
     z: np.float32,
-    cosine: NDArray[np.float32],
-    fresnel: NDArray[np.float32],
-    mirrored: NDArray[np.float32],
+    cosine: Floats,
+    fresnel: Floats,
+    mirrored: Floats,
 ) -> None:
     """Write how surface points reflect a lamp at (x, y, z): cosine, Schlick's term and mirrored share."""
     nx, ny, nz = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2]
@@ -503,14 +476,14 @@ def _reflect(
 
 @kernel
 def _cast_shadows(
-    spots: NDArray[np.float32],
-    lamp: NDArray[np.float64],
+    spots: Floats,
+    lamp: Doubles,
     scatter: float,
-    cosine: NDArray[np.float32],
-    to_map: NDArray[np.float64],
-    nearest: NDArray[np.float32],
+    cosine: Floats,
+    to_map: Doubles,
+    nearest: Floats,
     bias: float,
-    lit: NDArray[np.float32],
+    lit: Floats,
 ) -> None:
     """Write the share (N,) of the first lamp that surface points see.
 
@@ -530,15 +503,15 @@ def _cast_shadows(
 
 @kernel
 def _add_lamp(
-    color: NDArray[np.float32],
+    color: Floats,
     scatter: np.float32,
     hard: np.float32,
     soft: np.float32,
-    cosine: NDArray[np.float32],
-    fresnel: NDArray[np.float32],
-    mirrored: NDArray[np.float32],
-    lit: NDArray[np.float32],
-    light: NDArray[np.float32],
+    cosine: Floats,
+    fresnel: Floats,
+    mirrored: Floats,
+    lit: Floats,
+    light: Floats,
 ) -> None:
     """Add one color of a lamp's light to `light` (N,).
 

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -25,13 +25,15 @@ from PIL import Image
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular
-from handsim.files.names import plain_path
+from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
-from render.frames import Pictures
+from render.frames import Bytes, Doubles, Floats
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
+
+if TYPE_CHECKING:
+    from render.painting.rasterizer import Geometry
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
@@ -79,7 +81,7 @@ def _no_photo(folder: Path) -> HandSimError:
     return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
 
 
-def _read(file: Path) -> NDArray[np.uint8] | None:
+def _read(file: Path) -> Bytes | None:
     try:
         check_regular(file, error=HandSimError)
         if _num_pixels(file) > _MOST_PIXELS:
@@ -107,7 +109,7 @@ def _num_pixels(file: Path) -> int:
         raise HandSimError(f"{file}: not a readable photograph") from error
 
 
-def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
+def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> Floats:
     """A random part of a photograph in the picture's proportions, which fills it: half of it or more."""
     photo = _read(file)
     if photo is None:
@@ -121,8 +123,7 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> N
     scaled = cv2.resize(
         np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     )
-    light: NDArray[np.float32] = (scaled.astype(np.float32) / 255.0) ** _GAMMA
-    return light
+    return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
 
 
 SHARE: Final = 0.6
@@ -217,11 +218,7 @@ class Background:
 
 
 def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:
-    """A random background.
-
-    Raises:
-        HandSimError: Photographs are requested, and the folder holds none that can be read.
-    """
+    """A random background."""
     shares = np.array(list(config.shares.values()))
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
     first, second = _color(rng), _color(rng)
@@ -232,11 +229,7 @@ def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Backg
 
 
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """The picture in linear light, 1 for full white.
-
-    Raises:
-        HandSimError: The kind is unknown, or the photograph cannot be read.
-    """
+    """The picture in linear light, 1 for full white."""
     return enlarged(_coarse(background, size), size)
 
 
@@ -244,7 +237,7 @@ def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Fl
     """A picture of `kept_background`, or values that grow with it from 0 on, at its whole size."""
     if picture.shape[1::-1] == size:
         return picture
-    whole: NDArray[np.float32] = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+    whole: Floats = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     return np.clip(whole, 0.0, picture.max(), out=whole)
 
 
@@ -256,7 +249,7 @@ def kept_background(background: Background, size: tuple[int, int]) -> Float32[np
     return picture
 
 
-def _coarse(background: Background, size: tuple[int, int]) -> NDArray[np.float32]:
+def _coarse(background: Background, size: tuple[int, int]) -> Floats:
     """The picture of `draw_background`, at half of its size where that shows as well."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
@@ -279,8 +272,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> NDArray[np.float32
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0, dtype=np.float32)
-    return drawn
+    return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -290,21 +282,18 @@ def _color(rng: np.random.Generator) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-def _gradient(
-    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     x = np.linspace(-1.0, 1.0, size[0], dtype=np.float32) * np.float32(np.cos(angle))
     y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(angle))
     share = (x[None, :] + y[:, None])[..., None]
     share = 0.5 + 0.5 * share / np.abs(share).max()
-    blend: NDArray[np.float32] = first + share * (second - first)
-    return blend
+    return np.asarray(first + share * (second - first))
 
 
 def _octaves(
     size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator, cells: int = 3
-) -> NDArray[np.float32]:
+) -> Floats:
     """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1.
 
     The largest is the picture's height over `cells`.
@@ -319,13 +308,11 @@ def _octaves(
         squares += strength**2
         cells, strength = 2 * cells, fall * strength
     total *= np.float32(1.0 / np.sqrt(squares))
-    whole: NDArray[np.float32] = cv2.resize(total, size, interpolation=cv2.INTER_CUBIC)
+    whole: Floats = cv2.resize(total, size, interpolation=cv2.INTER_CUBIC)
     return whole.reshape(height, width, channels)
 
 
-def _noise(
-    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _noise(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
     """Stone, carpet, cloth or wood: grain of one scale and finer, often longer one way than the other."""
     cells = int(np.exp(rng.uniform(*np.log(_GRAINS))))
     longer = float(rng.choice([1.0, rng.uniform(2.0, 8.0)]))
@@ -336,13 +323,10 @@ def _noise(
     grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
     share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
     color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
-    mixed: NDArray[np.float32] = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
-    return mixed
+    return np.asarray((first + np.clip(share, 0.0, 1.0) * (second - first)) * color)
 
 
-def _clutter(
-    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _clutter(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
     """Objects on a table: boxes, tins and cloths of all colors in a heap, each with its own light."""
     picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
     height = size[1]
@@ -367,13 +351,7 @@ def _clutter(
     return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
 
 
-def _paint_object(
-    picture: NDArray[np.float32],
-    outline: NDArray[Any],
-    color: NDArray[np.float32],
-    *,
-    shadow: bool = True,
-) -> None:
+def _paint_object(picture: Floats, outline: NDArray[Any], color: Floats, *, shadow: bool = True) -> None:
     """Paint an object over a picture, with its shadow to the right and below."""
     height, width = picture.shape[:2]
     offset = 0.02 * height
@@ -392,12 +370,7 @@ def _paint_object(
 
 
 @kernel
-def _lay_over(
-    part: NDArray[np.float32],
-    covered: NDArray[np.uint8],
-    shadow: NDArray[np.uint8],
-    color: NDArray[np.float32],
-) -> None:
+def _lay_over(part: Floats, covered: Bytes, shadow: Bytes, color: Floats) -> None:
     """Lay a linear color over a part (h, w, 3) of a picture; 255 covers it, or takes half its light."""
     for row in range(part.shape[0]):
         for column in range(part.shape[1]):
@@ -440,31 +413,18 @@ class Surroundings:
     signs: Int8[np.ndarray, "H W"]
     """Whether it points along that axis (1) or against it (-1)."""
 
-    def put_behind(self, pictures: Pictures, camera: Camera) -> Pictures:
-        """Pictures of hands and objects with depth and normals behind them, too.
-
-        Args:
-            pictures: Depth, normals if any, and instances.
-            camera: The camera of both.
-        """
-        assert pictures.depth is not None and pictures.instances is not None
+    def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
+        """Pictures of hands and objects with depth and normals behind them, too."""
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
             normals = normals.copy()
             normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
-        return dataclasses.replace(
-            pictures, depth=np.where(bare, self.depth, pictures.depth), normals=normals
-        )
+        return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
 
 
 def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
-    """A random box around cameras and hands.
-
-    Args:
-        positions: Where they are [m].
-        seed: Seed of the distances of the walls.
-    """
+    """A random box around cameras and hands."""
     below, above = np.random.default_rng([seed, 0]).uniform(*_MARGIN, (2, 3))
     low, high = positions.min(axis=0), positions.max(axis=0)
     return Enclosure(
@@ -472,17 +432,13 @@ def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
     )
 
 
-def _corner(point: NDArray[np.float64]) -> Corner:
+def _corner(point: Doubles) -> Corner:
     x, y, z = point.tolist()
     return x, y, z
 
 
 def draw_surroundings(background: Background, enclosure: Enclosure, camera: Camera) -> Surroundings:
-    """What a camera inside the box, with any lens, sees of it; what stands still is drawn once.
-
-    Raises:
-        HandSimError: The photograph cannot be read.
-    """
+    """What a camera inside the box, with any lens, sees of it; what stands still is drawn once."""
     focal = tuple(camera.K.ravel().tolist())
     lens = camera.lens
     return _drawn(background, enclosure, camera.size, focal, lens, camera.T_world_camera.tobytes())
@@ -538,12 +494,7 @@ def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.n
     return np.concatenate(pictures)
 
 
-def _meet_walls(
-    rays: NDArray[np.float64],
-    eye: NDArray[np.float64],
-    room: NDArray[np.float64],
-    pictures: NDArray[np.float32],
-) -> RoomLight:
+def _meet_walls(rays: Doubles, eye: Doubles, room: Doubles, pictures: Floats) -> RoomLight:
     """Where rays (N, 3) from the eye (3,) meet the walls of an empty room (3,), and the pictures there."""
     far = rays > 0.0
     ways = (np.where(far, room, 0.0) - eye) / rays

@@ -14,9 +14,9 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
+from render.frames import Doubles, Integers
 from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
 from render.skin.look import SkinLook
 
@@ -46,11 +46,7 @@ class Lamp:
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """All light of one picture.
-
-    Raises:
-        HandSimError: There are more than five lamps, or the surroundings do not have nine rows.
-    """
+    """All light of one picture."""
 
     lamps: tuple[Lamp, ...]
     """The first casts shadows."""
@@ -117,24 +113,17 @@ def _tint(warmth: float, rng: np.random.Generator) -> tuple[float, float, float]
     return _triple(np.exp([warmth, green, -1.2 * warmth]))
 
 
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def _triple(values: Doubles) -> tuple[float, float, float]:
     first, second, third = values
     return float(first), float(second), float(third)
 
 
 def sample_surroundings(
-    config: Backgrounds,
-    skin: SkinLook | None,
-    size: tuple[int, int] = _SIZE,
-    *,
-    rng: np.random.Generator,
+    config: Backgrounds, skin: SkinLook | None, size: tuple[int, int] = _SIZE, *, rng: np.random.Generator
 ) -> tuple[Background, Lighting]:
     """A random background, and random lamps in the light that it gives.
 
     The picture is exposed for this skin, or for gloves; of a known size [px] the background is painted once.
-
-    Raises:
-        HandSimError: There is no photograph that can be read.
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
     picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
@@ -157,12 +146,7 @@ def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
 
 
 def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: float) -> Lighting:
-    """Give light from everywhere the colors of a picture; how much there is of it stays.
-
-    Args:
-        picture: Linear light, taken for all that is before the hand, and mirrored for what is behind.
-        share: How much of the light from everywhere comes from the picture.
-    """
+    """Give light from everywhere the colors of a picture; how much there is of it stays."""
     ambient = np.array(lighting.ambient)
     rows = irradiance(picture)
     rows *= share * (ambient @ _LUMINANCE) / max(float(rows[0] @ _LUMINANCE), 1e-4)
@@ -175,9 +159,6 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
     """What a white matt surface sends back in a picture's light, by its normal in the camera's axes.
 
     Rows are the factors of 1, x, y, z, xy, yz, xz, x^2 - y^2 and 3 z^2 - 1.
-
-    Args:
-        picture: Linear light; its middle is straight ahead, its borders are at right angles to that.
     """
     height, width = picture.shape[:2]
     pixels, functions = _looked_up(width, height)
@@ -187,7 +168,7 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
 
 
 @functools.lru_cache(maxsize=4)
-def _looked_up(width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _looked_up(width: int, height: int) -> tuple[Integers, Doubles]:
     """Pixel of a picture in each direction (D,), and the nine functions there (D, 9)."""
     directions, functions = _sphere()
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
@@ -198,7 +179,7 @@ def _looked_up(width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.f
 
 
 @functools.cache
-def _sphere() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sphere() -> tuple[Doubles, Doubles]:
     """Directions (D, 3) all around, evenly, and the nine functions there (D, 9)."""
     number = np.arange(_DIRECTIONS)
     z = 1.0 - (2.0 * number + 1.0) / _DIRECTIONS

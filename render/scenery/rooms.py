@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from render.fields import normal_numbers
+from render.frames import Doubles, Flags, Floats, Integers
 
 _FURNITURE: Final = (4, 14)
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
@@ -29,14 +30,14 @@ _FRAME: Final = 0.06  # of a picture or window, as a share of its sides
 class _Walls(NamedTuple):
     """What is painted on the six sides: from the room's origin and from its far corner, for x, y and z."""
 
-    patterns: NDArray[np.int64]
-    pitches: NDArray[np.float64]
+    patterns: Integers
+    pitches: Doubles
     """Of stripes, tiles and boards (6,) [m]."""
-    colors: NDArray[np.float64]
+    colors: Doubles
     """Two of each (6, 2, 3), linear."""
-    boards: NDArray[np.float64]
+    boards: Doubles
     """Tones of boards (512,)."""
-    frames: NDArray[np.float64]
+    frames: Doubles
     """Pictures and windows (6, 3, 11): left, low, width, height, colors of frame and glass, slope; width 0:
     none."""
 
@@ -55,13 +56,13 @@ class RoomLight(NamedTuple):
 class _Boxes(NamedTuple):
     """Furniture: B boxes."""
 
-    corners: NDArray[np.float64]
+    corners: Doubles
     """Low and high (B, 2, 3) [m]."""
-    colors: NDArray[np.float64]
+    colors: Doubles
     """Linear (B, 2, 3)."""
-    bands: NDArray[np.float64]
+    bands: Doubles
     """How many drawers or shelves, and what share of each has the second color (B, 2)."""
-    shades: NDArray[np.float64]
+    shades: Doubles
     """Of the faces along x, y and z (B, 3)."""
 
 
@@ -76,13 +77,10 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
-    drawn: NDArray[np.float32] = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
-    return drawn
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # rays have no width, pixels have
 
 
-def _seen(
-    scene: _Scene, size: tuple[int, int], across: NDArray[np.float32], down: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _seen(scene: _Scene, size: tuple[int, int], across: Floats, down: Floats) -> Floats:
     """Light (N, 3) at places (N,) [px] of a picture."""
     width, height = size
     rays = np.empty((len(across), 3), dtype=np.float32)
@@ -92,13 +90,7 @@ def _seen(
 
 @kernel
 def _aim(
-    across: NDArray[np.float32],
-    down: NDArray[np.float32],
-    middle: float,
-    center: float,
-    focal: float,
-    axes: NDArray[np.float64],
-    rays: NDArray[np.float32],
+    across: Floats, down: Floats, middle: float, center: float, focal: float, axes: Doubles, rays: Floats
 ) -> None:
     """Write the directions (N, 3) in which a camera sees places of its picture, no component 0.
 
@@ -119,7 +111,7 @@ def _aim(
             rays[n, axis] = way if abs(way) > 1e-6 else 1e-6
 
 
-def _edges(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _edges(picture: Floats) -> Flags:
     """Where (H W,) a picture differs from its neighbors to the right or below, on both sides of that."""
     roots = np.sqrt(picture @ _WEIGHTS)
     edges = np.zeros(roots.shape, dtype=bool)
@@ -135,14 +127,14 @@ def _edges(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
 class _Scene(NamedTuple):
     """A room and who looks into it."""
 
-    room: NDArray[np.float64]
+    room: Doubles
     """Far corner [m]; the other one is at the origin, z up."""
-    eye: NDArray[np.float64]
+    eye: Doubles
     focal: float
     """Focal length [picture heights]."""
-    axes: NDArray[np.float64]
+    axes: Doubles
     """The camera's axes (3, 3), a row each: right, down, ahead."""
-    lamp: NDArray[np.float64]
+    lamp: Doubles
     """Lamps and windows leave some parts darker than others."""
     strength: float
     walls: _Walls
@@ -170,14 +162,7 @@ def cast_room(
     *,
     rng: np.random.Generator,
 ) -> RoomLight:
-    """A random room of a given size, seen from a position; an equal rng gives the same from another.
-
-    Args:
-        rays: Unit directions in the room's axes, z up, no component 0.
-        eye: Where they begin [m], the room's low corner at the origin.
-        room: The room's far corner [m].
-        free: Low and high corner of a box without furniture [m].
-    """
+    """A random room of a given size, seen from a position; an equal rng gives the same from another."""
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)
     outside = (boxes.corners[:, 1] < free[0]) | (boxes.corners[:, 0] > free[1])
@@ -186,13 +171,7 @@ def cast_room(
 
 
 def _cast_all(
-    rays: NDArray[np.float32],
-    eye: NDArray[np.float64],
-    room: NDArray[np.float64],
-    walls: _Walls,
-    boxes: _Boxes,
-    lamp: NDArray[np.float64],
-    strength: float,
+    rays: Floats, eye: Doubles, room: Doubles, walls: _Walls, boxes: _Boxes, lamp: Doubles, strength: float
 ) -> RoomLight:
     count = len(rays)
     seen = RoomLight(
@@ -204,7 +183,7 @@ def _cast_all(
     return seen
 
 
-def _turned(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
+def _turned(yaw: float, pitch: float, roll: float) -> Doubles:
     """Axes (3, 3), a row each, of a camera that looks into the room, a little up or down and askew [rad]."""
     (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
     aside, upright = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -213,7 +192,7 @@ def _turned(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
     return np.stack([cr * aside + sr * down, cr * down - sr * aside, ahead])
 
 
-def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
+def _paint_walls(room: Doubles, rng: np.random.Generator) -> _Walls:
     frames = np.zeros((6, 3, 11))
     for wall in range(4):  # not on floor and ceiling
         across = room[1 - wall // 2]
@@ -228,16 +207,10 @@ def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
     patterns[_FLOOR:] = rng.choice([_TILES, _BOARDS, _PLAIN], p=_FLOORS), _PLAIN
     colors = _paint(rng, 12).reshape(6, 2, 3)
     colors[:, 1] = colors[:, 0] + rng.uniform(*_CONTRAST, (6, 1)) * (colors[:, 1] - colors[:, 0])
-    return _Walls(
-        patterns,
-        rng.uniform(0.06, 0.5, 6),
-        colors,
-        rng.uniform(0.0, 0.5, 512),
-        frames,
-    )
+    return _Walls(patterns, rng.uniform(0.06, 0.5, 6), colors, rng.uniform(0.0, 0.5, 512), frames)
 
 
-def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.random.Generator) -> _Boxes:
+def _place_boxes(room: Doubles, eye: Doubles, rng: np.random.Generator) -> _Boxes:
     """Furniture that stands on the floor, or hangs on or stands by a wall."""
     count = int(rng.integers(*_FURNITURE))
     extents = rng.uniform((0.2, 0.2, 0.1), (1.6, 1.0, 1.9), (count, 3)) * rng.uniform(0.4, 1.0, (count, 1))
@@ -255,22 +228,22 @@ def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.ra
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
 @kernel
 def _cast(
-    rays: NDArray[np.float32],
-    eye: NDArray[np.float64],
-    room: NDArray[np.float64],
-    patterns: NDArray[np.int64],
-    pitches: NDArray[np.float64],
-    colors: NDArray[np.float64],
-    boards: NDArray[np.float64],
-    frames: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    box_colors: NDArray[np.float64],
-    bands: NDArray[np.float64],
-    shades: NDArray[np.float64],
-    lamp: NDArray[np.float64],
+    rays: Floats,
+    eye: Doubles,
+    room: Doubles,
+    patterns: Integers,
+    pitches: Doubles,
+    colors: Doubles,
+    boards: Doubles,
+    frames: Doubles,
+    corners: Doubles,
+    box_colors: Doubles,
+    bands: Doubles,
+    shades: Doubles,
+    lamp: Doubles,
     strength: float,
-    picture: NDArray[np.float32],
-    distances: NDArray[np.float32],
+    picture: Floats,
+    distances: Floats,
     axes: NDArray[np.int8],
 ) -> None:
     """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
@@ -305,7 +278,7 @@ def _cast(
 
 
 @kernel
-def _cones(offsets: NDArray[np.float64]) -> Any:
+def _cones(offsets: Doubles) -> Any:
     """Cones around boxes (B, 4): unit direction of the axis, and the cosine of half the angle."""
     cones = np.empty((len(offsets), 4))
     for box in range(len(offsets)):
@@ -324,13 +297,7 @@ def _cones(offsets: NDArray[np.float64]) -> Any:
 
 
 @kernel
-def _nearest_box(
-    ray: NDArray[np.float32],
-    inverse: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    cones: NDArray[np.float64],
-    distance: float,
-) -> Any:
+def _nearest_box(ray: Floats, inverse: Doubles, offsets: Doubles, cones: Doubles, distance: float) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none."""
     nearest, face = -1, 0
     for box in range(len(offsets)):
@@ -349,14 +316,14 @@ def _nearest_box(
 
 @kernel
 def _wall_color(
-    position: NDArray[np.float64],
+    position: Doubles,
     wall: int,
-    patterns: NDArray[np.int64],
-    pitches: NDArray[np.float64],
-    colors: NDArray[np.float64],
-    boards: NDArray[np.float64],
-    frames: NDArray[np.float64],
-    color: NDArray[np.float64],
+    patterns: Integers,
+    pitches: Doubles,
+    colors: Doubles,
+    boards: Doubles,
+    frames: Doubles,
+    color: Doubles,
 ) -> None:
     """Write the color of a wall at a position: plain, stripes, tiles or boards, pictures and windows."""
     axis = wall // 2
@@ -386,13 +353,13 @@ def _wall_color(
                 color[channel] = bright * frames[wall, number, start + channel]
 
 
-def _paint(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+def _paint(rng: np.random.Generator, count: int) -> Doubles:
     """Linear light (count, 3) of some paints, woods or cloths."""
     gray = rng.uniform(0.1, 0.95, (count, 1)) ** 2.2
     return np.clip(gray * np.exp(paint_tints(rng, count)), 0.003, 0.95)
 
 
-def paint_tints(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+def paint_tints(rng: np.random.Generator, count: int) -> Doubles:
     """Logarithms (count, 3) of paints' red, green and blue over their gray.
 
     They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray; some have a

@@ -19,7 +19,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from handsim._checks import check_choice, check_type
@@ -28,6 +27,7 @@ from handsim.hand.shape import HandShape
 from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR
 from render.fields import smooth
+from render.frames import Doubles
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -126,14 +126,7 @@ def hyphened(tone: str) -> str:
 
 
 def named_tones(names: Sequence[str]) -> tuple[float, ...]:
-    """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range.
-
-    Args:
-        names: Of classes, with a space or a hyphen in very light.
-
-    Raises:
-        ArgumentError: A class is unknown.
-    """
+    """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range."""
     known = {hyphened(name): angles for name, angles in TONES.items()}
     for name in names:
         check_type("a skin tone", name, str, "its name", known)
@@ -148,11 +141,7 @@ def named_tones(names: Sequence[str]) -> tuple[float, ...]:
 
 
 def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
-    """A random person's skin.
-
-    Args:
-        tones: Ends of ranges of typology angles [deg], drawn from uniformly; see `named_tones`.
-    """
+    """A random person's skin."""
     angle = _draw_angle(tones, rng)
     yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
     redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
@@ -221,11 +210,7 @@ _MARGIN: Final = 0.1  # of a picture around it where no arm ends
 
 @dataclass(frozen=True, slots=True)
 class Forearm:
-    """A forearm in plain values.
-
-    Raises:
-        HandSimError: It is shorter than 2 cm or longer than half a meter, or its girth is not positive.
-    """
+    """A forearm in plain values."""
 
     length: float = 0.22
     """Length behind the wrist [m]."""
@@ -273,12 +258,7 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
 def forearm_rings(
     shape: HandShape, forearm: Forearm, wrist: Float[np.ndarray, "R 3"], rings: int
 ) -> Float[np.ndarray, "rings R 3"]:
-    """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m].
-
-    Args:
-        wrist: The wrist's ring, which the arm continues [m].
-        rings: Number of rings.
-    """
+    """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m]."""
     mirror = MIRROR if shape.side == "left" else np.eye(3)
     right = wrist @ mirror
     center = right.mean(axis=0)
@@ -297,7 +277,7 @@ def forearm_rings(
     sections = (1.0 - share) * section + share * round_section
     axes, middles = _course(shape, forearm, behind)
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
-    points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
+    points: Doubles = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
     return points @ mirror
 
 
@@ -306,7 +286,7 @@ def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
 
     Rings lie closer together near the wrist, where all the bending is, and two pairs at the edge of a sleeve.
     """
-    places: NDArray[np.float64] = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
+    places: Doubles = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
     if forearm.sleeve < forearm.length:
         edge = forearm.sleeve + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
         first = int(np.clip(np.abs(places - forearm.sleeve).argmin() - 1, 1, rings - 4))
@@ -322,13 +302,7 @@ def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
 def bent_rings(
     rings: Float[np.ndarray, "K R 3"], elbow: float, towards: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K R 3"]:
-    """Rings of an arm that bends at its elbow and ends `REACH` behind it [m].
-
-    Args:
-        rings: Of a straight arm, outwards from the hand [m].
-        elbow: Place of the elbow along it, behind the first ring [m].
-        towards: Unit direction of the upper arm.
-    """
+    """Rings of an arm that bends at its elbow and ends `REACH` behind it [m]."""
     middles = rings.mean(axis=1)
     ahead = middles[-1] - middles[-2]
     ahead /= np.linalg.norm(ahead)
@@ -360,13 +334,7 @@ def bent_rings(
 def upper_arms(
     elbows: Float[np.ndarray, "H 3"], forearms: Float[np.ndarray, "H 3"], cameras: Sequence[Camera]
 ) -> Float[np.ndarray, "H 3"]:
-    """Unit directions from elbows in which arms leave the pictures of all cameras, where that is possible.
-
-    Args:
-        elbows: In the world [m].
-        forearms: Unit directions of the forearms, from wrist to elbow.
-        cameras: All that see the arms.
-    """
+    """Unit directions from elbows in which arms leave the pictures of all cameras, where that is possible."""
     axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
     if np.linalg.norm(axis) < 0.2:  # they look at the arms from all around
         axis = cameras[0].T_world_camera[:3, 2]
@@ -387,12 +355,8 @@ def upper_arms(
 
 
 def _out_of_pictures(
-    elbow: NDArray[np.float64],
-    forearm: NDArray[np.float64],
-    way: NDArray[np.float64],
-    axis: NDArray[np.float64],
-    cameras: Sequence[Camera],
-) -> NDArray[np.float64]:
+    elbow: Doubles, forearm: Doubles, way: Doubles, axis: Doubles, cameras: Sequence[Camera]
+) -> Doubles:
     """The direction nearest to `way`, turned about `axis`, in which an arm ends in no picture."""
     aside = np.cross(axis, way)
     flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
@@ -410,13 +374,10 @@ def _out_of_pictures(
         to_camera = camera.T_world_camera[:3, 3] - elbow
         nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
         bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
-    best: NDArray[np.float64] = tried[int(bad.argmin())]
-    return best
+    return np.asarray(tried[int(bad.argmin())])
 
 
-def _half_axes(
-    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
     girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
     flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
@@ -427,9 +388,7 @@ def _half_axes(
     return girth / around, flatness * girth / around
 
 
-def _course(
-    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _course(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
     fine = np.linspace(0.0, behind[-1], 200)
     share = smooth(fine, 0.0, _BEND * shape.length)

@@ -21,17 +21,21 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.skin.cage_topology import WRIST, cage_topology
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
-from handsim.hand.skin.surface import skin_frames, vertex_normals
-from handsim.hand.topology import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
+from handsim.hand.skin import (
+    WRIST,
+    cage_topology,
+    catmull_clark,
+    skin_frames,
+    subdivided_loops,
+    vertex_normals,
+)
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import bump, smooth
-from render.frames import FOREARM
+from render.frames import FOREARM, Bytes, Doubles, Floats, Integers
 from render.skin.look import ELBOW, Forearm, bent_rings, forearm_rings
 
 TILE: Final = 16
@@ -48,21 +52,21 @@ _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
 class Atlas(NamedTuple):
     """Numbers only; vertices are `HandSurface`'s, then the forearm's rings, then the end's middle."""
 
-    used: NDArray[np.int64]
+    used: Integers
     """Vertices (U,) of the base surface that are drawn: those from the wrist's ring on."""
-    wrist: NDArray[np.int64]
+    wrist: Integers
     """The wrist's ring (R,), indices of the drawn vertices, from the index side over the back."""
-    faces: NDArray[np.int64]
+    faces: Integers
     """Triangles (F, 3) of the drawn vertices, closed, counter-clockwise from outside on a right hand."""
-    corners: NDArray[np.int64]
+    corners: Integers
     """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
-    corner_faces: NDArray[np.int64]
+    corner_faces: Integers
     """The same triangles (F, 3) as indices of `corners`."""
-    coarse_faces: NDArray[np.int64]
+    coarse_faces: Integers
     """A quarter as many triangles (G, 3) of the same corners: the surface to a few tenths of a millimeter."""
-    uv: NDArray[np.float32]
+    uv: Floats
     """Texture coordinates (D, 2), the origin at the bottom left."""
-    tiles: NDArray[np.int64]
+    tiles: Integers
     """Drawn vertices (K, 5, 5) of each tile's grid."""
     size: tuple[int, int]
     """Width and height of the texture [texels]."""
@@ -102,7 +106,7 @@ def skin_atlas() -> Atlas:
     return _assemble(used, tiles, wrist)
 
 
-def _child_coordinates(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+def _child_coordinates(coordinates: Doubles) -> Doubles:
     """Coordinates (4 Q, 4, 2) in their tile of the four children's corners, in `catmull_clark`'s order."""
     following, before = np.roll(coordinates, -1, axis=1), np.roll(coordinates, 1, axis=1)
     middle = np.broadcast_to(coordinates.mean(axis=1, keepdims=True), coordinates.shape)
@@ -112,7 +116,7 @@ def _child_coordinates(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
     return children.reshape(-1, 4, 2)
 
 
-def _grids(quads: NDArray[np.int64], coordinates: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+def _grids(quads: Integers, coordinates: Doubles, count: int) -> Integers:
     """Vertices (K, 5, 5) of each cage face's grid: rows go along its second axis."""
     grids = np.zeros((count, _SIDE + 1, _SIDE + 1), dtype=np.int64)
     column, row = np.rint(coordinates * _SIDE).astype(int).transpose(2, 0, 1)
@@ -121,7 +125,7 @@ def _grids(quads: NDArray[np.int64], coordinates: NDArray[np.float64], count: in
     return grids
 
 
-def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[np.int64]) -> Atlas:
+def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     tile_rows = -(-len(tiles) // COLUMNS)
     width, height = COLUMNS * TILE, tile_rows * TILE + ARM_ROWS
     # The hand's tiles: node (row, column) of a tile stands on the center of a texel of its border or inside.
@@ -168,7 +172,7 @@ def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[
     return atlas
 
 
-def _squares(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _squares(nodes: Integers) -> Integers:
     """Two triangles of each square of grids (K, R, C)."""
     a, b, c, d = nodes[:, :-1, :-1], nodes[:, :-1, 1:], nodes[:, 1:, 1:], nodes[:, 1:, :-1]
     first = np.stack([a, b, c], axis=-1).reshape(-1, 3)
@@ -190,22 +194,14 @@ class _Hill(NamedTuple):
     """Angle without height [deg]."""
     full: float
     """Angle with full height [deg]."""
-    heights: NDArray[np.float64]
+    heights: Doubles
     """Full height at each vertex (U,) along the normal [m]."""
 
 
 class Flexion:
-    """The shapes of one hand.
+    """The shapes of one hand."""
 
-    Args:
-        rest: Vertices (U, 3) at rest, in the wrist's frame [m].
-        normals: Their outward unit normals (U, 3).
-        bony: Factor on all heights.
-    """
-
-    def __init__(
-        self, model: HandModel, rest: NDArray[np.float64], normals: NDArray[np.float64], bony: float
-    ) -> None:
+    def __init__(self, model: HandModel, rest: Doubles, normals: Doubles, bony: float) -> None:
         hills = list(_hills(model, rest, normals))
         self._joints = np.array([hill.joint for hill in hills])
         self._start = np.deg2rad([hill.start for hill in hills])
@@ -220,12 +216,12 @@ class Flexion:
         """Vertices at rest as the angles [rad] shape them [m]."""
         angle = np.where(self._joints < 0, self._full, angles[self._joints])
         share = smooth(angle, self._start, self._full)
-        shaped: NDArray[np.float64] = rest.copy()
+        shaped: Doubles = rest.copy()
         shaped[self._rows] += (self._heights @ share)[:, None] * self._normals
         return shaped
 
 
-def _hills(model: HandModel, rest: NDArray[np.float64], normals: NDArray[np.float64]) -> Iterator[_Hill]:
+def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]:
     """All shapes, on the right hand that the hand is a mirror image of."""
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
     points, outward = rest @ mirror, normals @ mirror
@@ -244,21 +240,19 @@ def _hills(model: HandModel, rest: NDArray[np.float64], normals: NDArray[np.floa
 class _Skin(NamedTuple):
     """A right hand at rest."""
 
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    frames: NDArray[np.float64]
+    points: Doubles
+    normals: Doubles
+    frames: Doubles
     """Transforms of the bones (16, 4, 4)."""
     scale: float
     """Of the hand against the reference."""
 
-    def local(self, bone: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def local(self, bone: int) -> tuple[Doubles, Doubles]:
         """Points (U, 3) [m] in a bone's frame, and how far they face its back, -1 to 1 (U,)."""
         frame = self.frames[bone]
         return (self.points - frame[:3, 3]) @ frame[:3, :3], self.normals @ frame[:3, 2]
 
-    def beside(
-        self, start: NDArray[np.float64], end: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def beside(self, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
         """How far along a segment of the wrist's x and y [m] points are, 0 to 1, and how far from it [m]."""
         way = end - start
         along = np.clip((self.points[:, :2] - start) @ way / (way @ way), 0.0, 1.0)
@@ -266,32 +260,27 @@ class _Skin(NamedTuple):
 
     def knob(
         self, bone: int, height: float, along: float, aside: float, *, at: tuple[float, float] = (0.0, 0.0)
-    ) -> NDArray[np.float64]:
+    ) -> Doubles:
         """A hill on the back of a bone, `at` its x and y; `along` and `aside` are its half widths [m]."""
         place, facing = self.local(bone)
         size = self.scale
         hill = bump(place[:, 0] - size * at[0], size * along) * bump(place[:, 1] - size * at[1], size * aside)
         hill *= smooth(facing, -0.1, 0.5) * (place[:, 2] > -0.004)
-        result: NDArray[np.float64] = size * height * hill
-        return result
+        return np.asarray(size * height * hill)
 
-    def girth(self, bone: int, height: float, at: float, along: float) -> NDArray[np.float64]:
+    def girth(self, bone: int, height: float, at: float, along: float) -> Doubles:
         """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
         place, facing = self.local(bone)
         near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
         hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
-        result: NDArray[np.float64] = self.scale * height * hill
-        return result
+        return np.asarray(self.scale * height * hill)
 
-    def ball(
-        self, center: tuple[float, float], height: float, width: float, *, back: bool
-    ) -> NDArray[np.float64]:
+    def ball(self, center: tuple[float, float], height: float, width: float, *, back: bool) -> Doubles:
         """A hill on the back or the palm, around a place of the wrist's frame [m]."""
         size = self.scale
         distance = np.linalg.norm(self.points[:, :2] - size * np.array(center), axis=1)
         facing = self.normals[:, 2] if back else -self.normals[:, 2]
-        result: NDArray[np.float64] = size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6)
-        return result
+        return np.asarray(size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6))
 
 
 def _joint(name: str) -> int:
@@ -383,13 +372,7 @@ class DrawnSkin:
 
 
 class PosableSkin:
-    """The drawn skin of one person's hand.
-
-    Args:
-        forearm: The forearm behind it.
-        bony: Factor on what joints make of the skin around them, see `render.skin.mesh`; 0 for the hand
-            model's own surface.
-    """
+    """The drawn skin of one person's hand."""
 
     def __init__(self, model: HandModel, forearm: Forearm | None = None, bony: float = 0.0) -> None:
         self.model = model
@@ -426,18 +409,14 @@ class PosableSkin:
         rotation = quaternion_matrix(qpos[3:7])
         return qpos[:3] + rotation @ elbow, rotation @ ahead
 
-    def _rings(self, rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _rings(self, rest: Doubles) -> Doubles:
         """The arm's rings (K, R, 3)."""
         return rest[skin_atlas().num_hand : -1].reshape(RINGS, -1, 3)
 
     def posed(
         self, qpos: Float[np.ndarray, "27"], upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> DrawnSkin:
-        """The skin in one pose; without the upper arm's direction in the world the arm is straight and short.
-
-        Raises:
-            ArgumentError: `qpos` is not (27,) or not finite.
-        """
+        """The skin in one pose; the arm is straight and short without an upper arm's direction."""
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
         shaped = self._flexion.shaped(self.rest, qpos[7:])
@@ -464,12 +443,12 @@ class PosableSkin:
     ) -> Float[np.ndarray, "U 3"]:
         """Posed vertices of `rest`, or of its changed form, in the frame of the bones' transforms [m]."""
         still = self.rest if rest is None else rest
-        points: NDArray[np.float64] = skin_frames(
+        points: Doubles = skin_frames(
             still, self._bones, self._weights, self.model.rest_transforms, transforms
         )[0]
         return points
 
-    def _rest_occlusion(self) -> NDArray[np.float32]:
+    def _rest_occlusion(self) -> Floats:
         """Occlusion in the flat hand by capsules of the same flesh: a digit's other neighbors do shade it."""
         normals = vertex_normals(self.rest, self.faces)
         occluded = self._occluded(self.model.rest_transforms[None], self.rest, normals)
@@ -486,11 +465,9 @@ class PosableSkin:
             occluded[mine] += share[mine].astype(np.float32) * (own - occluded[mine])
         return occluded
 
-    def _occluded(
-        self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def _occluded(self, transforms: Doubles, points: Doubles, normals: Doubles) -> Floats:
         capsules = self.model.capsules
-        occluded: NDArray[np.float32] = _occluded_share(
+        occluded: Floats = _occluded_share(
             points, normals, capsules.posed(transforms)[0], capsules.radii * _FLESH
         )
         return occluded
@@ -504,18 +481,13 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
     rows = np.arange(atlas.num_hand)[:, None]
     shares[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
     shares[atlas.num_hand :, FOREARM] = 1e3  # one vertex of the forearm makes a triangle the forearm's
-    parts: NDArray[np.uint8] = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
+    parts: Bytes = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
     parts.setflags(write=False)
     return parts
 
 
 @kernel
-def _occluded_share(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    segments: NDArray[np.float64],
-    radii: NDArray[np.float64],
-) -> Any:
+def _occluded_share(points: Doubles, normals: Doubles, segments: Doubles, radii: Doubles) -> Any:
     """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
 
     The inner loop has no branches and writes one array, so that it is compiled into vector instructions.
@@ -553,10 +525,6 @@ def _occluded_share(
 
 
 @kernel
-def _columns(points: NDArray[np.float64]) -> Any:
+def _columns(points: Doubles) -> Any:
     """The columns of an array (V, 3)."""
-    return (
-        points[:, 0].astype(np.float32),
-        points[:, 1].astype(np.float32),
-        points[:, 2].astype(np.float32),
-    )
+    return (points[:, 0].astype(np.float32), points[:, 1].astype(np.float32), points[:, 2].astype(np.float32))

@@ -20,16 +20,16 @@ from scipy import ndimage
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import named_shape
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import DIGITS, NUM_BONES
+from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
+from handsim.hand.skin import vertex_normals
 from handsim.kernels import kernel
 from render.fields import bump, noise, smooth
+from render.frames import Bytes, Doubles, Floats, Integers
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas
 
 if TYPE_CHECKING:
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 REFERENCE: Final = Forearm(length=0.5)
 """The forearm whose texels are painted; a longer one is stretched."""
@@ -45,15 +45,15 @@ _WRIST_LINES: Final = (-0.001, -0.009)  # across the palm's side of the wrist [m
 class DigitTexels(NamedTuple):
     """The texels (K,) of one digit."""
 
-    texels: NDArray[np.int64]
+    texels: Integers
     """Indices (K,) of the texture's N texels."""
-    along: NDArray[np.float64]
+    along: Doubles
     """Distance from the digit's first joint [m]."""
-    angle: NDArray[np.float64]
+    angle: Doubles
     """Angle about the digit from the middle of its back [rad], positive towards the thumb's side."""
-    share: NDArray[np.float64]
+    share: Doubles
     """Share of the skin that moves with the digit."""
-    lengths: NDArray[np.float64]
+    lengths: Doubles
     """Lengths of the three bones [m]."""
     radius: float
     """Of the skin behind the tip [m]."""
@@ -62,17 +62,17 @@ class DigitTexels(NamedTuple):
 class Texels(NamedTuple):
     """All N = width x height texels, row by row from the texture's top; unused ones repeat a used one."""
 
-    positions: NDArray[np.float64]
+    positions: Doubles
     """On the reference hand's skin, in the wrist's frame [m] (N, 3)."""
-    normals: NDArray[np.float64]
+    normals: Doubles
     """Outward unit normals (N, 3)."""
-    dorsal: NDArray[np.float64]
+    dorsal: Doubles
     """From -1 in the middle of the palm or of a finger's pad to 1 on the back (N,)."""
-    back: NDArray[np.float64]
+    back: Doubles
     """1 on the back of the hand, 0 on the palm, smooth between (N,)."""
-    facing: NDArray[np.float64]
+    facing: Doubles
     """From -1 to 1 likewise, before that: how far the skin faces the way of the back (N,)."""
-    palm: NDArray[np.float64]
+    palm: Doubles
     """Share of the skin that moves with the palm and no digit (N,)."""
     digits: tuple[DigitTexels, ...]
 
@@ -101,7 +101,7 @@ def skin_texels() -> Texels:
     return Texels(positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], digits)
 
 
-def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spread(values: Doubles) -> Doubles:
     """Values (U, C) of the drawn vertices at every texel (N, C), interpolated linearly."""
     atlas = skin_atlas()
     width, height = atlas.size
@@ -121,7 +121,7 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([hand, arm]).reshape(width * height, -1)
 
 
-def _between(nodes: int, texels: int) -> NDArray[np.float64]:
+def _between(nodes: int, texels: int) -> Doubles:
     """Matrix (texels, nodes) of linear interpolation between nodes, the outer texels on the outer nodes."""
     position = np.linspace(0.0, nodes - 1.0, texels)
     low = np.minimum(position.astype(int), nodes - 2)
@@ -131,9 +131,7 @@ def _between(nodes: int, texels: int) -> NDArray[np.float64]:
     return matrix
 
 
-def _digit_texels(
-    model: HandModel, digit: int, positions: NDArray[np.float64], weights: NDArray[np.float64]
-) -> DigitTexels:
+def _digit_texels(model: HandModel, digit: int, positions: Doubles, weights: Doubles) -> DigitTexels:
     first = 1 + 3 * digit
     share = weights[:, first : first + 3].sum(axis=1)
     texels = np.flatnonzero(share > 0.02)
@@ -144,7 +142,7 @@ def _digit_texels(
     return DigitTexels(texels, local[:, 0], angle, share[texels], lengths, float(model.shape.radii[digit, 3]))
 
 
-def behind_wrist(forearm: Forearm) -> NDArray[np.float64]:
+def behind_wrist(forearm: Forearm) -> Doubles:
     """How far behind the wrist each texel (N,) is along this forearm [m]; negative on the hand."""
     width, _ = skin_atlas().size
     behind = -skin_texels().positions[:, 0]
@@ -154,7 +152,7 @@ def behind_wrist(forearm: Forearm) -> NDArray[np.float64]:
 
 
 @functools.cache
-def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _palm_distances() -> tuple[Integers, Doubles]:
     """Texels of the palm (K,), and the distance of each palm line from them (3, K) [m]."""
     texels = skin_texels()
     near = np.flatnonzero((texels.dorsal < 0.1) & (texels.positions[:, 0] > -0.02))
@@ -173,7 +171,7 @@ def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return near, distances
 
 
-def line_depth(rng: np.random.Generator) -> NDArray[np.float32]:
+def line_depth(rng: np.random.Generator) -> Floats:
     """Depth of each texel (N,) in a palm line, finger crease or knuckle wrinkle; 1 for a deep line."""
     near, palm_lines, depth = _lines_of_all()
     depth = depth.copy()
@@ -199,14 +197,14 @@ def line_depth(rng: np.random.Generator) -> NDArray[np.float32]:
 
 @kernel
 def _draw_line(
-    along: NDArray[np.float32],
-    bent: NDArray[np.float32],
-    share: NDArray[np.float32],
+    along: Floats,
+    bent: Floats,
+    share: Floats,
     position: float,
     width: float,
     strength: float,
-    texels: NDArray[np.int64],
-    depth: NDArray[np.float32],
+    texels: Integers,
+    depth: Floats,
 ) -> None:
     """Draw a line of this width [m] and depth across a digit.
 
@@ -223,24 +221,24 @@ def _draw_line(
 class _DigitLines(NamedTuple):
     """The texels (K,) of a digit and where on it lines are drawn."""
 
-    texels: NDArray[np.int64]
-    along: NDArray[np.float32]
+    texels: Integers
+    along: Floats
     """Distance from its first joint [m]."""
-    sine: NDArray[np.float32]
-    cosine: NDArray[np.float32]
+    sine: Floats
+    cosine: Floats
     """Of three times the angle about it."""
-    arch: NDArray[np.float32]
+    arch: Floats
     """How far wrinkles bow [m]."""
-    pad: NDArray[np.float32]
+    pad: Floats
     """Share of creases on the palm's side."""
-    back: NDArray[np.float32]
+    back: Floats
     """Share of wrinkles on its back."""
-    joints: NDArray[np.float64]
+    joints: Doubles
     """Distance of its two other joints [m]."""
 
-    def wave(self, phase: float) -> NDArray[np.float32]:
+    def wave(self, phase: float) -> Floats:
         """How far a crease waves from its position (K,) [m]."""
-        wave: NDArray[np.float32] = np.float32(0.0006 * np.cos(phase)) * self.sine
+        wave: Floats = np.float32(0.0006 * np.cos(phase)) * self.sine
         wave += np.float32(0.0006 * np.sin(phase)) * self.cosine
         return wave
 
@@ -267,7 +265,7 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
 
 
 @functools.cache
-def _lines_of_all() -> tuple[NDArray[np.int64], tuple[NDArray[np.float32], ...], NDArray[np.float32]]:
+def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
     """Texels of the palm (K,), its lines there (K,) each, and the depth (N,) of the wrist's lines."""
     texels = skin_texels()
     back = texels.back
@@ -282,7 +280,7 @@ def _lines_of_all() -> tuple[NDArray[np.int64], tuple[NDArray[np.float32], ...],
     return near, lines, depth.astype(np.float32)
 
 
-def _share_at(digit: DigitTexels, texels: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+def _share_at(digit: DigitTexels, texels: Integers, count: int) -> Doubles:
     share = np.zeros(count)
     share[digit.texels] = digit.share
     return share[texels]
@@ -294,21 +292,16 @@ _STEEPEST: Final = 0.9  # height over distance
 class _TangentScales(NamedTuple):
     """Scales (N,) from height differences of neighboring texels to gradients along the tangents [1/m]."""
 
-    across: NDArray[np.float64]
+    across: Doubles
     """Scale of the difference along the row, for the first tangent."""
-    skew: NDArray[np.float64]
+    skew: Doubles
     """Share of the first gradient in the second tangent: tiles are not rectangles."""
-    down: NDArray[np.float64]
+    down: Doubles
     """Scale of the difference along the column, for the second tangent."""
 
 
 def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
-    """Normal map in the tangent frame of pyrender's shader: along u, and normal x that.
-
-    Args:
-        height: Height of the relief at each texel (N,) [m].
-        side: A left hand's second axis has the other sign.
-    """
+    """Normal map in the tangent frame of pyrender's shader: along u, and normal x that."""
     width, rows = skin_atlas().size
     across, down = _differences(height.reshape(rows, width, 1))
     scales = _tangent_scales()
@@ -321,7 +314,7 @@ def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
     tilt *= np.minimum(1.0, _STEEPEST / np.maximum(steep, 1e-12))
     normals = np.concatenate([tilt, np.ones((len(tilt), 1))], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    encoded: NDArray[np.uint8] = np.rint(127.5 * (normals + 1.0)).astype(np.uint8)
+    encoded: Bytes = np.rint(127.5 * (normals + 1.0)).astype(np.uint8)
     return encoded.reshape(rows, width, 3)
 
 
@@ -339,7 +332,7 @@ def _differences(grid: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 @functools.cache
-def relief() -> NDArray[np.float64]:
+def relief() -> Doubles:
     """Height (N,) [m] of the relief of every hand: tendons, knuckles, and hollows between them."""
     texels, shape = skin_texels(), named_shape("M")
     back = smooth(texels.dorsal, -0.25, 0.35)  # of each digit; the thumb's faces sideways
@@ -409,40 +402,35 @@ class SkinTexture(NamedTuple):
 class _Paint(NamedTuple):
     """Color, roughness and height of each texel; all three are written."""
 
-    lab: NDArray[np.float32]
+    lab: Floats
     """CIELAB."""
-    roughness: NDArray[np.float32]
-    height: NDArray[np.float32]
+    roughness: Floats
+    height: Floats
     """Height of the relief (N,) [m]."""
 
 
 class _Blood(NamedTuple):
     """What blood in the skin adds to CIELAB (N, 3) at a flush of 1."""
 
-    fixed: NDArray[np.float32]
-    knuckles: NDArray[np.float32]
+    fixed: Floats
+    knuckles: Floats
     """Where knuckles are darker (N,), which depends on the skin."""
 
 
 class _Nail(NamedTuple):
     """The texels (K,) of a nail and its fold."""
 
-    texels: NDArray[np.int64]
-    plate: NDArray[np.float32]
+    texels: Integers
+    plate: Floats
     """Share of the nail (K,)."""
-    fold: NDArray[np.float32]
+    fold: Floats
     """Depth of the fold around it (K,)."""
-    moon: NDArray[np.float32]
+    moon: Floats
     """What its moon and its free edge add to CIELAB (K, 3)."""
 
 
 def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side = "right") -> SkinTexture:
-    """Paint a skin; equal looks give equal texels.
-
-    Args:
-        forearm: Forearm whose sleeve is painted too.
-        side: Side of the hand; colors are equal on both.
-    """
+    """Paint a skin; equal looks give equal texels."""
     color, roughness, height = _painted(look, forearm)
     return SkinTexture(color, roughness, normal_map(height, side))
 
@@ -450,7 +438,7 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
 @functools.lru_cache(maxsize=2)  # both hands of a person share it
 def _painted(
     look: SkinLook, forearm: Forearm | None
-) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float32]]:
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], Floats]:
     """Color, roughness and height of the relief."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     # Pigment fades over the sides of fingers and hand, unevenly; relief ends sooner.
@@ -488,7 +476,7 @@ def _painted(
     return lab_to_srgb(paint.lab.reshape(rows, width, 3)), roughness, paint.height
 
 
-def _add(lab: NDArray[np.float32], share: NDArray[Any], color: tuple[float, float, float]) -> None:
+def _add(lab: Floats, share: NDArray[Any], color: tuple[float, float, float]) -> None:
     """Add a share (N,) of a color to each texel's (N, 3)."""
     for channel, value in enumerate(color):
         lab[:, channel] += np.float32(value) * share
@@ -497,8 +485,7 @@ def _add(lab: NDArray[np.float32], share: NDArray[Any], color: tuple[float, floa
 def lab_to_srgb(lab: NDArray[Any]) -> UInt8[np.ndarray, "H W 3"]:
     """SRGB of CIELAB colors (D65), clipped to the gamut of sRGB."""
     rgb = cv2.cvtColor(np.asarray(lab, dtype=np.float32), cv2.COLOR_Lab2RGB)
-    color: NDArray[np.uint8] = np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
-    return color
+    return np.asarray(np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8))
 
 
 @functools.cache
@@ -528,7 +515,7 @@ def _blood() -> _Blood:
     return _Blood(lab.astype(np.float32), knuckles.astype(np.float32))
 
 
-def _veins(rng: np.random.Generator) -> NDArray[np.float32]:
+def _veins(rng: np.random.Generator) -> Floats:
     """Visibility of veins at each texel (N,): three of them wind along the back of hand and forearm."""
     near, x, y, back = _vein_texels()
     veins = np.zeros(len(skin_texels().back), dtype=np.float32)
@@ -543,7 +530,7 @@ def _veins(rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 @functools.cache
-def _vein_texels() -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def _vein_texels() -> tuple[Integers, Floats, Floats, Floats]:
     """Texels (K,) that may have veins, their x and y [m] and how far they are on the back (K,)."""
     texels = skin_texels()
     x, y, back = (values.astype(np.float32) for values in (*texels.positions[:, :2].T, texels.back))
@@ -611,11 +598,7 @@ GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
 
 @dataclass(frozen=True, slots=True)
 class GloveLook:
-    """A glove's cloth in plain values.
-
-    Raises:
-        HandSimError: The cuff does not extend behind the wrist.
-    """
+    """A glove's cloth in plain values."""
 
     color: tuple[float, float, float] = GLOVE_COLOR
     """sRGB in [0, 1]."""
@@ -647,12 +630,7 @@ def sample_glove_look(*, rng: np.random.Generator) -> GloveLook:
 def glove_texture(
     look: GloveLook, skin: SkinTexture, forearm: Forearm | None = None, *, side: Side = "right"
 ) -> SkinTexture:
-    """The texture of a glove over painted skin; only the forearm behind the cuff stays visible.
-
-    Args:
-        skin: The texture of the skin under it.
-        forearm: The forearm of the skin; its length scales the cuff.
-    """
+    """The texture of a glove over painted skin; only the forearm behind the cuff stays visible."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size
     arm = REFERENCE if forearm is None else forearm

@@ -15,15 +15,16 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, starter_layout
-from gloves.takes import columns as table
+from gloves.takes import points as table
+from gloves.takes.archives import GrowingArchive, growing_path
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.growing import GrowingArchive, growing_path
 from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take, take_header, worn_arrays
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.rigid_body import RigidTemplate, save_body
-from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
+from track.streams.frame_source import StreamedFrame
+from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
 from track.user import User
 
 FRAMES, COLUMNS = 4, 24
@@ -243,7 +244,7 @@ def settings(folder: Path) -> list[Path]:
 
 def packets(folder: Path) -> list[Path]:
     rng = _rng()
-    frame = MarkerFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
+    frame = StreamedFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
     info = ServerInfo("Motive", (3, 1), 1511, "239.255.42.99")
     contents = {
         "frame-3.0": pack_frame(frame, (3, 0)),

@@ -20,9 +20,9 @@ from gloves.takes.corrections import applied_corrections, load_corrections
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import import_cameras, load_cameras
+from handsim.space.rig import CameraRig, load_rig
+from handsim.space.rig_formats import import_cameras, load_cameras
 from render.scenery.backgrounds import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds

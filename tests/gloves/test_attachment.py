@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from gloves.fit import _ray, attach_markers, vary_layout
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import MIRROR
 from tests.handsim.hand.skin.blending import blend_skin

@@ -23,8 +23,7 @@ from gloves.layout import (
     stored_layout,
 )
 from handsim.errors import LayoutError
-from handsim.hand.shape import SIZES
-from handsim.hand.topology import BONE_NAMES
+from handsim.hand.shape import BONE_NAMES, SIZES
 
 DENSE19 = (
     "ThumbCMC ThumbMCP ThumbIP ThumbTip IndexMCP IndexPIP IndexTip MiddleMCP MiddlePIP MiddleTip "

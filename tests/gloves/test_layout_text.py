@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import gloves.layout
 from gloves.layout import load_layout, moved_text, starter_layout
-from handsim.hand.topology import BONE_NAMES
+from handsim.hand.shape import BONE_NAMES
 
 DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
 

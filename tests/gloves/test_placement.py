@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gloves.fit import attach_markers, nominal_fit, place_marker
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel
-from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.skin import vertex_normals
 
 LAYOUT = load_layout("dense19")
 MODELS = {side: HandModel.named("M", side=side) for side in ("right", "left")}

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS, SIDES, bones_of
+from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels import (
     align_rigid,
     move,

@@ -7,9 +7,8 @@ import pytest
 
 from gloves.fit import Attachment, attach_markers
 from gloves.layout import load_layout
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.model import HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import Side
 from handsim.space.camera import Camera, look_at, pinhole
 from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 

@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.errors import ArgumentError
 from render.color_sensor import (
     Exposure,
     ExposureConfig,
     Shutter,
     ShutterConfig,
     combine,
-    encoded,
     expose,
     linear_of,
     sample_exposure,
@@ -36,7 +34,6 @@ def shot(light, exposure, seed=0):
 
 def test_the_plainest_exposure_changes_no_byte():
     rgb = every_value()
-    assert (encoded(linear_of(rgb)) == rgb).all()
     assert (shot(linear_of(rgb), Exposure()) == rgb).all()
 
 
@@ -50,7 +47,7 @@ def test_the_curve_is_srgbs():
 
 def test_a_stop_doubles_the_light_and_balance_tints_it():
     light = np.full((8, 8, 3), 0.2, np.float32)
-    assert (shot(light, Exposure(stops=1.0)) == encoded(2 * light)).all()
+    assert (shot(light, Exposure(stops=1.0)) == shot(2 * light, Exposure())).all()
     assert (shot(light, Exposure(stops=3.0)) == 255).all()
     tinted = linear_of(shot(light, Exposure(balance=(1.2, 1.0, 0.8))))[0, 0]
     np.testing.assert_allclose(tinted / 0.2, [1.2, 1.0, 0.8], rtol=0.02)
@@ -119,8 +116,6 @@ def test_exposures_are_plain_and_within_limits():
 def test_odd_sizes_work():
     light = np.full((37, 23, 3), 0.3, np.float32)
     assert shot(light, Exposure(0.1, (1.1, 1.0, 0.9), 900.0, 3.0, 0.2, 80)).shape == (37, 23, 3)
-    with pytest.raises(ArgumentError, match="expected \\(H, W, 3\\)"):
-        shot(light[..., 0], Exposure())
 
 
 def test_blur_spreads_light_and_loses_none() -> None:
@@ -224,14 +219,3 @@ def test_shutters_are_plain_and_within_limits():
     assert all(0.001 <= one.exposure <= 0.016 and one.sub_frames == 8 for one in drawn)
     assert 0.3 < np.mean([one.readout > 0 for one in drawn]) < 0.7
     assert Shutter() == Shutter(0.0, 0.0, 1)
-
-
-def test_mistakes_are_told():
-    with pytest.raises(ArgumentError, match="counts of at least 1"):
-        shutter_times(0.01, 0.0, 0, 10)
-    with pytest.raises(ArgumentError, match="times of at least 0"):
-        shutter_times(-0.01, 0.0, 3, 10)
-    _, weights = shutter_times(0.01, 0.0, 3, HEIGHT)
-    for frames in ([bar(1.0)] * 2, [bar(1.0)] * 4, [bar(1.0)[:10]] * 3, []):
-        with pytest.raises(ArgumentError, match="expected 3 of 60 rows"):
-            combine(frames, weights)

@@ -15,8 +15,7 @@ from gloves.takes.take import load_take
 from handsim import Camera, HandModel
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import join_qpos
+from handsim.hand.model import hand_keypoints, join_qpos
 from handsim.space.camera import look_at, pinhole, preset
 from poses import sample_poses
 from render import Backgrounds
@@ -146,7 +145,7 @@ def test_a_take_has_its_own_hands():
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
-    studio = open_studio(take.hands, RenderConfig(painter="compiled"), rng=np.random.default_rng(0))
+    studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
     pictures = 0
     for placement in PLACEMENTS:
         viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))

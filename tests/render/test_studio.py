@@ -8,9 +8,8 @@ import trimesh
 
 from gloves.fit import attach
 from gloves.layout import load_layout
-from handsim.hand.keypoints import KEYPOINT_DIGITS, hand_keypoints, keypoint_thickness
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS, PALM, bones_of
+from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos, keypoint_thickness
+from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.space.camera import Camera, look_at, pinhole
 from poses import sample_poses
 from render.frames import FOREARM, Pictures

@@ -13,8 +13,7 @@ from gloves.fit import attach
 from gloves.takes.take import Take
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import HAND_DTYPE, named_shape, pack_hand, sample_shape
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
@@ -54,7 +53,7 @@ def load_poses(file, seed=0):
 
 
 def drawn(subject, config, frames, shard=0):
-    return Drawing(subject, config).frames(shard, enumerate(frames))
+    return Drawing(subject, config.resolved()).frames(shard, enumerate(frames))
 
 
 def saved(folder, **arrays):

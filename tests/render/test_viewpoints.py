@@ -9,7 +9,7 @@ import pytest
 
 from gloves.takes.take import LOST, Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from handsim.space.camera import look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
 from render.subject import subject_of_poses

@@ -14,7 +14,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import (
     LOST,
     STATUSES,
@@ -29,9 +29,9 @@ from track.captures import track_capture
 from track.config import TrackerConfig
 from track.recorder import TakeRecorder
 from track.rigid_body import RigidTemplate
-from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
-from track.streams.natnet_server import ReplayServer
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
@@ -195,7 +195,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.captures import track_capture
 from track.label_confidence import label_confidence
-from track.settings import warm_up
+from track.tracker import warm_up
 from track.streams.frame_source import checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take

@@ -42,7 +42,7 @@ def test_the_other_side_is_named(capture):
 
 def test_the_glove_that_is_worn_is_named(capture):
     with pytest.warns(HandSimWarning, match=r"a right hand in glove 'dense19' better .*--glove dense19"):
-        label_capture(capture, "sparse13")
+        label_capture(capture, glove="sparse13")
 
 
 def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypatch):

@@ -6,19 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 
 from gloves.fit import attach
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import ADULTS, DIGITS, SIZES, sample_shape, shape_from_measures
 from poses.motion import sample_motion
 from track.hand_size import (
-    _PRECISION,
     SizeFit,
     _is_found,
-    _least,
     fit_size,
     sample_frames,
     usual_breadth,
@@ -105,22 +101,6 @@ def test_parts_of_a_long_capture_are_consecutive_and_reach_its_end():
     assert numbers[0] == 0 and numbers[-1] == 999 and len(numbers) == 128
     assert (np.diff(numbers) != 1).sum() == 7
     assert sample_frames(frames[:50]) == frames[:50]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_search_makes_scipys_steps(seed):
-    rng = np.random.default_rng(seed)
-    place, slope, waves = rng.uniform(0.1, 0.25), rng.uniform(1.0, 9.0), rng.uniform(0.0, 0.3)
-    tried = []
-
-    def function(x):
-        tried.append(x)
-        return (x - place) ** 2 + slope * abs(x - place) + waves * np.sin(200.0 * x)
-
-    found = _least(function, 0.125, 0.225)
-    mine, tried[:] = tried.copy(), []
-    scipys = minimize_scalar(function, bounds=(0.125, 0.225), method="bounded", options={"xatol": _PRECISION})
-    assert found == scipys.x and mine == tried
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import LOST, STATUSES, TRACKED, RigidBody, Take, load_take
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.model import join_qpos

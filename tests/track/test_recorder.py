@@ -21,9 +21,9 @@ from render.subject import load_subject
 from track import recorder as module
 from track.recorder import Recorder, TakeRecorder
 from track.rigid_body import RigidTemplate
-from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
-from track.streams.natnet_server import ReplayServer
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take

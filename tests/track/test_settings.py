@@ -37,5 +37,5 @@ def test_fields_that_are_named_differ_from_the_settings():
         TrackSettings.of(None, {"glvoe": "dense19"})
     with pytest.raises(ArgumentError, match="settings is 'dense19', expected a TrackSettings"):
         TrackSettings.of("dense19", {})  # type: ignore[arg-type]
-    with pytest.raises(ArgumentError, match="unknown setting of the tracker 'noise'"):
+    with pytest.raises(ArgumentError, match="unknown setting of tracker 'noise'"):
         TrackSettings.from_json({"tracker": {"noise": 1.0}})

@@ -39,8 +39,8 @@ def angle_error(take: Take, truth: Take) -> float:
 @pytest.mark.slow
 def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
     start = nominal_user(load_layout("dense19"), "M", ("right", "left"))  # the take has a right one
-    done = calibrate_take(seen, start, start, None)
-    user = kept_user(seen, done, start, "from a test", None)
+    done = calibrate_take(seen, start, start)
+    user = kept_user(seen, done, start, "from a test")
     (one,) = user.calibrations
     markers = truth.observed("right")[FRAMES:]
     fresh = markers[np.isfinite(markers[..., 0]).all(axis=1)][::4]
@@ -54,10 +54,10 @@ def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
 @pytest.mark.slow
 def test_a_hand_that_becomes_no_better_stays(seen):
     start, before = [nominal_fit("dense19", "M", "right")], User(seen.hands)
-    done = calibrate_take(seen, start, before, None)
-    user = kept_user(seen, done, before, "from a test", None)
+    done = calibrate_take(seen, start, before)
+    user = kept_user(seen, done, before, "from a test")
     assert user[0] is before[0] and user.notes.endswith("it stays as it was") and user.is_calibrated("right")
-    measured = kept_user(seen, done, User(seen.hands, f"{MEASURED}187 x 83 mm"), "from a test", None)
+    measured = kept_user(seen, done, User(seen.hands, f"{MEASURED}187 x 83 mm"), "from a test")
     assert measured.notes.endswith("it stays as it was, as measured")
     assert not measured.is_calibrated("right")
 
@@ -66,13 +66,13 @@ def test_a_hand_that_becomes_no_better_stays(seen):
 def test_a_hand_stays_whose_labels_may_be_the_next_fingers():
     truth = simulate_take("hand-controller", glove="starter10", num_frames=FRAMES, seed=100)
     start = nominal_user(load_layout("starter10"), "M", ("right",))
-    assert calibrate_take(truth, start, start, None)[0].is_better
+    assert calibrate_take(truth, start, start)[0].is_better
     label = start.layout.names.index
     given = np.arange(-1, len(truth.label_names))  # by one finger too far: the little one's is hidden
     for name, other in (("MiddleTip", "RingTip"), ("RingTip", "PinkyTip"), ("PinkyTip", "MiddleTip")):
         given[1 + label(name)] = label(other)
     take = dataclasses.replace(truth, labels=given[1 + truth.labels])
-    user = kept_user(take, calibrate_take(take, start, start, None), start, "from a test", None)
+    user = kept_user(take, calibrate_take(take, start, start), start, "from a test")
     (one,) = user.calibrations
     assert one.held_out.after < 0.5 * one.held_out.before and user[0] is start[0]
     told = "MiddleTip is rarely seen, and the next finger's fits in its place as well"
@@ -84,7 +84,7 @@ def test_a_hand_stays_whose_labels_may_be_the_next_fingers():
 def test_a_marker_that_fell_off_is_no_doubt_where_the_others_tell_the_fingers(seen):
     start = nominal_user(load_layout("dense19"), "M", ("right",))
     lost = np.where(seen.labels == start.layout.names.index("RingTip"), -1, seen.labels)
-    (one,) = calibrate_take(dataclasses.replace(seen, labels=lost), start, start, None)
+    (one,) = calibrate_take(dataclasses.replace(seen, labels=lost), start, start)
     assert one.is_better and not one.held_out.hidden
 
 
@@ -92,7 +92,7 @@ def test_a_take_without_a_hand_is_told(seen):
     no_pose = np.full_like(seen.qpos, np.nan)
     lost = dataclasses.replace(seen, qpos=no_pose, status=np.full_like(seen.status, LOST))
     with pytest.raises(CalibrationError, match="no right hand was found in the capture"):
-        calibrate_take(lost, seen.hands, seen.hands, None)
+        calibrate_take(lost, seen.hands, seen.hands)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel

@@ -15,8 +15,7 @@ from gloves.layout import load_layout
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES, sample_shape
 from track.user import AS_MEASURED, MEASURED, User, UserError, as_user, load_user
 
 

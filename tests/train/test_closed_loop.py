@@ -11,7 +11,7 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.cli.main import main
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.model import hand_keypoints
 from render import RenderConfig, draw
 from render.viewpoints import ViewConfig
 from track.captures import track_capture
@@ -137,7 +137,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["label", "TAKE", "--labeler", "nowhere", "--out", "OUT"], "unknown labeler or glove 'nowhere'"),
         (["label", "missing.trc", "--labeler", "RUN", "--out", "OUT"], "missing.trc: cannot be read"),
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
-        (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "expected 0 or more"),
+        (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "ghosts is -1, expected 0 to 100"),
         (["train", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
         (
             ["train", "SET", "--out", "RUN", "--seed", "5"],

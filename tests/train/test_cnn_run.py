@@ -14,11 +14,11 @@ from train.data.shards import Dataset
 from train.evaluation import evaluate_labeler
 from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
 from train.loop import train_labeler
-from train.settings import CNNConfig, default_config
+from train.settings import CNNConfig, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import DatasetConfig, SceneMix
 
-CONFIG = dataclasses.replace(default_config("cnn"), samples=48, batch=16, average_every=2, precision="32")
+CONFIG = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
 
 FIXED = dataclasses.replace(CONFIG, cnn=CNNConfig(reject=0.04, spread=0.005))
 """Without the choice of these two, which takes as long as many steps."""

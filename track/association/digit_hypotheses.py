@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels import kernel, point_distance, write_quaternion_matrix
 from track.kinematics.marker_kinematics import (
     LIMIT_PRECISION,

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
+from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, move, velocity_of
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.frame_state import peak_log_odds

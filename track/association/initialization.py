@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, squared_distance
 from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of

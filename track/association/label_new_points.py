@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from handsim.kernels import kernel, point_distance
 from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses, empty_hypotheses, evaluate_digit
 from track.association.frame_state import FrameState, Numbering, match_log_odds, match_points

@@ -22,11 +22,9 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.skin.surface import rest_vertices
-from handsim.hand.topology import DIGITS, NUM_BONES, bones_of
+from handsim.hand.model import HandModel, skinned_jacobian
+from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
+from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
 from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (

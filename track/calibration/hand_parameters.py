@@ -18,12 +18,9 @@ from scipy import sparse
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.model import HandModel
-from handsim.hand.shape import ADULTS, HandShape, named_shape
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.skin.subdivision import catmull_clark
-from handsim.hand.skin.surface import build_surface, vertex_normals
-from handsim.hand.topology import DIGITS, NUM_BONES
+from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
+from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
 from handsim.kernels import kernel
 
 LENGTH, BREADTH = 0, 1  # log factors
@@ -260,7 +257,7 @@ class SkinTopology(NamedTuple):
     """Topology and weights, the same for the skins of all hands."""
 
     subdivide: sparse.csr_array
-    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin.surface` to these."""
+    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these."""
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     adjacent: Int[np.ndarray, "F 3"]

@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
 from handsim.errors import ArgumentError, CalibrationError
-from handsim.hand.model import HandModel
-from handsim.hand.shape import HandShape
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.skin.surface import rest_vertices
-from handsim.hand.topology import BONES, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM
+from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape
+from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
     HEIGHT_SPREAD,

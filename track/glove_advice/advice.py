@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, JOINTS
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS
 from track.glove_advice.joint_spread import untold_spreads
 from track.glove_advice.layout_score import LayoutScore
 from track.glove_advice.trials import METHODS

@@ -19,8 +19,8 @@ from gloves.fit import attach_markers
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, BONES, PALM
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import BONE_NAMES, BONES, PALM
+from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import palm_spread
 from track.glove_advice.worn_places import Columns, WornPlaces
 from train.data.batches import Corruption, corrupt
@@ -28,7 +28,7 @@ from train.evaluation import LabelCounts
 from train.labelers.layout_labeler import mean_features, shipped_network
 from train.labelers.layout_training import sample_places
 from train.labelers.matching import match_probabilities, pair_probabilities
-from train.threads import labeling_threads
+from train.labelers.protocol import labeling_threads
 
 _PEOPLE, _POSES_EACH = 40, 40
 _CANDIDATES: Final = 10  # places that are tried at once

@@ -13,7 +13,7 @@ import numpy as np
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, load_layout
 from handsim._checks import check_count, check_number
 from handsim.callbacks import OnStep, no_step
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.space.rig import CameraRig, as_rig
 from track.glove_advice.improvement import Improvement, Worth
 from track.glove_advice.trials import CAPTURES, Trial, try_layout, verdict
 from track.inputs import AnyGlove

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from gloves.fit import GloveFit, attach_markers
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, JOINTS, NUM_JOINTS, PALM
+from handsim.hand.shape import BONE_NAMES, JOINTS, NUM_JOINTS, PALM
 from track.glove_advice.observed_hands import ObservedHand
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import known_hand, tip_lengths

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
 from track.glove_advice.trials import Trial
 from train.data.batches import Corruption, corrupt, paper_corruption
-from train.evaluation import LabelingReport, evaluate_clouds, evaluate_labeler
+from train.evaluation import LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 
@@ -74,7 +74,7 @@ def score_layout(
     some = _some(hands, _JOINT_FRAMES)
     return LayoutScore(
         layout,
-        evaluate_clouds(labeler, cloud),
+        evaluate_frames(labeler, [cloud_frames(cloud)]),
         evaluate_labeler(labeler, markers - center, Corruption(occlude=0, ghosts=0), rng=rng),
         evaluate_labeler(labeler, markers - center, recipe, rng=rng),
         np.isfinite(observed[..., 0]).mean(axis=0),

@@ -13,7 +13,7 @@ from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
-from handsim.space.cameras import ROOM_CENTER, CameraRig
+from handsim.space.rig import ROOM_CENTER, CameraRig
 from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import (
     DatasetConfig,

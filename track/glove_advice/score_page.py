@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.app.page import Section, write_page
-from handsim.hand.topology import DIGITS, JOINTS
+from handsim.hand.shape import DIGITS, JOINTS
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
 from track.glove_advice.trials import METHODS, Trial

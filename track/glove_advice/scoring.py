@@ -13,7 +13,7 @@ from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_type
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.space.rig import CameraRig, as_rig
 from track.glove_advice.advice import advice
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_motion, observe_poses

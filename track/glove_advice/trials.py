@@ -17,13 +17,14 @@ from jaxtyping import Float
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import HandSimWarning
-from handsim.hand.topology import Side
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import Side
+from handsim.space.rig import CameraRig
 from track.captures import label_capture, track_capture
 from track.config import BOTH
-from track.hand_size import sample_frames
-from track.settings import measured_user
+from track.hand_size import measured_user, sample_frames
+from track.settings import USUAL_SIZE
 from track.streams.frame_source import checked_frames
+from track.user import nominal_user
 from train.evaluation import LabelCounts
 from train.labelers.protocol import Labeler
 from train.simulation.scenes import SimulatedKind
@@ -128,9 +129,10 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     sides = [side for side in BOTH if side in layout.sides]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        user = measured_user(sample_frames(checked_frames(capture)), layout, sides, labeler)
+        sample = sample_frames(checked_frames(capture))
+        user = measured_user(sample, nominal_user(layout, USUAL_SIZE, sides), labeler)
         tracked = track_capture(capture, hands=user, labeler=labeler)
-        labeled = label_capture(capture, layout, hands=user, labeler=labeler)
+        labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
     slots, frames = {}, {}
     for name, take in zip(METHODS, (labeled, tracked), strict=True):
         slots[name], frames[name] = _rights(truth, take)

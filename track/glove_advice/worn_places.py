@@ -14,8 +14,8 @@ from gloves.fit import Attachment, GloveFit, wear
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from gloves.optics.visibility import visible_cameras
 from handsim.hand.model import HandModel
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import SIDES
+from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import pose_spreads
 from train.simulation.scenes import sample_hands
 from train.simulation.training_frames import DatasetConfig, sample_single_hand

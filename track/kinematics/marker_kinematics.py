@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.topology import BONES, NUM_BONES, NUM_JOINTS
+from handsim.hand.shape import BONES, NUM_BONES, NUM_JOINTS
 from handsim.kernels import kernel, multiply_rotations, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6

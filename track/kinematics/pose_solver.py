@@ -18,7 +18,7 @@ from gloves.fit import GloveFit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_QPOS
+from handsim.hand.shape import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.kernels import align_rigid, kernel, write_quaternion_matrix
 from track.kinematics.marker_kinematics import (
     MARKER_NOISE,

@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import ADULTS
-from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
+from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
 from handsim.kernels import kernel, write_quaternion_matrix
 from poses.shapes import LIBRARIES, gestures_of
 from track.config import HandOrigin

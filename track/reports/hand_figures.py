@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.takes.take import INITIALIZED, LOST, Take
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 
 RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """What is told of a range of motion, as percentiles."""

@@ -13,9 +13,8 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.page import Section, write_page
-from handsim.files.atomic import written_together
-from handsim.files.outputs import check_ending
-from handsim.hand.topology import JOINTS
+from handsim.files.outputs import check_ending, written_together
+from handsim.hand.shape import JOINTS
 from track.config import Size
 from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures

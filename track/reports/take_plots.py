@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, LOST
-from handsim.hand.topology import DIGITS, JOINT_NAMES
+from handsim.hand.shape import DIGITS, JOINT_NAMES
 from track.reports.hand_figures import HandFigures
 from train.reports.plot_style import BAND, BLUE, CARD, GREEN, LINE, SOFT, VIOLET, WARM
 

@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gloves.takes.take import STATUSES, Take
-from handsim.files.atomic import atomic_write
-from handsim.hand.topology import JOINT_NAMES, JOINTS
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track.reports.hand_figures import RANGE, HandFigures
 from track.take_summary import SuspectSpan
 

@@ -21,13 +21,14 @@ class NetworkAddress(NamedTuple):
 
 
 def split_address(
-    address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None
+    address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None, any_port: bool = False
 ) -> NetworkAddress:
     """Take `scheme://host:port?option=value` apart.
 
     Args:
         options: The valid values of each option, the usual one first.
         port: The usual port; an address must have one where there is none.
+        any_port: Whether port 0 stands for any free one.
     """
     scheme = address.partition("://")[0]
     try:
@@ -39,6 +40,8 @@ def split_address(
     if number is None or parts.path not in ("", "/") or parts.fragment or parts.username is not None:
         suffix = "" if port is None else f" or {scheme}://host"
         raise ArgumentError(f"'{address}' is not an address, expected {scheme}://host:port{suffix}")
+    if number == 0 and not any_port:
+        raise ArgumentError(f"'{address}' is not an address, expected a port from 1 to 65535")
     for name, value in given.items():
         if name not in options:
             nothing = f"unknown option '{name}', there are none"

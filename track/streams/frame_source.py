@@ -1,19 +1,36 @@
-"""Frames of points, and what delivers them: a capture, or a source of the user's own."""
+"""Frames of points, and what delivers them: a capture, or a source that runs in a thread of its own."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import threading
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from gloves.captures.capture import Capture
-from gloves.captures.plausibility import check_place, check_unit
+from gloves.captures.capture import Capture, check_place, check_unit
 from gloves.optics.reconstruction import number_runs
-from track.frames import FARTHEST
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from track.frames import FARTHEST, LATEST_TIME
+
+LEAVE: Final = 1.0
+"""Time for a source to end after `close` [s]."""
+_MOST_WAITING: Final = 1 << 14  # frames that may wait for a reader
+_WAITING: Final = 256  # frames that may wait of a source that is faster than its times; it waits after that
+_PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
+_FEWEST_PACE: Final = 5  # of them
+_SAME_PACE: Final = 1.0  # [s], the longest step of their times, beyond which it begins anew
+_FASTER: Final = 1.5  # times as fast as its frames' times, from which a source is not live
+_SHORT: Final = 0.01  # [s] by which any source may be ahead
+_MOST_ID: Final = 1 << 31  # as takes store them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,3 +98,160 @@ def checked_frames(capture: Capture) -> list[StreamedFrame]:
     check_unit([frame.points for frame in frames])
     check_place(capture, FARTHEST)
     return frames
+
+
+class ArrivingFrames(ABC):
+    """Frames as they arrive, in any order; those that wait for too long for a reader are left out."""
+
+    is_live = True
+    """Whether frames come at their own pace, however slow their reader is."""
+    error: Exception | None = None
+    """Why no further frame comes, if the source failed."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Number of frames that were left out."""
+        self._arrived: deque[StreamedFrame] = deque()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What became of other packets so far, by name."""
+        return {}
+
+    @property
+    @abstractmethod
+    def is_over(self) -> bool:
+        """Whether no further frame comes."""
+
+    @abstractmethod
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        """Wait for a frame, so long at most [s]; returns all that have arrived."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """No frame is wanted but those that have arrived."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """No frame is wanted."""
+
+    def _add(self, frame: StreamedFrame) -> None:
+        self._arrived.append(frame)
+        if len(self._arrived) > _MOST_WAITING:
+            self._arrived.popleft()
+            self.lost += 1
+
+    def _take_all(self) -> list[StreamedFrame]:
+        arrived, self._arrived = list(self._arrived), deque()
+        return arrived
+
+
+class SourceStream(ArrivingFrames):
+    """The checked frames of a source, which is iterated in a thread of its own.
+
+    A source that is faster than the times of its frames is made to wait.
+
+    Args:
+        source: Delivers the frames.
+        name: What messages call it.
+        waits: Whether it may be made to wait; a system that measures goes on.
+
+    Raises:
+        ArgumentError: The source is not a `FrameSource`.
+    """
+
+    def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
+        super().__init__()
+        for method in ("__iter__", "close"):
+            if not callable(getattr(source, method, None)):
+                raise ArgumentError(
+                    f"{name} has no method {method}, expected __iter__ and close of a frame source"
+                )
+        self._source, self._name, self._waits = source, name, waits
+        self._changed = threading.Condition()
+        self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)
+        self._read_all = self._ended = self._closed = False
+        self._thread = threading.Thread(target=self._read, name="frame source", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no further frame comes."""
+        with self._changed:
+            return (self._read_all or self._closed) and not self._arrived
+
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        """Wait for a frame, so long at most [s]; returns all that have arrived."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._arrived or self._read_all or self._closed, seconds)
+            self._changed.notify_all()
+            return self._take_all()
+
+    def end(self) -> None:
+        """Close the source, once."""
+        if self._ended:
+            return
+        self._ended = True
+        try:
+            self._source.close()
+        except Exception as error:  # of the user's code: any; what came before is kept
+            warnings.warn(
+                f"{self._name}: close failed ({type(error).__name__}: {error})", HandSimWarning, stacklevel=3
+            )
+
+    def close(self) -> None:
+        """Close the source."""
+        self.end()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(LEAVE)  # a source that does not listen ends with the process
+
+    def _read(self) -> None:
+        """Take every frame as it arrives."""
+        try:
+            for frame in self._source:
+                if self._ended or not self._put(_checked(frame)):
+                    break
+        except Exception as error:  # of the user's code: any
+            if not self._ended:  # one that is closed while it waits may fail
+                self.error = CaptureError(
+                    f"{self._name}: the stream failed ({type(error).__name__}: {error})"
+                )
+                self.error.__cause__ = error
+        with self._changed:
+            self._read_all = True
+            self._changed.notify_all()
+
+    def _put(self, frame: StreamedFrame) -> bool:
+        """Let a frame wait for the reader; returns whether the reader is still there."""
+        with self._changed:
+            while len(self._arrived) >= _WAITING and not self.is_live and not self._closed:
+                self._changed.wait()
+            if math.isnan(frame.arrived):
+                frame = dataclasses.replace(frame, arrived=time.monotonic())
+            if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
+                self._pace.clear()
+            self._pace.append(frame)
+            if self._waits and len(self._pace) >= _FEWEST_PACE:  # after a restart it is as before until then
+                first, last = self._pace[0], self._pace[-1]
+                span = last.arrived - first.arrived
+                self.is_live = last.time - first.time <= _FASTER * span + _SHORT
+            self._add(frame)
+            self._changed.notify_all()
+            return not self._closed
+
+
+def _checked(frame: StreamedFrame) -> StreamedFrame:
+    """The frame with arrays of the right types, without points that are missing."""
+    if not isinstance(frame, StreamedFrame):
+        raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
+    points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)
+    if points.ndim != 2 or points.shape != (*ids.shape, 3):
+        raise ArgumentError(f"points have shape {points.shape} and IDs {ids.shape}, expected (N, 3) and (N,)")
+    if not abs(frame.time) < LATEST_TIME:
+        raise ArgumentError(f"the time of frame {frame.number} is {frame.time}, expected seconds")
+    if ids.size and not -1 <= ids.min() <= ids.max() < _MOST_ID:
+        raise ArgumentError(f"IDs are from {ids.min()} to {ids.max()}, expected -1 to {_MOST_ID - 1}")
+    there = np.isfinite(points).all(axis=1)
+    return dataclasses.replace(frame, points=points[there], ids=ids[there])

@@ -1,96 +1,145 @@
 """Live streams as a tracker takes them: in order, on a clock that never goes back, and now.
 
-What the reader does not keep up with is dropped, oldest first, and counted.
+Order. Every frame that arrived goes on once, in order; the rest is counted. A frame that continues the stream
+goes on at once. Only behind a gap in the numbers frames are held, until the gap is closed, eight frames are
+held, or their time is up: 30 ms, or five frames of a slower stream; a tenth of a second where others were
+out of order in the last ten seconds. What is then still missing is counted.
+
+A frame continues the stream when its time and its number go on by no more than they explain each other, and
+its time by no more than its arrival and sixteen frames explain. Any other frame is a jump, which is believed
+only when five frames in a row fit together, as those of a recording or a server that starts again. Fewer are
+wild, and left out.
+
+Time. When the stream's time begins anew, it continues here. What the reader does not keep up with is dropped,
+oldest first, and counted.
 """
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
-import threading
 import time
-import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, Any, Final
 
 import numpy as np
 
-from handsim._closing import Closing
-from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from gloves.captures.text import HIGHEST_RATE
+from handsim._checks import check_type
+from handsim._plugins import is_plugin, list_plugins, make_plugin
+from handsim.callbacks import Closing
+from handsim.errors import ArgumentError
+from handsim.settings import Limits, Settings
 from track.frames import FARTHEST, LATEST_TIME
-from track.streams.frame_order import FrameOrder
-from track.streams.frame_source import FrameSource, StreamedFrame
+from track.streams import split_address
+from track.streams.frame_source import LEAVE, ArrivingFrames, SourceStream, StreamedFrame
 
-SILENCE: Final = 2.0
-"""Time without a frame [s] after which a stream yields a silent frame."""
+VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
+"""What an address may be."""
+GROUP: Final = "handsim.frame_sources"
+"""Entry points of packages that bring frame sources."""
 MOST_LAG: Final = 0.03
 """Time [s] for which a frame waits for a reader that was held up, before it is dropped."""
+_SILENCE: Final = 2.0  # [s]
 _LEAST_LAG: Final = 0.01  # [s] for which it waits where the reader is too slow
 _TOO_SLOW: Final = 0.1  # [s] for which frames have waited all the time, from which the reader is too slow
 _FORGIVEN: Final = 2.0  # [s] of a lag that are forgiven, at most
-_CATCHING_UP: Final = 1.0  # [s] per second by which it has to shrink
-_WAITING: Final = 256  # frames that may wait of a source that is faster than its times; it waits after that
-_MOST_WAITING: Final = 1 << 14  # frames that may wait at all
-_PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
-_FEWEST_PACE: Final = 5  # of them
-_SAME_PACE: Final = 1.0  # [s], the longest step of their times, beyond which it begins anew
-_FASTER: Final = 1.5  # times as fast as its frames' times, from which a source is not live
+_CATCHING_UP: Final = 1.0  # [s] per second by which a forgiven lag has to shrink
 _LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and its first, when it starts again
 _STOP: Final = 0.1  # [s] between two looks at whether the stream shall end
-_MOST_ID: Final = 1 << 31  # as takes store them
-_LEAVE: Final = 1.0  # [s] for a source to end after `close`
+_WINDOW: Final = 8  # frames that are held behind a gap, at most
+_REACH: Final = 16  # frames by which a stream may go on at once, beside what the arrival explains
+_LASTING: Final = 5  # frames in a row from which a jump is believed
+_WAIT: Final = 0.03  # [s] for which a frame is held behind a gap
+_WAIT_FRAMES: Final = 5  # or so many frames, if they take longer
+_LONGEST_WAIT: Final = 0.1  # [s], the most of either, and where frames come out of order
+_REMEMBERED: Final = 10.0  # [s] for which a stream that was out of order is taken to be so
+_OLD: Final = 1.0  # [s]: a frame that is older by more belongs to a recording that starts again
+_BURST: Final = 0.5  # [s] from the last frame, within which frames of the same recording may arrive late
+_GOES_ON: Final = 1.0  # [s] by which a jump that lasts may go on with the same recording
+_FIRST_SLACK: Final = 0.05  # [s]: tolerance of a frame's time while the interval is unknown
+_FIRST_WAIT: Final = 0.1  # [s] for which the first frame is held
+_SLACK: Final = 0.001  # [s]: tolerance of time stamps beside half an interval
+_DRIFT: Final = 0.01  # by which two clocks may run at another pace
+_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
+_MOST_CHANGE: Final = 2.0  # factor by which an interval differs from the usual one, at most, as it counts
+_MOST_JUMPING: Final = 4 * _WINDOW  # frames of jumps that are held
+_RECENT: Final = 256  # frames among which one that comes twice is found
+_STRIDES: Final = 16  # frames whose numbers show the server's step
 
 
-class ArrivingFrames(Protocol):
-    """Frames as they arrive, in any order."""
+@dataclass(frozen=True, slots=True)
+class StreamSettings(Settings):
+    """How a live stream is read: keyword arguments of `open_source`."""
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """What became of other packets so far, by name."""
-        ...
+    silence: Annotated[float, Limits(0.0, above=True)] = _SILENCE
+    """Time without a frame after which the stream yields a silent frame [s]."""
 
-    @property
-    def lost(self) -> int:
-        """Number of frames that waited too long to be asked for, and were left out."""
-        ...
 
-    @property
-    def is_live(self) -> bool:
-        """Whether frames come at their own pace, however slow their reader is."""
-        ...
+def check_address(address: str) -> None:
+    """Refuse by an `ArgumentError` what is not an address of a stream; no server is asked."""
+    check_type("address", address, str, f"one of {', '.join(VALID)}")
+    scheme, _, rest = address.rpartition("://")
+    name = rest.partition("?")[0]
+    if scheme not in ("natnet", "qtm") and (scheme or not (is_plugin(name) or name in list_plugins(GROUP))):
+        raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
 
-    @property
-    def is_over(self) -> bool:
-        """Whether no further frame comes."""
-        ...
 
-    @property
-    def error(self) -> Exception | None:
-        """Why it is over, if it failed."""
-        ...
+def open_source(
+    address: str,
+    settings: StreamSettings | None = None,
+    *,
+    ended: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> LiveStream:
+    """Open a live stream, the frames of which are iterated in a `with` block.
 
-    def poll(self, seconds: float) -> Sequence[StreamedFrame]:
-        """Wait for a frame, so long at most [s]; returns all that have arrived."""
-        ...
+    A frame has `points` (N, 3) [m], `ids` (N,) and a `time` [s] that never goes back, as `Tracker.step` takes
+    them. Frames that are not kept up with are dropped, oldest first, see `LiveStream`.
 
-    def end(self) -> None:
-        """No frame is wanted but those that have arrived."""
-        ...
+    Args:
+        address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own.
+        settings: How to read it; as `StreamSettings()` when not given.
+        ended: The stream ends when this is true; it is asked before each frame, and several times a second
+            while none comes.
+        options: Fields of `StreamSettings` that differ from `settings`.
 
-    def close(self) -> None:
-        """No frame is wanted."""
-        ...
+    Raises:
+        ArgumentError: The address is invalid, or there is no such source.
+        CaptureError: No server answers.
+    """
+    settings = StreamSettings.of(settings, options)
+    check_address(address)
+    return LiveStream(_open_frames(address), silence=settings.silence, ended=ended)
+
+
+def _open_frames(address: str) -> ArrivingFrames:
+    """The frames of an address as they arrive."""
+    if address.startswith("natnet://"):
+        from track.streams.natnet import open_stream
+
+        return open_stream(address)
+    if address.startswith("qtm://"):
+        from track.streams.qualisys import PORT, QualisysSource
+
+        host, port, _ = split_address(address, options={}, port=PORT)
+        return SourceStream(QualisysSource(host, port), address, waits=False)
+    source = make_plugin(address, group=GROUP, noun="frame source")
+    return SourceStream(source, address.partition("?")[0])
 
 
 class LiveStream(Closing, Iterator[StreamedFrame]):
     """Frames of a live stream as a tracker takes them; the end of a `with` block or `close` ends it.
 
-    They are in order (`track.streams.frame_order`), and their time never goes back: when the stream's time
-    begins anew, as in a recording that starts again, it continues. During a silence frames without points
-    come, at the time that has passed. Points 1000 m or more from the origin are left out and counted. A frame
-    that has waited for `MOST_LAG` while newer ones came is dropped and counted; where the reader is too slow,
-    so that frames wait all the time, a third of that.
+    They are in order, and their time never goes back: when the stream's time begins anew, as in a recording
+    that starts again, it continues. During a silence frames without points come, at the time that has passed.
+    Points 1000 m or more from the origin are left out and counted. A frame that has waited for `MOST_LAG`
+    while newer ones came is dropped and counted; where the reader is too slow, so that frames wait all the
+    time, a third of that.
 
     Args:
         frames: The frames as they arrive.
@@ -103,7 +152,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self,
         frames: ArrivingFrames,
         *,
-        silence: float = SILENCE,
+        silence: float = _SILENCE,
         ended: Callable[[], bool] = lambda: False,
     ) -> None:
         self.order = FrameOrder()
@@ -129,16 +178,16 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         All that were received were in order, reordered, doubled, late or with wild times, or wait; those that
         were dropped were in order or reordered.
         """
-        order = self.order
+        order, lost = self.order, self._frames.lost
         return {
-            "received_frames": order.received + self._frames.lost,
+            "received_frames": order.received + lost,
             "frames_in_order": order.passed - order.reordered,
             "reordered_frames": order.reordered,
             "doubled_frames": order.doubled,
             "late_frames": order.late,
             "frames_with_wild_times": order.wild,
-            "dropped_frames": self.dropped + self._frames.lost,
-            "missing_frames": max(order.missed - self._frames.lost, 0),
+            "dropped_frames": self.dropped + lost,
+            "missing_frames": max(order.missed - lost, 0),
             "missing_at_end": order.missing_at_end(self._end_at) if self._end_at < math.inf else 0,
             "restarts": order.restarts,
             "points_out_of_range": self.far_points,
@@ -202,11 +251,9 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             passed = (*self.order.expire(frame.arrived), *self.order.add(frame))
             self._ready.extend((one, frame.arrived) for one in passed)
         now = time.monotonic()
-        if self._frames.is_over or now > self._end_at + _LEAVE:
-            self._ready.extend((one, now) for one in self.order.end())
-            self._over = True
-        else:
-            self._ready.extend((one, now) for one in self.order.expire(now))
+        self._over = self._frames.is_over or now > self._end_at + LEAVE
+        waited = self.order.end() if self._over else self.order.expire(now)
+        self._ready.extend((one, now) for one in waited)
 
     def _drop_old(self) -> None:
         """Leave out what has waited for too long while newer frames came."""
@@ -240,136 +287,307 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
     def _silent(self) -> StreamedFrame:
         """A frame that stands for a silence."""
         now, last = time.monotonic(), self._last
-        number, told = (last.number, last.time + now - last.arrived) if last is not None else (0, 0.0)
+        number, shown = (last.number, last.time + now - last.arrived) if last is not None else (0, 0.0)
         return StreamedFrame(
-            number, told, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True, arrived=now
+            number, shown, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True, arrived=now
         )
 
 
-class SourceStream:
-    """The checked frames of a source of the user's own, which is iterated in a thread of its own.
+class FrameOrder:
+    """Decides which frames go on, in which order, and counts what becomes of the others."""
 
-    One that is faster than the times of its frames is made to wait.
-
-    Args:
-        source: Delivers the frames.
-        name: What messages call it.
-        waits: Whether it may be made to wait; a system that measures goes on.
-
-    Raises:
-        ArgumentError: The source is not a `FrameSource`.
-    """
-
-    def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
-        for method in ("__iter__", "close"):
-            if not callable(getattr(source, method, None)):
-                raise ArgumentError(
-                    f"{name} has no method {method}, expected __iter__ and close of a frame source"
-                )
-        self.lost = 0
-        """Number of frames that waited too long to be asked for, and were left out."""
-        self.error: CaptureError | None = None
-        """Why it is over, if it failed."""
-        self._source, self._name, self._waits = source, name, waits
-        self._changed = threading.Condition()
-        self._arrived: deque[StreamedFrame] = deque()
-        self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)
-        self._ahead = self._read_all = self._ended = self._closed = False
-        self._thread = threading.Thread(target=self._read, name="frame source", daemon=True)
-        self._thread.start()
+    def __init__(self) -> None:
+        self.received = 0
+        """Number of frames that came."""
+        self.passed = 0
+        """Number of frames that went on."""
+        self.reordered = 0
+        """Number of those that came after one that they precede."""
+        self.doubled = 0
+        """Number of frames that came again."""
+        self.late = 0
+        """Number of frames that came too late to go on in order."""
+        self.wild = 0
+        """Number of frames with a time or a number that the stream did not follow."""
+        self.missed = 0
+        """Number of frames that never arrived, by the frame numbers."""
+        self.restarts = 0
+        """How often the time of the stream began anew."""
+        self._last: StreamedFrame | None = None
+        self._first: StreamedFrame | None = None  # since the time began
+        self._held: list[StreamedFrame] = []  # behind a gap, by their times
+        self._jumping: dict[StreamedFrame, int] = {}  # as they came, and how many had gone on by then
+        self._in_a_row = 0  # of them
+        self._recent: dict[tuple[int, float], float] = {}  # number and time of those that went on: arrival
+        self._strides: deque[int] = deque(maxlen=_STRIDES)
+        self._interval: float | None = None  # [s] per frame number
+        self._disordered = -math.inf  # [s], when a frame came out of order
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Nothing beside frames comes."""
-        return {}
+    def interval(self) -> float:
+        """Time from frame to frame [s]; NaN while it is not known."""
+        return math.nan if self._interval is None else self._interval * self._stride
+
+    def missing_at_end(self, end: float) -> int:
+        """How many frames could have been sent after the last one, until some time [s]; 0 for one or two."""
+        if self._last is None or self._interval is None:
+            return 0
+        missing = math.floor((end - self._last.arrived) / self.interval)
+        return missing if missing > 2 else 0
 
     @property
-    def is_live(self) -> bool:
-        """Whether frames come no faster than their times go on."""
-        return not self._ahead
+    def deadline(self) -> float:
+        """When `expire` is to be called [s]; infinite when nothing waits."""
+        if self._held:
+            return min(frame.arrived for frame in self._held) + self._wait
+        if self._last is None and self._jumping:
+            return next(iter(self._jumping)).arrived + _FIRST_WAIT
+        return math.inf
 
-    @property
-    def is_over(self) -> bool:
-        """Whether no further frame comes."""
-        with self._changed:
-            return (self._read_all or self._closed) and not self._arrived
+    def add(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
+        """The frames that go on now that another has arrived."""
+        self.received += 1
+        last = self._last
+        if not abs(frame.time) < LATEST_TIME:
+            self.wild += 1
+        elif frame.restarted:
+            yield from self.end()
+            yield from self._begin([frame], restarted=self._last is not None)
+        elif self._is_again(frame):
+            self.doubled += 1
+        elif last is not None and self._is_late(last, frame):
+            self.late += 1
+            if self._first is not None and frame.time > self._first.time:
+                self.missed -= self.missed > 0  # it was missing when others went on
+            self._remember(frame)
+            self._disordered = frame.arrived
+        elif last is not None and self._is_next(last, frame):
+            self._settle(last, frame)
+            self._hold(frame)
+            yield from self._release()
+        else:
+            yield from self._doubt(frame)
 
-    def poll(self, seconds: float) -> list[StreamedFrame]:
-        """Wait for a frame, so long at most [s]; returns all that have arrived."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._arrived or self._read_all or self._closed, seconds)
-            arrived, self._arrived = list(self._arrived), deque()
-            self._changed.notify_all()
-        return arrived
-
-    def _read(self) -> None:
-        """Take every frame as it arrives, in a thread of its own."""
-        try:
-            for frame in self._source:
-                if self._ended or not self._put(_checked(frame)):
-                    break
-        except Exception as error:  # of the user's code: any
-            if not self._ended:  # one that is closed while it waits may fail
-                self.error = CaptureError(
-                    f"{self._name}: the stream failed ({type(error).__name__}: {error})"
-                )
-                self.error.__cause__ = error
-        with self._changed:
-            self._read_all = True
-            self._changed.notify_all()
-
-    def _put(self, frame: StreamedFrame) -> bool:
-        """Let a frame wait for the reader; returns whether the reader is still there."""
-        with self._changed:
-            while len(self._arrived) >= _WAITING and self._ahead and not self._closed:
-                self._changed.wait()
-            if math.isnan(frame.arrived):
-                frame = dataclasses.replace(frame, arrived=time.monotonic())
-            if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
-                self._pace.clear()
-            self._pace.append(frame)
-            if self._waits and len(self._pace) >= _FEWEST_PACE:  # after a restart, it is as before until then
-                first, last = self._pace[0], self._pace[-1]
-                span = last.arrived - first.arrived
-                self._ahead = last.time - first.time > _FASTER * span + _LOOP_GAP
-            self._arrived.append(frame)
-            if len(self._arrived) > _MOST_WAITING:
-                self._arrived.popleft()
-                self.lost += 1
-            self._changed.notify_all()
-            return not self._closed
-
-    def end(self) -> None:
-        """Close the source, once."""
-        if self._ended:
+    def expire(self, now: float) -> Iterator[StreamedFrame]:
+        """The held frames whose time is up, because what they waited for did not come."""
+        if not self.deadline <= now:
             return
-        self._ended = True
-        try:
-            self._source.close()
-        except Exception as error:  # of the user's code: any; what came before is kept
-            warnings.warn(
-                f"{self._name}: close failed ({type(error).__name__}: {error})", HandSimWarning, stacklevel=3
-            )
+        if self._last is None:
+            yield from self._begin(self._largest_group())
+            return
+        while self._held and self.deadline <= now:
+            yield self._pass(self._held.pop(0))
+        yield from self._release()
 
-    def close(self) -> None:
-        """Close the source."""
-        self.end()
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(_LEAVE)  # a source that does not listen ends with the process
+    def end(self) -> Iterator[StreamedFrame]:
+        """All frames that are held; a jump that has not lasted is left out."""
+        if self._last is None and self._jumping:
+            yield from self._begin(self._largest_group())
+        yield from self._flush()
+        self._leave_out_jumping(len(self._jumping))
+
+    @property
+    def _wait(self) -> float:
+        """For how long a frame is held behind a gap [s]."""
+        newest = max(frame.arrived for frame in self._held)
+        if newest - self._disordered < _REMEMBERED or self._interval is None:
+            return _LONGEST_WAIT
+        return min(max(_WAIT, _WAIT_FRAMES * self.interval), _LONGEST_WAIT)
+
+    @property
+    def _stride(self) -> int:
+        """By how much numbers go on from frame to frame; some servers send every other frame only."""
+        return max(1, min(self._strides)) if len(self._strides) == _STRIDES else 1
+
+    def _hold(self, frame: StreamedFrame) -> None:
+        """Put a frame among those that are held."""
+        if self._held and frame.time < self._held[-1].time:
+            self.reordered += 1
+            self._disordered = frame.arrived
+        bisect.insort(self._held, frame, key=lambda one: one.time)
+
+    def _release(self) -> Iterator[StreamedFrame]:
+        """Pass on what nothing is missing before, or too much is held behind."""
+        while self._held and (len(self._held) > _WINDOW or not self._is_behind_gap()):
+            yield self._pass(self._held.pop(0))
+
+    def _flush(self) -> Iterator[StreamedFrame]:
+        """Pass on all that is held."""
+        while self._held:
+            yield self._pass(self._held.pop(0))
+
+    def _is_behind_gap(self) -> bool:
+        """Whether a frame is missing before the first one that is held.
+
+        Where a later one has the number that it should have, its own number is wrong, not the order.
+        """
+        last = self._last
+        if last is None or not self._missing(last, self._held[0]):
+            return False
+        return all(one.number - last.number > place for place, one in enumerate(self._held, start=1))
+
+    def _pass(self, frame: StreamedFrame) -> StreamedFrame:
+        """Let a frame go on."""
+        last, self._last = self._last, frame
+        self.passed += 1
+        self._remember(frame)
+        if last is None or frame.restarted:
+            return frame
+        self.missed += self._missing(last, frame)
+        span, steps = frame.time - last.time, frame.number - last.number
+        if steps >= 1 and span > 0.0:
+            self._strides.append(steps)
+            newest = span / steps
+            usual = newest if self._interval is None else self._interval
+            newest = min(max(newest, usual / _MOST_CHANGE), usual * _MOST_CHANGE)
+            self._interval = usual + _SMOOTHING * (newest - usual)
+        return frame
+
+    def _doubt(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
+        """Hold a frame that jumps, or believe it and those that it fits to."""
+        self._jumping[frame] = self.passed
+        group = self._group_of(frame)
+        self._in_a_row = min(self._in_a_row + 1, len(group))
+        if self._in_a_row >= _LASTING:
+            yield from self._begin(group)
+        elif len(self._jumping) > _MOST_JUMPING:
+            self._leave_out_jumping(1)
+
+    def _settle(self, last: StreamedFrame, frame: StreamedFrame) -> None:
+        """The stream goes on: of the frames that jump, those before this one were right."""
+        self._in_a_row = 0
+        right = [
+            one for one in self._jumping if last.time < one.time < frame.time and self._continues(one, frame)
+        ]
+        for one in right:
+            del self._jumping[one]
+            self._hold(one)
+        self._leave_out_jumping(sum(self.passed - passed > _WINDOW for passed in self._jumping.values()))
+
+    def _leave_out_jumping(self, count: int) -> None:
+        """The oldest of the frames that jump were wild."""
+        self.wild += count
+        for one in list(self._jumping)[:count]:
+            del self._jumping[one]
+
+    def _group_of(self, frame: StreamedFrame) -> list[StreamedFrame]:
+        """The frames that jump to the same place as one of them, as they came."""
+        group = [one for one in self._jumping if one is frame or self._fit(one, frame)]
+        ordered = _increasing(sorted(group, key=lambda one: one.time))
+        return [one for one in group if one in ordered]
+
+    def _largest_group(self) -> list[StreamedFrame]:
+        return max((self._group_of(one) for one in self._jumping), key=len)
+
+    def _begin(self, group: list[StreamedFrame], *, restarted: bool | None = None) -> Iterator[StreamedFrame]:
+        """Go on with frames that jumped: with the same recording, or with another one."""
+        for one in group:
+            self._jumping.pop(one, None)
+        self._leave_out_jumping(len(self._jumping))
+        self._in_a_row = 0
+        yield from self._flush()
+        ordered = sorted(group, key=lambda one: one.time)
+        last = self._last
+        if restarted is None:
+            restarted = last is not None and not self._goes_on(ordered[0])
+        if last is None or restarted:
+            self.restarts += restarted
+            self._first = ordered[0]
+            self._recent.clear()
+            self._strides.clear()
+            self._interval = _usual_interval(ordered)
+        for one in group:
+            self._hold(one)
+        if restarted:
+            self._held[0] = dataclasses.replace(self._held[0], restarted=True)
+            yield self._pass(self._held.pop(0))
+        yield from self._release()
+
+    def _is_again(self, new: StreamedFrame) -> bool:
+        """Whether a frame is one that came before."""
+        key = new.number, new.time
+        came = [one.arrived for one in (*self._held, *self._jumping) if (one.number, one.time) == key]
+        came.append(self._recent.get(key, -math.inf))
+        return any(abs(arrived - new.arrived) < _BURST for arrived in came)
+
+    def _remember(self, frame: StreamedFrame) -> None:
+        """Know a frame that went on, or was too late, when it comes again."""
+        self._recent[frame.number, frame.time] = frame.arrived
+        if len(self._recent) > _RECENT:
+            del self._recent[next(iter(self._recent))]
+
+    def _is_late(self, last: StreamedFrame, new: StreamedFrame) -> bool:
+        """Whether a frame precedes one that has gone on."""
+        return -_OLD < new.time - last.time <= 0.0 and new.arrived - last.arrived < _BURST
+
+    def _is_next(self, last: StreamedFrame, new: StreamedFrame) -> bool:
+        """Whether a frame follows the last one, or is one of those that are held behind a gap."""
+        if new.time <= last.time:
+            return False
+        return self._continues(last, new) or bool(self._held and self._fit(self._held[-1], new))
+
+    def _continues(self, last: StreamedFrame, new: StreamedFrame) -> bool:
+        """Whether a frame follows another: time and number go on by no more than is explained."""
+        return new.time - last.time <= self._reach(new.arrived - last.arrived) and self._agrees(last, new)
+
+    def _fit(self, one: StreamedFrame, other: StreamedFrame) -> bool:
+        """Whether two frames are of the same recording, in any order."""
+        first, second = sorted((one, other), key=lambda frame: frame.time)
+        span, steps = second.time - first.time, second.number - first.number
+        if not 0.0 < span <= self._reach(abs(one.arrived - other.arrived)):
+            return False
+        rate = HIGHEST_RATE if self._interval is None else 1.5 / self._interval
+        return 0 <= steps <= rate * (span + _SLACK) + 1.0
+
+    def _reach(self, waited: float) -> float:
+        """By how much a frame's time may go on that came so much later than another [s]."""
+        ahead = _FIRST_SLACK if self._interval is None else (_REACH + 0.5) * self.interval + _SLACK
+        return waited + ahead
+
+    def _agrees(self, last: StreamedFrame, new: StreamedFrame) -> bool:
+        """Whether time and number go on by no more than they explain each other, or the arrival the time."""
+        span, waited = new.time - last.time, new.arrived - last.arrived
+        steps = new.number - last.number
+        if self._interval is None:
+            return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= HIGHEST_RATE * span + 1.0
+        longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _SLACK
+        return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
+
+    def _goes_on(self, new: StreamedFrame) -> bool:
+        """Whether a jump that lasts goes on with the recording, of which frames are missing.
+
+        As many as could have been sent since the recording began, by when they arrived.
+        """
+        last, first = self._last, self._first
+        if last is None or first is None:
+            return True
+        possible = (1.0 + _DRIFT) * (new.arrived - first.arrived) + _GOES_ON
+        if new.time - first.time > possible:
+            return False
+        return 0.0 < new.time - last.time <= _GOES_ON or self._agrees(last, new)
+
+    def _missing(self, last: StreamedFrame, new: StreamedFrame) -> int:
+        """The number of frames between two, as far as their times agree with their numbers."""
+        steps = new.number - last.number
+        if self._interval is not None:
+            steps = min(steps, round(1.5 * (new.time - last.time) / self._interval))
+        return max(-(-steps // self._stride) - 1, 0)
 
 
-def _checked(frame: StreamedFrame) -> StreamedFrame:
-    """The frame with arrays of the right types, without points that are missing."""
-    if not isinstance(frame, StreamedFrame):
-        raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
-    points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)
-    if points.ndim != 2 or points.shape != (*ids.shape, 3):
-        raise ArgumentError(f"points have shape {points.shape} and IDs {ids.shape}, expected (N, 3) and (N,)")
-    if not abs(frame.time) < LATEST_TIME:
-        raise ArgumentError(f"the time of frame {frame.number} is {frame.time}, expected seconds")
-    if ids.size and not -1 <= ids.min() <= ids.max() < _MOST_ID:
-        raise ArgumentError(f"IDs are from {ids.min()} to {ids.max()}, expected -1 to {_MOST_ID - 1}")
-    there = np.isfinite(points).all(axis=1)
-    return dataclasses.replace(frame, points=points[there], ids=ids[there])
+def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
+    """As many of some frames, by their times, as have numbers that do not go back."""
+    longest: list[list[StreamedFrame]] = []
+    for frame in ordered:
+        before = [chain for chain in longest if chain[-1].number <= frame.number]
+        longest.append([*max(before, key=len, default=[]), frame])
+    return max(longest, key=len, default=[])
+
+
+def _usual_interval(ordered: list[StreamedFrame]) -> float | None:
+    """Time per number of frames in order [s]; None where their numbers do not go on."""
+    intervals = [
+        (second.time - first.time) / (second.number - first.number)
+        for first, second in pairwise(ordered)
+        if second.number > first.number and second.time > first.time
+    ]
+    return float(np.median(intervals)) if intervals else None

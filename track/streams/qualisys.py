@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim._extras import import_extra
+from handsim._plugins import import_extra
 from handsim.errors import CaptureError
 from track.streams.frame_source import StreamedFrame
 

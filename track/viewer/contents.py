@@ -11,14 +11,14 @@ import numpy as np
 
 from gloves.captures.formats import READABLE, read_capture
 from gloves.layout import list_layouts, load_layout
+from gloves.takes.archives import is_growing
 from gloves.takes.corrections import corrections_path, told
-from gloves.takes.growing import is_growing
 from gloves.takes.take import load_take
 from handsim.errors import ArgumentError, FileError, HandSimWarning
-from handsim.files.atomic import read_toml
+from handsim.files.inputs import read_toml
 from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
-from handsim.space.cameras import CameraRig, list_rigs, load_rig
+from handsim.space.rig import CameraRig, list_rigs, load_rig
 from track.user import load_user
 from track.viewer.corrector import Corrector
 from track.viewer.frame_view import FrameView

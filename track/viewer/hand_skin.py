@@ -9,13 +9,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 
 if TYPE_CHECKING:
     from viser import MeshSkinnedHandle, ViserServer
 
-    from handsim.hand.topology import Side
+    from handsim.hand.shape import Side
 
 
 SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}

@@ -13,10 +13,10 @@ import numpy as np
 from gloves.fit import GloveFit, attach, place_marker
 from gloves.layout import MarkerLayout, moved_text
 from handsim.errors import LayoutError
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.viewer.hand_skin import HandSkin
 from track.viewer.point_balls import PointBalls
 from track.viewer.stage import set_stage

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.takes.take import label_names
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS
 from track.frames import TrackedFrame
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
@@ -21,7 +21,7 @@ from track.viewer.timeline import PICTURES
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from handsim.space.cameras import CameraRig
+    from handsim.space.rig import CameraRig
 
 
 _MOST_POINTS: Final = 400

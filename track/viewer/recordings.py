@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from gloves.captures.capture import Capture
 from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.hand.model import HandModel
-from handsim.space.cameras import CameraRig, as_rig, list_rigs
+from handsim.space.rig import CameraRig, as_rig, list_rigs
 from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 

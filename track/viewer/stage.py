@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.space.cameras import ROOM_CENTER, CameraRig
+from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rotation_quaternions
 
 if TYPE_CHECKING:

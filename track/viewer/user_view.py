@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.fit import GloveFit, nominal_fit
-from handsim.hand.shape import SIZES
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS, SIZES
 from track.viewer.hand_skin import HandSkin
 from track.viewer.point_balls import PointBalls
 from track.viewer.stage import set_stage

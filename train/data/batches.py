@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_callable, check_number, check_rng, check_type, shown_value
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES
 from train.data.shards import MappedRows
 
 _MOST: Final = 100  # points to add to a cloud or drop from it

@@ -27,11 +27,10 @@ from handsim._checks import check_type
 from handsim.app.output import Place, place_of
 from handsim.errors import DatasetError, LayoutError, choices
 from handsim.files.arrays import check_npy_header
-from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
-from handsim.hand.shape import HAND_DTYPE, HandShape, unpack_hand
-from handsim.hand.topology import NUM_QPOS
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import HAND_DTYPE, NUM_QPOS, HandShape, unpack_hand
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"

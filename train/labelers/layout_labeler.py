@@ -26,23 +26,29 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gloves.layout import MarkerLayout
-from handsim._version import __version__
+from handsim import __version__
 from handsim.errors import WeightsError
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import checksum
 from handsim.files.json_files import save_json
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import CameraRig, as_rig
+from handsim.files.outputs import atomic_write, written_together
+from handsim.hand.shape import SIDES
+from handsim.space.rig import CameraRig, as_rig
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.labelers.pose_prior import PosePrior, learn_pose_prior
-from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.protocol import (
+    Labeling,
+    label_by_scores,
+    label_in_batches,
+    labeling_threads,
+    pad_clouds,
+    torch_threads,
+)
 from train.labelers.storage import LEARNED, learned_folder, learned_gloves
-from train.settings import TrainSettings, batch_recipe
+from train.settings import TrainSettings
 from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import DatasetConfig, sample_single_hand, simulate_frames
-from train.threads import labeling_threads, torch_threads
 
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""
@@ -288,7 +294,7 @@ def fine_tuned_labeler(
     labeler = LayoutLabeler.at_once(layout, seed=seed)
     rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
     network = copy.deepcopy(labeler.network).train()
-    recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
+    recipe = TrainSettings(batch=_BATCH).batch_recipe(layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):

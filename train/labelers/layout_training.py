@@ -24,16 +24,16 @@ from jaxtyping import Float, Float16, Int
 from gloves.fit import attach_markers, wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES, PALM, SIDES
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
 from train.data.batches import Cloud, Corruption, corrupt, stretched
 from train.labelers.layout_labeler import save_layout_network
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.labelers.protocol import torch_threads
 from train.simulation.scenes import sample_hands
 from train.simulation.training_frames import DatasetConfig, sample_frame_scene
-from train.threads import torch_threads
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least

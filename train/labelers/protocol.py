@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -13,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
-from gloves.captures.plausibility import check_unit
+from gloves.captures.capture import check_unit
+from handsim._checks import check_count
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError, WeightsError
 from train.labelers.matching import match_scores
@@ -23,7 +26,9 @@ LABELERS: Final = "handsim.labelers"
 """Group of entry points of labelers."""
 _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
+MOST_THREADS: Final = 1024
 _BATCH: Final = 256
+_threads: ContextVar[int] = ContextVar("threads of labelers", default=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +154,41 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
     if len(cloud) > MAX_POINTS:
         raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     return cloud
+
+
+def label_on(threads: int) -> None:
+    """Have labelers use this many threads from now on; it is one when this is never called.
+
+    Raises:
+        ArgumentError: `threads` is less than 1.
+    """
+    check_count("threads", threads, 1, MOST_THREADS)
+    _threads.set(threads)
+
+
+@contextmanager
+def labeling_threads() -> Iterator[None]:
+    """Within the block torch uses the threads of labelers."""
+    with torch_threads(_threads.get()):
+        yield
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Within the block torch and labelers use this many threads.
+
+    Torch's own default, a thread a core, makes a small network many times slower where others compute too:
+    its threads wait for one another in every operation.
+    """
+    import torch
+
+    before, token = torch.get_num_threads(), _threads.set(count)
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _threads.reset(token)
 
 
 class OwnLabeler:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.kernels import kernel
 from poses.shapes import sample_valid_angles
 

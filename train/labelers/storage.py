@@ -16,7 +16,7 @@ import io
 import json
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -27,14 +27,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, list_layouts, load_layout
+from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
-from handsim._version import __version__
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
-from handsim.files.atomic import atomic_write, written_together
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
-from handsim.files.names import plain_path
+from handsim.files.outputs import atomic_write, plain_path, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
 from train.labelers.pose_prior import PosePrior
@@ -56,6 +55,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 
+ANY_LAYOUT: Final = "any-layout"
+"""Name of the labeler that needs no training."""
 LEARNED: Final = ".safetensors"
 """How the files in `learned_folder` end."""
 WEIGHTS: Final = "labeler.safetensors"
@@ -68,6 +69,163 @@ _LEAST_BYTES: Final = 4  # of a number of a network
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
+_FEW_POSES: Final = 6000  # from which a layout is known that nobody asked for
+_EXPECTED: Final = (
+    "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
+    "module:name"
+)
+_NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
+_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
+_CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
+_ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
+_MATCHING: Final = "handsim.matching"  # key of the constants that labels are chosen by, for other programs
+_IMAGES: Final = "images"  # its input
+_INPUTS: Final = "points", "present"
+_OUTPUTS: Final = "point_scores", "label_scores"
+_PAIRED: Final = "pairs", "costs"  # outputs for other programs
+_OPSET: Final = 17
+_DESCRIPTION: Final = (
+    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
+    "bfloat16 by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
+)
+_MEANINGS: Final = {
+    "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
+    "none.",
+    "present": "Whether a row of points is one.",
+    "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
+    "the last column is a ghost.",
+    "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
+    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
+    "ghost.",
+    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
+    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
+    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
+    "there is none.",
+    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
+    "image's width.",
+}
+"""What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
+_HINT: Final = "install it with: pip install 'handsim[onnx]'"
+
+
+def load_labeler(
+    glove: MarkerLayout | Labeler | str | Path, labeler: Labeler | str | Path | None = None
+) -> Labeler:
+    """The labeler of a glove, or a labeler by its name, path or object.
+
+    A glove without a labeler of its own gets the one for any layout, which learns the layout within a minute.
+    Only shipped labelers, folders and the one for any layout need torch.
+
+    Args:
+        glove: A marker layout, or its name or path, whose labeler is wanted. Or, where `labeler` is not
+            given, a labeler: a folder that `handsim train` wrote, an .onnx file, `module:name` of a `Labeler`
+            or of a class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
+        labeler: A labeler like these, or `any-layout`, to be used with this glove; it is checked against the
+            glove's markers.
+
+    Returns:
+        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
+
+    Raises:
+        ArgumentError: An argument is none of these, or `any-layout` is given without a glove.
+        LayoutError: The glove is unknown.
+        WeightsError: The labeler is unknown, damaged, or knows other markers.
+
+    Warns:
+        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout; or such a
+            glove is nearly its own mirror image.
+    """
+    if labeler is None and not _is_glove(glove):
+        return _resolved(glove)
+    layout = load_layout(glove)  # type: ignore[arg-type]
+    if labeler is None:
+        return _shipped_labeler(layout) or _any_layout_labeler(layout, glove)  # type: ignore[arg-type]
+    if labeler == ANY_LAYOUT:
+        from train.labelers.layout_labeler import learned_labeler  # torch
+
+        return learned_labeler(layout)
+    found = _resolved(labeler)
+    if found.marker_names != layout.names:
+        raise WeightsError(
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{layout.name}' has "
+            f"{', '.join(layout.names)}; name the glove that it was trained on (--glove)"
+        )
+    return found
+
+
+@functools.lru_cache(maxsize=32)
+def labeler_at_once(layout: MarkerLayout) -> Labeler:
+    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    shipped = _shipped_labeler(layout)
+    if shipped is not None:
+        return shipped
+    from train.labelers.layout_labeler import LayoutLabeler, is_learned, learned_labeler  # torch
+
+    return (
+        learned_labeler(layout) if is_learned(layout) else LayoutLabeler.at_once(layout, num_poses=_FEW_POSES)
+    )
+
+
+def _is_glove(given: Any) -> bool:
+    return (
+        isinstance(given, MarkerLayout)
+        or str(given) in list_layouts()
+        or (isinstance(given, str | Path) and Path(given).suffix.lower() == ".toml")
+    )
+
+
+def _resolved(labeler: Any) -> Labeler:
+    """A labeler as it is, or by its name or path."""
+    if labeler == ANY_LAYOUT:
+        raise ArgumentError(
+            f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
+            "MarkerLayout, or the name or path of one"
+        )
+    if hasattr(labeler, "label_frames") and not isinstance(labeler, type):
+        ours = type(labeler).__module__.startswith("train.")
+        return labeler if ours else OwnLabeler(labeler)
+    check_type("labeler", labeler, (str, Path), _EXPECTED, list_layouts())
+    name, path = str(labeler), Path(labeler)
+    if path.suffix.lower() == ".onnx":
+        return OnnxLabeler(path)
+    if not path.exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
+        return OwnLabeler(name)
+    return _read(*_files(name)).labeler()
+
+
+def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
+    """The labeler that comes with handsim for a layout, if one does."""
+    found = (name for name in shipped_labelers() if load_layout(name) == layout)
+    return next((_read(*_files(name)).labeler() for name in found), None)
+
+
+def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
+    """The labeler for any layout, after a warning that it is this one."""
+    from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
+    from train.labelers.side import is_mirror_like  # kernels
+
+    own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
+    name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
+    how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
+    warnings.warn(
+        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
+        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
+        "train SET --out RUN, and --labeler RUN",
+        HandSimWarning,
+        stacklevel=3,
+    )
+    if is_mirror_like(layout):
+        warnings.warn(
+            f"glove '{name}' is nearly its own mirror image, so that right and left may be exchanged for a "
+            "whole capture; put a marker on the thumb, or move those on the back away from any symmetry",
+            HandSimWarning,
+            stacklevel=3,
+        )
+    return learned_labeler(layout)
 
 
 def learned_folder() -> Path:
@@ -86,50 +244,23 @@ def shipped_labelers() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if path.stem != _ANY_LAYOUT))
 
 
-def load_stored_labeler(name_or_path: str | Path) -> Labeler:
-    """A labeler: the shipped one of a glove, one that was trained or exported, or one of your own.
-
-    Args:
-        name_or_path: A glove with a shipped labeler, a folder that `handsim train` wrote, an .onnx file,
-            `module:name` of a `Labeler` or of a class of them, or the name of an entry point of the group
-            `handsim.labelers`.
-
-    Returns:
-        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
-
-    Raises:
-        WeightsError: Unknown, damaged, or not a labeler's weights.
-    """
-    if Path(name_or_path).suffix.lower() == ".onnx":
-        return OnnxLabeler(Path(name_or_path))
-    name = str(name_or_path)
-    if not Path(name).exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
-        return OwnLabeler(name)
-    stored = _read(*_files(name_or_path))
-    if isinstance(stored.config, SetLabelerConfig):
-        return TrainedSetLabeler(stored.config, stored.weights, stored.prior, stored.marker_names)
-    from train.labelers.networks import labeler_of  # torch
-
-    return labeler_of(stored.network(), stored.marker_names)
-
-
 def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """A trained network and its model card.
 
     Raises:
         WeightsError: Unknown, damaged, or not a labeler's weights.
     """
-    stored = _read(*_files(name_or_path))
+    stored = _read(*_files(str(name_or_path)))
     return stored.network(), stored.card
 
 
-def _files(name_or_path: str | Path) -> tuple[Path, Path]:
+def _files(name: str) -> tuple[Path, Path]:
     """Weights and card of a shipped labeler or a folder."""
-    if str(name_or_path) in shipped_labelers():
-        return _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
-    weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
+    if name in shipped_labelers():
+        return _SHIPPED / f"{name}.safetensors", _SHIPPED / f"{name}.json"
+    weights, card = Path(name) / WEIGHTS, Path(name) / CARD
     if not weights.is_file() or not card.is_file():
-        unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler or glove")
+        unknown = choices(name, shipped_labelers(), noun="labeler or glove")
         raise WeightsError(
             f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
             "module:name"
@@ -147,10 +278,14 @@ class _Stored:
     """The network's weights by name."""
     prior: PosePrior | None
 
-    @property
-    def marker_names(self) -> tuple[str, ...]:
-        """Markers in label order."""
-        return tuple(self.card["marker_names"])
+    def labeler(self) -> Labeler:
+        """The labeler, of the default kind without torch."""
+        names = tuple(self.card["marker_names"])
+        if isinstance(self.config, SetLabelerConfig):
+            return TrainedSetLabeler(self.config, self.weights, self.prior, names)
+        from train.labelers.networks import labeler_of
+
+        return labeler_of(self.network(), names)
 
     def network(self) -> nn.Module:
         """The network in torch."""
@@ -180,15 +315,26 @@ def _read(weights: Path, card: Path) -> _Stored:
         if weights.stat().st_size < _LEAST_BYTES * sum(map(math.prod, expected.values())):
             raise ValueError("it is too short for the network that its card describes")
         tensors = load_file(weights)
-        tables = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_PRIOR)}
-        _check_shapes(tensors, expected)
-        prior = _read_prior(tables, config.num_labels) if tables else None
+        tables = {
+            name.removeprefix(_PRIOR): tensors.pop(name) for name in list(tensors) if name.startswith(_PRIOR)
+        }
+        for name in sorted(expected.keys() | tensors.keys()):
+            found = tensors[name].shape if name in tensors else None
+            if found != expected.get(name):
+                raise ValueError(f"{name} has shape {found}, expected {expected.get(name)}")
+        prior = PosePrior.of_tensors(tables) if tables else None
+        if prior is not None and prior.num_markers != config.num_labels:
+            raise WeightsError(
+                f"the pose prior has {prior.num_markers} markers for {config.num_labels} labels"
+            )
     except WeightsError:
         raise
-    except (HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError) as error:
-        raise _damaged(weights, error) from error
-    except (AttributeError, RuntimeError, RecursionError, OverflowError) as error:
-        raise _damaged(weights, error) from error
+    except (
+        HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError,
+        RuntimeError, OverflowError,
+    ) as error:  # fmt: skip
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise WeightsError(f"{weights} is damaged or not a labeler's: {reason}") from error
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise WeightsError(f"{weights} is damaged: {name} holds NaN or infinite values")
@@ -205,31 +351,6 @@ def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
 
     with torch.device("meta"):
         return {name: tuple(one.shape) for name, one in new_network(config).state_dict().items()}
-
-
-def _check_shapes(tensors: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse tensors that are not those of a network, by a `ValueError`."""
-    for name, shape in expected.items():
-        if name not in tensors:
-            raise ValueError(f"it lacks {name}")
-        if tensors[name].shape != shape:
-            raise ValueError(f"{name} has shape {tensors[name].shape}, expected {shape}")
-    for name in tensors:
-        if name not in expected:
-            raise ValueError(f"it holds {name}, which is no part of the network")
-
-
-def _read_prior(tensors: dict[str, NDArray[Any]], num_labels: int) -> PosePrior:
-    """The pose prior of a network with so many labels, from its tensors."""
-    prior = PosePrior.of_tensors({name.removeprefix(_PRIOR): one for name, one in tensors.items()})
-    if prior.num_markers != num_labels:
-        raise WeightsError(f"the pose prior has {prior.num_markers} markers for {num_labels} labels")
-    return prior
-
-
-def _damaged(weights: Path, error: Exception) -> WeightsError:
-    reason = (str(error) or type(error).__name__).splitlines()[0]
-    return WeightsError(f"{weights} is damaged or not a labeler's: {reason}")
 
 
 def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None:
@@ -277,40 +398,6 @@ def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
     header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
     header += b" " * (-len(header) % _LENGTH)  # tensors begin at multiples of eight bytes
     return len(header).to_bytes(_LENGTH, "little") + header + content[end:]
-
-
-_NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
-_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
-_CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
-_ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
-_MATCHING: Final = "handsim.matching"  # key of the constants that labels are chosen by, for other programs
-_IMAGES: Final = "images"  # its input
-_INPUTS: Final = "points", "present"
-_OUTPUTS: Final = "point_scores", "label_scores"
-_PAIRED: Final = "pairs", "costs"  # outputs for other programs
-_OPSET: Final = 17
-_DESCRIPTION: Final = (
-    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
-    "bfloat16 by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
-)
-_MEANINGS: Final = {
-    "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
-    "none.",
-    "present": "Whether a row of points is one.",
-    "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
-    "the last column is a ghost.",
-    "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
-    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
-    "ghost.",
-    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
-    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
-    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
-    "there is none.",
-    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
-    "image's width.",
-}
-"""What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
-_HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
 class OnnxLabeler:
@@ -472,126 +559,3 @@ def _describe(model: onnx.ModelProto, properties: dict[str, str]) -> None:
     for value in (*model.graph.input, *model.graph.output):
         value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
     onnx.helper.set_model_props(model, properties)
-
-
-ANY_LAYOUT: Final = "any-layout"
-"""Name of the labeler that needs no training."""
-_FEW_POSES: Final = 6000  # from which a layout is known that nobody asked for
-_EXPECTED: Final = (
-    "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
-    "module:name"
-)
-
-
-def load_labeler(
-    glove: MarkerLayout | Labeler | str | Path, labeler: Labeler | str | Path | None = None
-) -> Labeler:
-    """The labeler of a glove, or a labeler by its name, path or object.
-
-    A glove without a labeler of its own gets the one for any layout, which learns the layout within a minute.
-    Only shipped labelers, folders and the one for any layout need torch.
-
-    Args:
-        glove: A marker layout, or its name or path, whose labeler is wanted. Or, where `labeler` is not
-            given, a labeler: a folder that `handsim train` wrote, an .onnx file, `module:name` of a `Labeler`
-            or of a class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
-        labeler: A labeler like these, or `any-layout`, to be used with this glove; it is checked against the
-            glove's markers.
-
-    Returns:
-        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
-
-    Raises:
-        ArgumentError: An argument is none of these, or `any-layout` is given without a glove.
-        LayoutError: The glove is unknown.
-        WeightsError: The labeler is unknown, damaged, or knows other markers.
-
-    Warns:
-        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout; or such a
-            glove is nearly its own mirror image.
-    """
-    if labeler is None:
-        return _of_layout(load_layout(glove), glove) if _is_layout(glove) else _of(glove)  # type: ignore[arg-type]
-    layout = load_layout(glove)  # type: ignore[arg-type]
-    if labeler == ANY_LAYOUT:
-        from train.labelers.layout_labeler import learned_labeler  # torch
-
-        return learned_labeler(layout)
-    found = _of(labeler)
-    if found.marker_names != layout.names:
-        raise WeightsError(
-            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{layout.name}' has "
-            f"{', '.join(layout.names)}; name the glove that it was trained on (--glove)"
-        )
-    return found
-
-
-@functools.lru_cache(maxsize=32)
-def labeler_at_once(layout: MarkerLayout) -> Labeler:
-    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn.
-
-    Raises:
-        LayoutError: A marker misses the skin.
-    """
-    for name in shipped_labelers():
-        if load_layout(name) == layout:
-            return load_stored_labeler(name)
-    from train.labelers.layout_labeler import (
-        LayoutLabeler,  # torch
-        is_learned,
-        learned_labeler,
-    )
-
-    return (
-        learned_labeler(layout) if is_learned(layout) else LayoutLabeler.at_once(layout, num_poses=_FEW_POSES)
-    )
-
-
-def _is_layout(glove: Any) -> bool:
-    return (
-        isinstance(glove, MarkerLayout)
-        or str(glove) in list_layouts()
-        or (isinstance(glove, str | Path) and Path(glove).suffix.lower() == ".toml")
-    )
-
-
-def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
-    """The labeler that was trained on a layout, or the one for any."""
-    for name in shipped_labelers():
-        if load_layout(name) == layout:
-            return load_stored_labeler(name)
-    from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
-    from train.labelers.side import is_mirror_like  # kernels
-
-    own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
-    name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
-    how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
-    warnings.warn(
-        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
-        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
-        "train SET --out RUN, and --labeler RUN",
-        HandSimWarning,
-        stacklevel=3,
-    )
-    if is_mirror_like(layout):
-        warnings.warn(
-            f"glove '{name}' is nearly its own mirror image, so that right and left may be exchanged for a "
-            "whole capture; put a marker on the thumb, or move those on the back away from any symmetry",
-            HandSimWarning,
-            stacklevel=3,
-        )
-    return learned_labeler(layout)
-
-
-def _of(labeler: Any) -> Labeler:
-    """A labeler by its name, path or object."""
-    if labeler == ANY_LAYOUT:
-        raise ArgumentError(
-            f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
-            "MarkerLayout, or the name or path of one"
-        )
-    if hasattr(labeler, "label_frames") and not isinstance(labeler, type):
-        ours = type(labeler).__module__.startswith("train.")
-        return labeler if ours else OwnLabeler(labeler)
-    check_type("labeler", labeler, (str, Path), _EXPECTED, list_layouts())
-    return load_stored_labeler(labeler)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gloves.captures.capture import run_lengths
 from handsim.app.page import Section, write_page
 from handsim.errors import DatasetError
-from handsim.hand.topology import JOINTS, SIDES
-from handsim.space.cameras import as_rig
+from handsim.hand.shape import JOINTS, SIDES
+from handsim.space.rig import as_rig
 from train.data.shards import Dataset, hands_name
 from train.reports import dataset_plots as _plots
 from train.reports.plot_style import picture

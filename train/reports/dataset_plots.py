@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.topology import DIGITS, JOINTS
+from handsim.hand.shape import DIGITS, JOINTS
 from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:

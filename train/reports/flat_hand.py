@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONES, PALM
+from handsim.hand.shape import BONES, PALM
 
 
 class FlatHand(NamedTuple):

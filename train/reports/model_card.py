@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.files.atomic import atomic_write
+from handsim.files.outputs import atomic_write
 from train.evaluation import percent
 
 MODEL_CARD: Final = "README.md"

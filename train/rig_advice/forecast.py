@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
-from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
+from handsim.space.rig import FEWEST_CAMERAS, CameraRig
 from train.rig_advice.work import room_of_work
 from train.simulation.room import (
     LightSources,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from handsim.space.camera import look_at
-from handsim.space.cameras import HAND_REACH
+from handsim.space.rig import HAND_REACH
 
 Mount = Literal["walls", "truss", "tripods"]
 MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)

@@ -22,7 +22,7 @@ from handsim._checks import check_choice, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
-from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, CameraRig, as_rig
+from handsim.space.rig import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, CameraRig, as_rig
 from train.rig_advice.forecast import OPTICS, Forecast, forecast, light_work
 from train.rig_advice.mounts import MOUNTS, Mount, places
 from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.optics.reconstruction import MARKER_RADIUS
-from handsim.space.cameras import HAND_REACH, ROOM_CENTER, CameraRig
+from handsim.space.rig import HAND_REACH, ROOM_CENTER, CameraRig
 
 HALF_SIDE: Final = 0.3
 """Half side of the cube around the rig's middle that hands work in [m]."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.app.page import Section, write_page
-from handsim.space.cameras import CameraRig
+from handsim.space.rig import CameraRig
 from train.reports.plot_style import BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
 from train.rig_advice.forecast import CameraLoss, Forecast
 from train.rig_advice.rig_score import GRID, RigScore, VolumeMap

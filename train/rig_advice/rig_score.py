@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
 from gloves.optics.reconstruction import MARKER_RADIUS
-from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
+from handsim.space.rig import FEWEST_CAMERAS, CameraRig
 from train.rig_advice.forecast import (
     OPTICS,
     CameraLoss,

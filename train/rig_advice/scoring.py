@@ -13,7 +13,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_count, check_type
 from handsim.callbacks import OnStep, no_step
-from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig
+from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig
 from train.rig_advice.rig_score import RigScore, score_work
 from train.rig_advice.work import GLOVE, VOLUME, checked_center, checked_sides, sample_work, work_of_take
 from train.simulation.scenes import SceneMotion

@@ -18,7 +18,7 @@ from gloves.takes.take import Take
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, CaptureError, PoseError
 from handsim.hand.motion import BodyMotion
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE
 from train.simulation.room import RoomConfig, usual_room

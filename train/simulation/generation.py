@@ -27,9 +27,8 @@ from handsim.files.json_files import load_json, save_json
 from handsim.files.outputs import check_free
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
-from handsim.hand.shape import HAND_DTYPE, pack_hand
-from handsim.hand.topology import SIDES
-from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
+from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
+from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
 from poses.shapes import PoseSampler, load_sampler
 from train.data.shards import (
     CONFIG,

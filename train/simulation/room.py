@@ -29,8 +29,8 @@ from gloves.optics.visibility import (
     hand_tree,
 )
 from gloves.takes.take import RigidBody, Take
-from handsim.hand.topology import PALM
-from handsim.space.cameras import CameraRig, check_outside
+from handsim.hand.shape import PALM
+from handsim.space.rig import CameraRig, check_outside
 from handsim.space.transforms import transform_poses
 from train.simulation.scenes import SceneMotion, SimulatedKind
 

@@ -18,10 +18,9 @@ from handsim._checks import check_count
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
-from handsim.hand.shape import ADULTS, EVERYBODY, Population, sample_shape
-from handsim.hand.topology import BONES, NUM_JOINTS, SIDES
-from handsim.space.cameras import CameraRig
+from handsim.hand.shape import ADULTS, BONES, EVERYBODY, NUM_JOINTS, SIDES, Population, sample_shape
 from handsim.space.objects import RigidObject, named_object
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import quaternion_matrix
 from poses.motion import (
     MotionConfig,

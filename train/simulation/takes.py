@@ -19,8 +19,8 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_count, check_type, fill_settings
 from handsim.errors import ArgumentError, LayoutError, PoseError
-from handsim.hand.topology import SIDES, Side
-from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
+from handsim.hand.shape import SIDES, Side
+from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MOST_OTHERS,

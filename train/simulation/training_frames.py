@@ -21,10 +21,9 @@ from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visi
 from handsim._checks import check_count, check_number, check_span, check_type, fill_settings
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Population
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, SIDES, Population
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
 from handsim.space.transforms import random_quaternions
 from poses.grasps import sample_held_poses, settle_hold, wrist_poses
 from poses.shapes import PoseMix, PoseSampler, checked_sampler, make_valid, sample_valid_angles

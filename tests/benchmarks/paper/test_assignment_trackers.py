@@ -11,7 +11,7 @@ from benchmarks.paper.assignment_trackers import GATE, NEAR, HungarianTracker, N
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
 from gloves.fit import GloveFit
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from train.simulation.takes import simulate_take

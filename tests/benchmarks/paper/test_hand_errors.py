@@ -12,8 +12,7 @@ from gloves.fit import GloveFit, attach_markers, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import PALM, SIDES
+from handsim.hand.shape import PALM, SIDES, sample_shape
 
 
 def worn(shape):

@@ -16,10 +16,9 @@ from benchmarks.paper.take_evaluation import (
     seen_frame,
     true_users,
 )
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
-from handsim.hand.shape import SIZES
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.shape import NUM_QPOS, SIZES
 from track.frames import TrackedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.takes import simulate_take

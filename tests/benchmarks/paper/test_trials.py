@@ -12,7 +12,7 @@ from benchmarks.paper.trials import (
     initialization_times,
     recovery_times,
 )
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.frames import TrackedFrame, TrackedHand

@@ -23,8 +23,8 @@ from benchmarks.public.manifest import (
 )
 from gloves.layout import load_layout
 from handsim.files.inputs import checksum
-from handsim.hand.keypoints import hand_keypoints
-from handsim.space.cameras import load_rig
+from handsim.hand.model import hand_keypoints
+from handsim.space.rig import load_rig
 from track.kinematics.pose_solver import PoseSolver
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from gloves.captures.motive_csv import read_motive_csv
+from gloves.captures.text_formats import read_motive_csv
 from handsim.errors import CaptureError
 
 # Type, name, quantities and axes of each asset; a number a column counts up from the left.

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, check_place, unit_fault, zeros_as_missing
 from gloves.captures.formats import read_capture, write_capture
-from gloves.captures.plausibility import check_place, unit_fault, zeros_as_missing
 from handsim.errors import CaptureError, HandSimWarning
 
 NAMES = tuple(f"marker{number}" for number in range(19))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.formats import read_capture
-from gloves.captures.qtm_tsv import read_qtm_tsv
+from gloves.captures.text_formats import read_qtm_tsv
 from handsim.errors import CaptureError
 
 

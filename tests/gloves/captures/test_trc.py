@@ -9,7 +9,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from gloves.captures.trc import read_trc
+from gloves.captures.text_formats import read_trc
 from handsim.errors import CaptureError
 
 SIG18 = Path(os.environ.get("HANDSIM_SIG18", Path(__file__).resolve().parents[3].parent / "shared" / "sig18"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gloves.captures.formats import read_capture
-from gloves.captures.vicon_csv import read_vicon_csv
+from gloves.captures.text_formats import read_vicon_csv
 from handsim.errors import CaptureError
 
 DEVICES = """\

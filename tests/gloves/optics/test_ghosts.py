@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gloves.optics.ghosts import MAX_GHOSTS, GhostConfig, reflect, sample_ghosts
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
 

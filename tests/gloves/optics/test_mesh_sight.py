@@ -16,7 +16,7 @@ from gloves.optics.visibility import MeshTree, clear_of_body, clear_of_mesh, fre
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
 

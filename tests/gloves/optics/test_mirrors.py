@@ -3,7 +3,7 @@
 import numpy as np
 
 from gloves.optics.ghosts import StrayConfig, cameras_by_mirror, reflect, sample_strays
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 
 RIG = named_rig("figure5")
 PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])

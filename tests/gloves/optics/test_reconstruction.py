@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from gloves.optics.reconstruction import OpticsConfig, number_runs, pack_columns, reconstruct
 from handsim.errors import ArgumentError
 from handsim.space.camera import look_at
-from handsim.space.cameras import CameraRig, named_rig
+from handsim.space.rig import CameraRig, named_rig
 from tests.rigs import square_rig
 
 STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)

@@ -18,7 +18,7 @@ from gloves.optics.visibility import (
 from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
-from handsim.space.cameras import CameraRig, named_rig
+from handsim.space.rig import CameraRig, named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from tests.rigs import mixed_rig

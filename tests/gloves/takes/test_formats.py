@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from gloves.captures.formats import read_capture
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.formats import MOTION_FORMATS
-from gloves.takes.take import LOST, RigidBody, Take
+from gloves.takes.take import LOST, MOTION_FORMATS, RigidBody, Take
 from handsim.errors import ArgumentError
 from handsim.hand.model import join_qpos
 from handsim.hand.motion import is_steady

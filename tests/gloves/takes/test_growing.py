@@ -9,8 +9,8 @@ import os
 import numpy as np
 import pytest
 
-from gloves.takes import growing
-from gloves.takes.growing import (
+from gloves.takes import archives as growing
+from gloves.takes.archives import (
     Column,
     GrowingArchive,
     GrownArchive,

@@ -14,11 +14,10 @@ import pytest
 from gloves.fit import attach, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.archives import SCHEMA
-from gloves.takes.columns import FRAMES as COLUMNS_OF_FRAMES
+from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
 from gloves.takes.take import INITIALIZED, LOST, STATUSES, SUFFIX, TRACKED, RigidBody, Take, load_take
 from handsim.errors import ArgumentError, CaptureError
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import sample_shape
 
 FRAMES, COLUMNS, MARKERS = 9, 47, 19

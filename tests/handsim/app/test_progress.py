@@ -45,8 +45,8 @@ def test_a_line_before_anything_is_done():
 
 
 def test_a_short_command_writes_no_line(capsys):
-    with progress_bar("frames") as (bar, task):
-        bar.update(task, completed=1, total=2)
+    with progress_bar("frames") as bar:
+        bar(1, 2)
     assert capsys.readouterr().err == ""
 
 

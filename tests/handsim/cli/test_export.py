@@ -13,8 +13,7 @@ from gloves.fit import attach
 from gloves.layout import load_layout
 from gloves.takes.take import LOST, TRACKED, RigidBody, Take, load_take
 from handsim.cli.main import main
-from handsim.hand.keypoints import KEYPOINT_NAMES
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, join_qpos
 from handsim.space.transforms import random_quaternions
 
 FRAMES, RATE = 12, 120.0

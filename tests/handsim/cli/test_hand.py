@@ -13,8 +13,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import Take, load_take
 from handsim.cli.main import main
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import JOINT_NAMES
+from handsim.hand.shape import JOINT_NAMES, sample_shape
 from track.user import User, load_user
 
 

@@ -75,11 +75,11 @@ def test_named_tones_are_drawn_and_no_others(names: str, tones: tuple[float, ...
 
 
 def test_the_depth_sensor_fits_the_placement() -> None:
-    assert parsed("--placement", "head").settled().depth_sensor == DepthSensor(("d435",))
-    assert parsed("--placement", "orbit").settled().depth_sensor == DepthSensor(("d435",))
-    assert parsed("--distance", "0.6", "0.9").settled().depth_sensor == DepthSensor(("kinect2",))
-    assert parsed("--placement", "rig").settled().depth_sensor == DepthSensor(("kinect2",))
-    given = parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1").settled()
+    assert parsed("--placement", "head").resolved().depth_sensor == DepthSensor(("d435",))
+    assert parsed("--placement", "orbit").resolved().depth_sensor == DepthSensor(("d435",))
+    assert parsed("--distance", "0.6", "0.9").resolved().depth_sensor == DepthSensor(("kinect2",))
+    assert parsed("--placement", "rig").resolved().depth_sensor == DepthSensor(("kinect2",))
+    given = parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1").resolved()
     assert given.depth_sensor == DepthSensor(("kinect2", "kinect1"))
 
 
@@ -105,6 +105,6 @@ def test_wrong_options_are_told(words: tuple[str, ...], message: str) -> None:
 
 
 def test_depth_alone_never_looks_for_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("render.config.choose_painter", lambda choice: pytest.fail("looked"))
-    assert RenderConfig(passes=("depth",)).with_chosen_painter().painter == "compiled"
-    assert RenderConfig(painter="opengl").with_chosen_painter().painter == "opengl"
+    monkeypatch.setattr("render.config.choose_painter", lambda: pytest.fail("looked"))
+    assert RenderConfig(passes=("depth",)).resolved().painter == "compiled"
+    assert RenderConfig(painter="opengl").resolved().painter == "opengl"

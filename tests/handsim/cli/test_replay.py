@@ -18,7 +18,7 @@ from handsim.cli.main import main
 from tests.waiting import LONG
 from track.streams import LOOPBACK
 from track.streams.live_stream import LiveStream
-from track.streams.point_stream import open_stream
+from track.streams.natnet import open_stream
 
 RUN = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
 FRAMES = 60
@@ -108,8 +108,8 @@ def test_a_port_that_is_taken_is_one_sentence(capture, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--rate", "0"], "--rate is 0, expected a positive number"),
-        (["--port", "70000"], "--port is 70000, expected 0 to 65535"),
+        (["--rate", "0"], "rate is 0, expected a number above 0"),
+        (["--port", "70000"], "port is 70000, expected 0 to 65535"),
         (["--host", "192.0.2.1"], "cannot be listened at on 192.0.2.1"),
     ],
 )

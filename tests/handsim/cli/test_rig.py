@@ -7,8 +7,8 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.errors import HandSimWarning
-from handsim.space.cameras import list_rigs, load_rig
-from handsim.space.rig_formats.any_file import import_cameras
+from handsim.space.rig import list_rigs, load_rig
+from handsim.space.rig_formats import import_cameras
 from tests.handsim.space.rig_formats.known_rig import MCAL, PIXELS, POINT, XCP, written
 
 

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from handsim.cli.main import main
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from train.rig_advice import planning
 from train.simulation.takes import simulate_take
 

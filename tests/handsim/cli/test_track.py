@@ -23,21 +23,20 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit, nominal_fit, wear
 from gloves.layout import load_layout
-from gloves.takes.archives import CutOffWarning
+from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
-from gloves.takes.growing import GrownArchive
 from gloves.takes.take import LOST, load_take
 from handsim.cli.main import main
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track import capture_tracking
+from track import captures
 from track.captures import track_capture
 from track.recorder import Recorder
 from track.rigid_body import load_body
-from track.streams.addresses import open_source
-from track.streams.natnet_server import ReplayServer
+from track.streams.live_stream import open_source
+from track.streams.natnet import ReplayServer
 from track.user import load_user
 from track.viewer.corrector import Corrector
 from train.simulation.scenes import CalibrationTakeConfig
@@ -443,8 +442,8 @@ def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypat
         one.bind(("127.0.0.1", 0))
         address = f"udp://127.0.0.1:{one.getsockname()[1]}"
         out, now = tmp_path / "take.npz", [50.0]
-        monkeypatch.setattr(capture_tracking, "monotonic", lambda: now[0])
-        monkeypatch.setattr(capture_tracking, "sleep", lambda seconds: now.append(now.pop() + seconds))
+        monkeypatch.setattr(captures, "monotonic", lambda: now[0])
+        monkeypatch.setattr(captures, "sleep", lambda seconds: now.append(now.pop() + seconds))
         assert main(["track", str(capture), "--out", str(out), "--size", "M", "--send", address]) == 0
         assert now[0] - 50.0 == pytest.approx((FRAMES - 1) / 120), "it waited until each frame's time"
         one.setblocking(False)

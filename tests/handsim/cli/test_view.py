@@ -15,7 +15,7 @@ import pytest
 
 from gloves.takes.take import load_take
 from handsim.cli.main import main
-from track.streams.natnet_server import ReplayServer
+from track.streams.natnet import ReplayServer
 from track.viewer import live_view
 from track.viewer.video import chosen_frames
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.files.atomic import atomic_write, temporary_beside, written_together
+from handsim.files.outputs import atomic_write, temporary_beside, written_together
 from handsim.files.signals import ENDING, Stopped, signals_raise
 from tests.renames import fails_at
 
@@ -79,7 +79,7 @@ def test_a_write_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
     """A file size limit stands in for the full disk: the same OSError from the same system call."""
     script = (
         "import resource, sys\n"
-        "from handsim.files.atomic import atomic_write\n"
+        "from handsim.files.outputs import atomic_write\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try:\n"
         "    with atomic_write(sys.argv[1]) as temporary:\n"
@@ -182,7 +182,7 @@ def test_what_a_process_that_was_killed_between_renames_left_is_removed(tmp_path
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from handsim.files.atomic import atomic_write, written_together\n"
+        "from handsim.files.outputs import atomic_write, written_together\n"
         "rename = os.replace\n"
         "def last(source, target):\n"
         "    rename(source, target)\n"

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from gloves.layout import load_layout
-from gloves.takes.formats import MOTION_FORMATS
+from gloves.takes.take import MOTION_FORMATS
 from handsim.cli.main import main
-from handsim.files.names import as_text, plain_path
+from handsim.files.outputs import as_text, plain_path
 from track.user import load_user, nominal_user
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are text")

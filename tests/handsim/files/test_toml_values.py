@@ -7,7 +7,7 @@ import tomllib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.files.toml_values import quoted
+from handsim.files.inputs import quoted
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))

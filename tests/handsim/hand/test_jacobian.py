@@ -8,10 +8,8 @@ import pytest
 
 from gloves.fit import attach_markers
 from gloves.layout import load_layout
-from handsim.hand.jacobian import NUM_VELOCITIES, skinned_jacobian
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
+from handsim.hand.shape import SIDES, sample_shape
 from handsim.space.transforms import random_quaternions
 
 

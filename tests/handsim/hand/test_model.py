@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import EVERYBODY, SIZES, named_shape, sample_shape
-from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, SIDES
+from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS, SIDES, SIZES, named_shape, sample_shape
 from handsim.space.transforms import MIRROR, random_quaternions
 
 
@@ -91,7 +90,7 @@ def test_positive_flexion_bends_towards_the_palm_and_the_thumb_opposes():
 
 
 def test_exported_xml_opens_and_moves_alike(tmp_path, rng):
-    from handsim.hand.mjcf import build_spec
+    from handsim.hand.model import build_spec
 
     model = HandModel(sample_shape(rng=rng))
     spec = build_spec(model.skeleton, model.capsules)

@@ -13,11 +13,9 @@ from scipy.spatial.transform import Rotation
 from gloves.fit import attach
 from gloves.hand_files import write_hand
 from gloves.takes.take import Take
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.osim import coordinate_names, hand_osim
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import BONE_NAMES
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim.hand.model_files import coordinate_names, hand_osim
+from handsim.hand.shape import BONE_NAMES, sample_shape
 
 FRAMES = 12
 PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "other_programs.md"

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
-from handsim.hand.urdf import hand_urdf
+from handsim.hand.model_files import hand_urdf
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, sample_shape
 
 
 @pytest.fixture(params=["right", "left"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.topology import BONE_NAMES, DIGITS
-from handsim.motion_files.bvh import write_bvh
+from handsim.hand.model import hand_keypoints
+from handsim.hand.shape import BONE_NAMES, DIGITS
+from handsim.motion_files.joint_files import write_bvh
 from handsim.motion_files.motion import posed_bodies, posed_hands
 
 BACK = 0.01 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

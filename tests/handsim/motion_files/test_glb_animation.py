@@ -14,8 +14,8 @@ from gloves.fit import attach
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.motion_files.glb_animation import write_glb
 from handsim.motion_files.motion import posed_bodies, posed_hands, seconds_of
+from handsim.motion_files.scenes import write_glb
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import CaptureError
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import JOINT_NAMES
-from handsim.motion_files.joint_table import read_joint_csv, write_joint_csv, write_joint_parquet, write_mot
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.shape import JOINT_NAMES
+from handsim.motion_files.joint_files import read_joint_csv, write_joint_csv, write_joint_parquet, write_mot
 from handsim.motion_files.motion import posed_hands, seconds_of
 
 

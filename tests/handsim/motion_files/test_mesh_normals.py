@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from handsim.motion_files.mesh_normals import corner_normals, split_vertices
+from handsim.motion_files.motion import corner_normals, split_vertices
 
 
 def test_edges_of_a_box_stay_sharp():

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import DIGITS
+from handsim.motion_files.joint_files import OPENXR_JOINTS, joint_poses, joint_radii, write_openxr
 from handsim.motion_files.motion import posed_hands
-from handsim.motion_files.openxr import JOINTS, joint_poses, joint_radii, write_openxr
 from handsim.space.transforms import MIRROR
 
 # The extension's enumeration, from XR_HAND_JOINT_PALM_EXT = 0 to XR_HAND_JOINT_LITTLE_TIP_EXT = 25.
@@ -46,12 +45,12 @@ def posed(hand, rng):
 
 
 def test_order():
-    assert len(JOINTS) == len(set(JOINTS)) == 26
-    assert {name: JOINTS.index(name) for name in NUMBERS} == NUMBERS
+    assert len(OPENXR_JOINTS) == len(set(OPENXR_JOINTS)) == 26
+    assert {name: OPENXR_JOINTS.index(name) for name in NUMBERS} == NUMBERS
 
 
 def test_forward_is_minus_z_to_the_next_joint(hand, rng):
-    poses = dict(zip(JOINTS, joint_poses(hand, posed(hand, rng)).swapaxes(0, 1), strict=True))
+    poses = dict(zip(OPENXR_JOINTS, joint_poses(hand, posed(hand, rng)).swapaxes(0, 1), strict=True))
     for chain in CHAINS:
         for near, far in itertools.pairwise(chain):
             way = poses[far][:, :3, 3] - poses[near][:, :3, 3]
@@ -68,12 +67,12 @@ def test_forward_is_minus_z_to_the_next_joint(hand, rng):
 def test_up_is_out_of_the_back_and_right_is_right(hand):
     """A flat hand on its palm, fingers ahead: its back is up, a right hand's little finger on the right."""
     poses = joint_poses(hand, join_qpos(np.zeros((1, 20))))[0]
-    for name, pose in zip(JOINTS, poses, strict=True):
+    for name, pose in zip(OPENXR_JOINTS, poses, strict=True):
         if not name.startswith("THUMB"):
             assert pose[2, 1] > 0.85, name
             assert pose[1, 0] < -0.85, name  # +x to the right, where our -y is
-    little = poses[JOINTS.index("LITTLE_PROXIMAL")] @ np.array([0, 0, 0, 1.0])
-    in_palm = np.linalg.inv(poses[JOINTS.index("PALM")]) @ little
+    little = poses[OPENXR_JOINTS.index("LITTLE_PROXIMAL")] @ np.array([0, 0, 0, 1.0])
+    in_palm = np.linalg.inv(poses[OPENXR_JOINTS.index("PALM")]) @ little
     assert (in_palm[0] > 0) == (hand.shape.side == "right")
 
 
@@ -90,7 +89,7 @@ def test_joints_that_both_have_are_in_the_same_places(hand, rng):
     qpos = posed(hand, rng)
     keypoints = hand_keypoints(hand, qpos)
     of_ours = ["WRIST", *(name for chain in CHAINS for name in chain[-4:])]
-    places = joint_poses(hand, qpos)[:, [JOINTS.index(name) for name in of_ours]][..., :3, 3]
+    places = joint_poses(hand, qpos)[:, [OPENXR_JOINTS.index(name) for name in of_ours]][..., :3, 3]
     assert len(of_ours) == len(KEYPOINT_NAMES)
     np.testing.assert_allclose(places, keypoints, atol=1e-12)
 
@@ -99,7 +98,7 @@ def test_radii_reach_the_skin(hand):
     """From each joint the skin is about as near as stated."""
     skin, joints = hand.surface.vertices, joint_poses(hand, join_qpos(np.zeros((1, 20))))[0, :, :3, 3]
     nearest = np.linalg.norm(skin[None] - joints[:, None], axis=2).min(axis=1)
-    tips = np.array([name.endswith("TIP") for name in JOINTS])
+    tips = np.array([name.endswith("TIP") for name in OPENXR_JOINTS])
     assert (nearest[~tips] < 1.35 * joint_radii(hand)[~tips]).all()
     assert nearest[tips].max() < 0.002  # our tips lie on the skin
 
@@ -108,7 +107,7 @@ def test_file(motion, tmp_path):
     path = tmp_path / "hands.openxr.json"
     write_openxr(path, motion)
     content = json.loads(path.read_text())
-    assert tuple(content["joints"]) == JOINTS and len(content["frames"]) == motion.num_frames
+    assert tuple(content["joints"]) == OPENXR_JOINTS and len(content["frames"]) == motion.num_frames
     up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for frame, stored in enumerate(content["frames"]):
         assert stored["time"] == motion.times[frame]

@@ -7,7 +7,7 @@ import pytest
 
 from handsim.errors import HandSimError
 from handsim.motion_files.motion import posed_bodies, posed_hands
-from handsim.motion_files.usd import write_usd
+from handsim.motion_files.scenes import write_usd
 
 
 @pytest.fixture(params=["usda", "usdc"])

@@ -20,7 +20,7 @@ from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population, sample_shape
 from handsim.space.camera import look_at
-from handsim.space.cameras import (
+from handsim.space.rig import (
     HAND_REACH,
     CameraRig,
     as_rig,

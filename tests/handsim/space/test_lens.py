@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.space.camera import Camera, Lens
 
 # A webcam, a wide lens with strong barrel distortion, a pincushion, and the fisheye of two headsets.
 BROWN = (

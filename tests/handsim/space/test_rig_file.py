@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from handsim.errors import RigError
 from handsim.space.camera import look_at
-from handsim.space.cameras import load_rig
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig import load_rig
+from handsim.space.rig_formats import load_cameras
 from tests.rigs import mixed_rig, square_rig
 
 TWO = """

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
 from handsim.files.json_files import package_data
-from handsim.hand.contact import overlap_between
-from handsim.hand.mjcf import build_spec
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.capsules import overlap_between
+from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import random_quaternions
 from poses.contact import (

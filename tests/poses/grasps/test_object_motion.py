@@ -8,8 +8,7 @@ import trimesh
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape, shape_from_measures
-from handsim.hand.topology import DIGITS, bones_of
+from handsim.hand.shape import DIGITS, bones_of, sample_shape, shape_from_measures
 from handsim.space.objects import RigidObject, load_object, named_object, object_names
 from handsim.space.transforms import MIRROR
 from poses.grasps import (

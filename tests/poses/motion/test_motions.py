@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES, sample_shape
 from poses.motion import (
     MotionConfig,
     can_be_left,

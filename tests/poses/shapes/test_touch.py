@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIZES, sample_shape
-from handsim.hand.topology import DIGITS, SIDES
+from handsim.hand.shape import DIGITS, SIDES, SIZES, sample_shape
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
 from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
 

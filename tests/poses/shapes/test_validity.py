@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import EVERYBODY, sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import EVERYBODY, SIDES, sample_shape
 from poses.shapes import (
     HIGH,
     LOW,

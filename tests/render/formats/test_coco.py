@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.hand.shape import HandShape
 from handsim.space.camera import look_at
 from render.formats.coco import skeleton_lines

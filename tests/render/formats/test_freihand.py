@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.space.lens import Lens
+from handsim.space.camera import Lens
 from render.formats.freihand import FreihandWriter
 from render.formats.records import hand_mask
 from tests.render.formats.reading import depth_of

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.keypoints import KEYPOINT_NAMES
-from handsim.space.camera import Camera
-from handsim.space.lens import Lens
+from handsim.errors import ArgumentError
+from handsim.hand.model import KEYPOINT_NAMES
+from handsim.space.camera import Camera, Lens
+from render.color_sensor import linear_of
 from render.formats.records import (
     ABSENT,
     JOINT_ORDERS,
@@ -27,7 +27,6 @@ from render.formats.records import (
     encode_pictures,
     hand_mask,
     joint_order,
-    linear_light,
     run_lengths,
     to_json,
     to_order,
@@ -236,13 +235,9 @@ def srgb(light: np.ndarray) -> np.ndarray:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-def test_middle_gray_is_half_the_light() -> None:
-    assert linear_light(np.array([188], np.uint8))[0] == pytest.approx(0.5, abs=0.005)
-
-
 def test_every_level_of_srgb_comes_back_from_half() -> None:
     levels = np.arange(256, dtype=np.uint8)
-    halves = linear_light(levels).astype(np.float16).astype(np.float64)
+    halves = linear_of(levels)[:, 0].astype(np.float16).astype(np.float64)
     np.testing.assert_array_equal(np.rint(255.0 * srgb(halves)), levels)
 
 
@@ -263,7 +258,7 @@ def test_openexr_reads_meters_and_linear_light(make_frame, tmp_path: Path) -> No
     point = frame.camera.T_world_camera @ np.array([*(ray / ray[2] * channels["Z"][row, column]), 1.0])
     square = 3 * channels["Z"][row, column] / frame.camera.K[0, 0]
     assert np.linalg.norm(point[:3] - frame.hands[0].vertices, axis=1).min() < square * np.sqrt(0.5)
-    assert channels["R"].max() == np.float16(linear_light(frame.ideal.rgb).max(axis=(0, 1))[0])
+    assert channels["R"].max() == np.float16(linear_of(frame.ideal.rgb).max(axis=(0, 1))[0])
 
 
 def test_the_same_frame_gives_the_same_bytes(make_frame, tmp_path: Path) -> None:
@@ -272,9 +267,7 @@ def test_the_same_frame_gives_the_same_bytes(make_frame, tmp_path: Path) -> None
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
-def test_a_wrong_name_or_place_is_told(make_frame, tmp_path: Path) -> None:
-    with pytest.raises(HandSimError, match=r"ends in \.exr"):
-        write_exr(tmp_path / "a.png", make_frame())
+def test_a_wrong_place_is_told(make_frame, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError):
         write_exr(tmp_path / "file" / "a.exr", make_frame())

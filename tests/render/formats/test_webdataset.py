@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import Side
-from handsim.space.camera import Camera, camera_from_record, look_at, pinhole
-from handsim.space.lens import Lens
+from handsim.hand.model import HandModel, hand_keypoints, join_qpos
+from handsim.hand.shape import Side
+from handsim.space.camera import Camera, Lens, camera_from_record, look_at, pinhole
 from handsim.space.transforms import axis_angle_matrix, quaternion_matrix, random_quaternions
 from render.formats.records import to_json, to_order
 from render.formats.webdataset import (

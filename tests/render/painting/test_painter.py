@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side
 from handsim.space.camera import Camera, look_at, pinhole
 from poses.shapes import gesture
 from render.painting.figures import Drawn, HandFigure, Material, sample_people

@@ -8,9 +8,8 @@ import trimesh
 
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.skin.surface import vertex_normals
-from handsim.space.camera import Camera, look_at, pinhole, preset
-from handsim.space.lens import Lens
+from handsim.hand.skin import vertex_normals
+from handsim.space.camera import Camera, Lens, look_at, pinhole, preset
 from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
 from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals
@@ -62,11 +61,6 @@ def test_a_principal_point_off_the_middle_moves_the_picture():
     middle = rasterize(pinhole("a", (40, 30), 60.0), thing).depth
     aside = rasterize(pinhole("b", (40, 30), 60.0, (25.0, 13.0)), thing).depth
     np.testing.assert_array_equal(aside[:-2, 5:], middle[2:, :-5])
-
-
-def test_a_lens_is_not_a_pinhole():
-    with pytest.raises(ArgumentError, match="expected a pinhole"):
-        rasterize(preset("headset_fisheye"), wall(1.0))
 
 
 @NO_EMBREE
@@ -186,7 +180,7 @@ def test_faces_are_where_the_camera_is_and_as_fine(scene):
 
 def test_ids_are_those_of_rays(scene):
     camera, truth, faces = scene
-    ids = warp(camera, [face["ids"] for face in faces], "nearest")
+    ids = warp(camera, [face["ids"] for face in faces])
     assert ids.dtype == np.uint8
     assert (ids != truth["ids"]).mean() < 0.01  # silhouettes, by less than a pixel
     inside = np.ones_like(ids, bool)
@@ -199,7 +193,7 @@ def test_ids_are_those_of_rays(scene):
 
 def test_colors_are_those_of_rays(scene):
     camera, truth, faces = scene
-    rgb = warp(camera, [face["rgb"] for face in faces], "linear")
+    rgb = warp(camera, [face["rgb"] for face in faces], cv2.INTER_LINEAR)
     error = np.abs(rgb.astype(int) - truth["rgb"].astype(int)).max(axis=-1)
     assert np.median(error) <= 1 and (error > 4).mean() < 0.02  # edges
 
@@ -232,7 +226,7 @@ def test_a_pinhole_is_its_own_face():
     (face,) = faces_for(camera)
     assert face is camera
     picture = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
-    assert (warp(camera, [picture], "linear") == picture).all()
+    assert (warp(camera, [picture], cv2.INTER_LINEAR) == picture).all()
     depth = picture[..., 0].astype(np.float32)
     assert (warp_depth(camera, [depth]) == depth).all()
 
@@ -241,7 +235,7 @@ def test_places_that_no_ray_meets_stay_empty():
     folds = Camera("folds", (320, 240), K, lens=Lens("brown", (-0.45, 0.0, 0.0, 0.0, 0.0)))
     faces = faces_for(folds)
     white = [np.full(face.size[::-1], 255, np.uint8) for face in faces]
-    picture = warp(folds, white, "nearest")
+    picture = warp(folds, white)
     known = np.isfinite(folds.rays()).all(axis=-1)
     assert 0.05 < (~known).mean() < 0.6
     assert (picture[known] == 255).all() and (picture[~known] == 0).all()
@@ -260,9 +254,6 @@ def test_a_moved_camera_shares_its_lookups(monkeypatch):
 
 
 def test_mistakes_are_told():
-    camera = CAMERAS["brown"]
-    with pytest.raises(ArgumentError, match="expected camera 'brown' faces'"):
-        warp(camera, [np.zeros((10, 10), np.uint8)], "nearest")
     narrow = np.diag([5000.0, 5000.0, 1.0])
     narrow[:2, 2] = 1e6
     blind = Camera("blind", (320, 240), narrow, lens=Lens("brown", (-0.45, 0.0, 0.0, 0.0, 0.0)))

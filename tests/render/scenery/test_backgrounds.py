@@ -10,7 +10,7 @@ import pytest
 
 from handsim.errors import HandSimError
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from render.config import RenderConfig
 from render.frames import Pictures, RenderedFrame
 from render.scenery.backgrounds import (

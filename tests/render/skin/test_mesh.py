@@ -6,9 +6,8 @@ import trimesh
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side
+from handsim.hand.shape import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side, sample_shape
+from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR
 from poses.shapes import gesture
 from render.frames import FOREARM

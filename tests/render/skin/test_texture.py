@@ -5,7 +5,7 @@ import pytest
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import SIDES, Side
+from handsim.hand.shape import SIDES, Side
 from poses.shapes import gesture
 from render.illustrations import view_along
 from render.painting.figures import skin_material
@@ -85,7 +85,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
             material=pyrender_material(skin_material(paint)),
         )
         scene.add(pyrender.Mesh([primitive]))
-        camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)
+        camera = pyrender.PerspectiveCamera(np.deg2rad(24.0), znear=0.05, zfar=10.0)
         scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
         add_lights(pyrender, scene, Lighting((lamp,), (0.1, 0.1, 0.1)), view.T_world_camera)
         picture, _ = offscreen_renderer(*SIZE).render(scene, flags=pyrender.RenderFlags.NONE)
@@ -102,7 +102,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
         lit[1], dim[1] = -np.sign(towards) * step, np.sign(towards) * step
     values = []
     for point in (lit, dim):
-        column, row = view.project(point, SIZE).astype(int)
+        column, row = view.project(point).astype(int)
         values.append(change[row - 1 : row + 2, column - 1 : column + 2].mean())
     assert values[0] > 4.0
     assert values[1] < -4.0

@@ -10,7 +10,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from poses.shapes import resting_angles
 from track.association.frame_state import FrameState, Numbering
 from track.association.hand_state import HandState

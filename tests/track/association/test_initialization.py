@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
-from handsim.hand.topology import Side
+from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from track.association.hand_state import HandState

@@ -22,7 +22,7 @@ from track.association.label_consistency import (
     gate_labels,
 )
 from track.config import TrackerConfig
-from train.glove_labeler import load_labeler
+from train import load_labeler
 from train.labelers.protocol import Labeling
 
 RATE = 120.0

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from track.association.digit_hypotheses import IMPOSSIBLE
 from track.association.frame_state import Numbering
 from track.association.hand_state import HandState, HandTrack

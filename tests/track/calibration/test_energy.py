@@ -10,7 +10,7 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from handsim.space.transforms import random_quaternions
 from poses.shapes import resting_angles, sample_valid_angles
 from poses.touch import touching_angles

@@ -14,8 +14,7 @@ from gloves.fit import GloveFit, attach, attach_markers, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import named_shape
-from handsim.hand.topology import JOINT_NAMES, SIDES
+from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion import WristConfig, wrist_path
 from track.calibration.hand_parameters import displace_markers

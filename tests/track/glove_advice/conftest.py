@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from track.glove_advice.layout_score import score_layout
 from track.glove_advice.observed_hands import observe_poses
 from train.labelers.layout_labeler import LayoutLabeler

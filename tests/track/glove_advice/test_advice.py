@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import MarkerPlace
-from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from track.glove_advice.advice import advice
 from track.glove_advice.joint_spread import untold_spreads
 from track.glove_advice.trials import METHODS, Trial

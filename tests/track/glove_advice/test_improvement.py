@@ -10,8 +10,8 @@ import pytest
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import BONE_NAMES
-from handsim.space.cameras import load_rig
+from handsim.hand.shape import BONE_NAMES
+from handsim.space.rig import load_rig
 from track.glove_advice import improvement
 from track.glove_advice.improvement import Improvement
 from track.glove_advice.joint_spread import palm_spread

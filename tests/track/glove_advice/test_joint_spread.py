@@ -9,7 +9,7 @@ import numpy as np
 from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel
-from handsim.hand.topology import JOINTS
+from handsim.hand.shape import JOINTS
 from poses.shapes import sample_poses
 from track.glove_advice.joint_spread import NOISE, joint_spreads, pose_spreads, untold_spreads
 from track.kinematics.pose_solver import PoseSolver

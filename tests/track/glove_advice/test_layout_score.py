@@ -10,7 +10,7 @@ import pytest
 from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from track.glove_advice.observed_hands import observe_motion, observe_poses
 from train.simulation.takes import simulate_take
 

@@ -9,10 +9,8 @@ from scipy.optimize import least_squares
 
 from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
-from handsim.hand.jacobian import skinned_jacobian
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
+from handsim.hand.shape import SIDES, sample_shape
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles

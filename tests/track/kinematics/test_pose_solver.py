@@ -12,8 +12,7 @@ from gloves.fit import GloveFit, attach_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
+from handsim.hand.shape import SIDES, sample_shape
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.motion import sample_motion

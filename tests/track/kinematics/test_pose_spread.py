@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from gloves.fit import GloveFit, attach, nominal_fit
 from gloves.layout import load_layout
-from handsim.hand.keypoints import hand_keypoints
-from handsim.hand.model import HandModel
-from handsim.hand.topology import SIDES
+from handsim.hand.model import HandModel, hand_keypoints
+from handsim.hand.shape import SIDES
 from poses.shapes import sample_poses
 from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays

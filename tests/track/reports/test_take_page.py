@@ -12,7 +12,7 @@ import pytest
 
 from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED, Take
 from handsim.errors import ArgumentError
-from handsim.hand.topology import JOINT_NAMES, JOINTS
+from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track.captures import track_capture
 from track.reports.hand_figures import hand_figures
 from track.reports.take_page import write_take_page

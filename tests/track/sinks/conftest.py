@@ -9,8 +9,8 @@ import pytest
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.status import Status
-from handsim.hand.topology import NUM_QPOS
+from gloves.takes.points import Status
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
 from track.frames import TrackedBody, TrackedFrame, TrackedHand
 from track.live_message import LiveMessage, MessageEncoder

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from track.frames import TrackedFrame, TrackedHand
 from track.sinks import VALID, SinkGroup, open_sink, open_sinks

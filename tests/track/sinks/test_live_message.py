@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
-from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from track.live_message import FORMATS, document_format, frame_document, header_document
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from handsim.errors import HandSimError
-from track.streams.addresses import VALID, open_source
+from track.streams.live_stream import VALID, open_source
 
 SOURCE = """
 import numpy as np

@@ -14,9 +14,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.errors import CaptureError, HandSimWarning
 from tests.track.streams.test_frame_source import Slow
-from track.streams.frame_order import FrameOrder
-from track.streams.frame_source import StreamedFrame
-from track.streams.live_stream import LiveStream, SourceStream
+from track.streams.frame_source import SourceStream, StreamedFrame
+from track.streams.live_stream import FrameOrder, LiveStream
 
 RATE = 120.0
 FRAMES = 120

@@ -13,8 +13,8 @@ from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from tests.waiting import LONG
 from track.streams import live_stream
-from track.streams.frame_source import StreamedFrame, capture_frames
-from track.streams.live_stream import LiveStream, SourceStream
+from track.streams.frame_source import SourceStream, StreamedFrame, capture_frames
+from track.streams.live_stream import LiveStream
 
 
 def frame(number: int, points: object = None, **changes: object) -> StreamedFrame:

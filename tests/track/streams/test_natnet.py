@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from track.streams.frame_source import StreamedFrame
 from track.streams.natnet import (
     NEWEST,
     DamagedPacket,
     Kind,
-    MarkerFrame,
     ServerInfo,
     pack,
     pack_connect,
@@ -36,7 +36,7 @@ def marker_frames(draw):
     points = draw(arrays.arrays(np.float32, (count, 3), elements=coordinate, unique=True))
     ids = draw(arrays.arrays(np.int64, count, elements=st.integers(-1, 2**31 - 1)))
     time = draw(st.floats(0.0, 1e6))
-    return MarkerFrame(draw(st.integers(0, 2**31 - 1)), time, points.astype(float), ids)
+    return StreamedFrame(draw(st.integers(0, 2**31 - 1)), time, points.astype(float), ids)
 
 
 def full_frame(markers, older, *, sized: bool, time: float = 12.5, end: int = 0) -> bytes:
@@ -107,8 +107,8 @@ def test_every_section_is_stepped_over(sized):
 
 @pytest.mark.parametrize("sized", [False, True])
 def test_the_two_layouts_are_not_taken_for_each_other(sized):
-    frame = MarkerFrame(1, 2.0, np.arange(30.0).reshape(10, 3), np.arange(10))
-    empty = MarkerFrame(1, 2.0, np.empty((0, 3)), np.empty(0, dtype=np.int64))
+    frame = StreamedFrame(1, 2.0, np.arange(30.0).reshape(10, 3), np.arange(10))
+    empty = StreamedFrame(1, 2.0, np.empty((0, 3)), np.empty(0, dtype=np.int64))
     for payload in (
         full_frame([(5, 0.1, 0.2, 0.3, 2)], [], sized=sized),
         unpack(pack_frame(frame, (4, 1) if sized else (3, 0)))[1],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import seen_frame
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
 from track.frames import TrackedFrame

@@ -13,7 +13,7 @@ from gloves.captures.formats import write_capture
 from gloves.layout import starter_layout
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from tests.rigs import mixed_rig
 from track.user import User
 from track.viewer.contents import ACCEPTED, open_content

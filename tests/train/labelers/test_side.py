@@ -10,7 +10,7 @@ import pytest
 from gloves.fit import attach_markers
 from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
 from train.labelers.side import SideClassifier, is_mirror_like

@@ -23,7 +23,7 @@ from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning, LayoutError, WeightsError
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS
+from handsim.hand.shape import DIGITS
 from poses import sample_poses
 from train import Corruption, corrupt
 from train.labelers.cnn_labeler import MeanHand

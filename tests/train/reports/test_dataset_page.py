@@ -14,7 +14,7 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.errors import DatasetError
-from handsim.hand.topology import JOINT_NAMES, JOINTS
+from handsim.hand.shape import JOINT_NAMES, JOINTS
 from train.data.shards import Dataset, row_dtype
 from train.reports import dataset_page as report
 from train.simulation import generation

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
-from handsim.hand.topology import BONES
+from handsim.hand.shape import BONES
 from tests.renames import fails_at
 from train.data.shards import Dataset
 from train.evaluation import (

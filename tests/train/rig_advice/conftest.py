@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
-from handsim.space.cameras import ROOM_CENTER, named_rig
+from handsim.space.rig import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.work import sample_work
 from train.simulation.room import RoomConfig

@@ -9,7 +9,7 @@ from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.hand.motion import BodyMotion
 from handsim.space.camera import look_at
-from handsim.space.cameras import named_rig
+from handsim.space.rig import named_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train.rig_advice.forecast import camera_losses, covariances, ellipsoid, forecast, light, light_work

@@ -9,7 +9,7 @@ import pytest
 
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.cameras import CameraRig, named_rig
+from handsim.space.rig import CameraRig, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.planning import Planning, plan_rig, view_candidates
 from train.simulation.room import RoomConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.space.camera import look_at
-from handsim.space.cameras import list_rigs, named_rig
+from handsim.space.rig import list_rigs, named_rig
 from tests.rigs import square_rig
 from train.rig_advice.rig_faults import faults, working_point
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.space.cameras import ROOM_CENTER, named_rig
+from handsim.space.rig import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import CameraLoss
 from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
 from train.rig_advice.rig_score import GRID, map_volume, score_work

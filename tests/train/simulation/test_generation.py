@@ -20,7 +20,7 @@ from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
-from handsim.space.cameras import as_rig
+from handsim.space.rig import as_rig
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import ArgumentError, DatasetError, HandSimWarning
-from handsim.space.cameras import load_rig
+from handsim.space.rig import load_rig
 from poses.shapes import sample_poses
 from train.simulation.generation import generate_dataset
 from train.simulation.takes import simulate_take

@@ -20,8 +20,8 @@ from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion
 from handsim.space.camera import look_at
-from handsim.space.cameras import named_rig
 from handsim.space.objects import RigidObject, named_object
+from handsim.space.rig import named_rig
 from poses.motion import sample_motion
 from tests.rigs import square_rig
 from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources

@@ -15,8 +15,8 @@ from gloves.optics.reconstruction import OpticsConfig
 from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import ROOM_CENTER, as_rig, named_rig
 from handsim.space.objects import named_object
+from handsim.space.rig import ROOM_CENTER, as_rig, named_rig
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW

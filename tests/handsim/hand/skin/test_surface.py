@@ -7,28 +7,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, build_skeleton, join_qpos
 from handsim.hand.shape import (
     ADULTS,
+    BONES,
+    DIGITS,
     EVERYBODY,
+    JOINTS,
+    NUM_BONES,
+    NUM_JOINTS,
     SIZES,
     HandShape,
     named_shape,
     sample_shape,
     shape_from_measures,
 )
-from handsim.hand.skeleton import build_skeleton
-from handsim.hand.skin.cage_topology import cage_topology
-from handsim.hand.skin.surface import (
+from handsim.hand.skin import (
     HandSurface,
     build_surface,
+    cage_topology,
     cage_weights,
     rest_vertices,
     skin_frames,
     strongest_weights,
     vertex_normals,
 )
-from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES, NUM_JOINTS
 from handsim.space.transforms import axis_angle_matrix, euler_matrix, random_quaternions
 from tests.handsim.hand.skin.blending import blend_skin
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimWarning, RigError
-from handsim.space.cameras import CameraRig
-from handsim.space.rig_formats.any_file import import_cameras, load_cameras
+from handsim.space.rig import CameraRig
+from handsim.space.rig_formats import import_cameras, load_cameras
 from tests.handsim.space.rig_formats.known_rig import (
     MCAL,
     PIXELS,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import RigError
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 
 R, T = cv2.Rodrigues(np.array([0.02, -0.08, 0.03]))[0], np.array([[-0.12], [0.003], [0.01]])

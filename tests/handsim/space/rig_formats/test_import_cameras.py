@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimWarning, RigError
-from handsim.space.rig_formats import any_file
-from handsim.space.rig_formats.any_file import import_cameras
-from handsim.space.rig_formats.lab_camera import LabCamera
+from handsim.space.rig_formats import LabCamera, import_cameras
 from tests.rigs import mixed_rig
 
 CAMERAS = mixed_rig().cameras
@@ -22,7 +20,7 @@ def told(monkeypatch):
     """`import_cameras` of these cameras, and the warnings."""
 
     def read(found, up=None):
-        monkeypatch.setattr(any_file, "load_lab_cameras", lambda path: tuple(found))
+        monkeypatch.setattr("handsim.space.rig_formats.load_lab_cameras", lambda path: tuple(found))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             cameras = import_cameras("lab.xcp", up)

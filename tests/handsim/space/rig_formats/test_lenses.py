@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimWarning
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig_formats import load_cameras
 from tests.handsim.space.rig_formats.known_rig import MCAL, QUALISYS, XCP
 
 POINTS = np.random.default_rng(5).uniform([-1.2, 1.0, 0.3], [1.2, 2.0, 1.9], (50, 3))

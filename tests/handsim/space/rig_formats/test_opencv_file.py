@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import RigError
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig_formats import load_cameras
 
 K = np.array([[610.0, 0, 321.5], [0, 612.0, 238.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from handsim.space.rig_formats.any_file import load_cameras
+from handsim.space.rig_formats import load_cameras
 
 LOCAL = np.random.default_rng(2).uniform([-0.3, -0.3, 1.0], [0.3, 0.3, 4.0], (20, 3))
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from handsim.errors import RigError
-from handsim.space.rig_formats import xml_tree
-from handsim.space.rig_formats.any_file import load_cameras
-from handsim.space.rig_formats.xml_tree import read_xml
+from handsim.space import rig_formats
+from handsim.space.rig_formats import load_cameras, read_xml
 from tests.handsim.space.rig_formats.known_rig import XCP, check
 
 BOMB = """<?xml version="1.0"?>
@@ -45,7 +44,7 @@ def test_hostile_xml(tmp_path, content, message):
 def test_a_giant_file(tmp_path):
     path = tmp_path / "lab.xcp"
     with path.open("wb") as file:
-        file.truncate(xml_tree._MOST_BYTES + 1)
+        file.truncate(rig_formats._MOST_BYTES + 1)
     with pytest.raises(RigError, match="bytes long, expected at most"):
         read_xml(path)
 

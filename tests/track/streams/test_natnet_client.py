@@ -14,18 +14,16 @@ import numpy as np
 import pytest
 
 from gloves.captures.capture import Capture
-from gloves.takes.status import Status
+from gloves.takes.points import Status
 from gloves.takes.take import Take
-from handsim.errors import CaptureError
+from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
 from track.rigid_body import BodyTracker, RigidTemplate
-from track.streams import natnet, natnet_server
-from track.streams import point_stream as streaming
-from track.streams.live_stream import LiveStream
-from track.streams.natnet import Kind, MarkerFrame, ServerInfo
-from track.streams.natnet_server import ReplayServer
-from track.streams.point_stream import PointStream, open_stream
+from track.streams import natnet
+from track.streams.frame_source import StreamedFrame
+from track.streams.live_stream import LiveStream, open_source
+from track.streams.natnet import Kind, PointStream, ReplayServer, ServerInfo, open_stream
 from train.simulation.takes import simulate_take
 
 LOOPBACK = "127.0.0.1"
@@ -34,7 +32,7 @@ LOOPBACK = "127.0.0.1"
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """A server is waited for, however busy the machine is."""
-    monkeypatch.setattr(streaming, "_PATIENCE", LONG)
+    monkeypatch.setattr(natnet, "_PATIENCE", LONG)
 
 
 def opened(url: str, **options: object) -> LiveStream:
@@ -92,7 +90,7 @@ def unicast(version: tuple[int, int]) -> ServerInfo:
 
 def frame(number: int, version: tuple[int, int]) -> bytes:
     points = np.array([[number, 0.0, 1.0]]) / 128.0
-    return natnet.pack_frame(MarkerFrame(number, number / 100.0, points, np.array([number])), version)
+    return natnet.pack_frame(StreamedFrame(number, number / 100.0, points, np.array([number])), version)
 
 
 @pytest.mark.parametrize("version", [(3, 0), (4, 0), (4, 1)])
@@ -113,7 +111,7 @@ def test_a_take_arrives_whole(version):
 
 def test_frames_are_played_at_their_rate(monkeypatch):
     take, now = twin(), [50.0]
-    monkeypatch.setattr(natnet_server, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(natnet, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
     with ReplayServer(take) as server, opened(server.url, silence=LONG) as stream:
         assert next(stream).number == 0
         for last in (1, 10, 11, 40):
@@ -242,9 +240,9 @@ def frames(stream: PointStream) -> list[int]:
 
 def test_a_quiet_server_is_greeted_anew(monkeypatch):
     now = [50.0]
-    monkeypatch.setattr(streaming, "_KEEP_ALIVE", 0.1)
-    monkeypatch.setattr(streaming, "_ATTENDED", 0.01)
-    monkeypatch.setattr(streaming, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    monkeypatch.setattr(natnet, "_KEEP_ALIVE", 0.1)
+    monkeypatch.setattr(natnet, "_ATTENDED", 0.01)
+    monkeypatch.setattr(natnet, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
     with Puppet(unicast((4, 1))) as server:
         stream = open_stream(server.url)
         for heard in (2, 4, 6):
@@ -285,18 +283,18 @@ def test_multicast_is_heard_on_loopback():
 
 @pytest.mark.parametrize(
     "url",
-    ["", "natnet://", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
+    ["", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
      "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
 )  # fmt: skip
 def test_addresses_that_are_none_are_told(url):
-    with pytest.raises(CaptureError, match="expected natnet://host or natnet://host:port"):
-        open_stream(url)
+    with pytest.raises(ArgumentError, match=r"natnet://host|a port from 1 to 65535"):
+        open_source(url)
 
 
 def test_servers_that_cannot_be_used_are_told(monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(streaming, "_PATIENCE", 0.2)
-        patch.setattr(streaming, "_RETRY", 0.1)
+        patch.setattr(natnet, "_PATIENCE", 0.2)
+        patch.setattr(natnet, "_RETRY", 0.1)
         with (
             Puppet() as server,
             pytest.raises(CaptureError, match="no NatNet server answers; in Motive"),
@@ -327,11 +325,11 @@ def test_what_cannot_be_replayed_is_told():
     points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
     for arguments, options, words in (
         ((points, ids[:1], 100.0), {}, "expected (T, N, 3) and (T, N)"),
-        ((points, ids, 0.0), {}, "the rate is 0 Hz"),
+        ((points, ids, 100.0), {"rate": 0.0}, "rate is 0, expected a number above 0"),
         ((points, ids, 100.0), {"version": (2, 9)}, "unknown NatNet version '2.9'"),
         ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
     ):  # fmt: skip
-        with pytest.raises(CaptureError) as caught:
+        with pytest.raises(HandSimError) as caught:
             ReplayServer(
                 SimpleNamespace(**dict(zip(("points", "ids", "rate"), arguments, strict=True))), **options
             )
@@ -368,7 +366,9 @@ def test_one_wild_time_does_not_end_a_stream():
     with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         for number in range(20):
             for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
-                server.say(natnet.pack_frame(MarkerFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1)))
+                server.say(
+                    natnet.pack_frame(StreamedFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1))
+                )
             server.say(frame(number, (4, 1)))
         got = list(itertools.islice(stream, 20))
         stream.end()

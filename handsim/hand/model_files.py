@@ -1,9 +1,14 @@
-"""A hand as an OpenSim model, .osim: a body per bone, custom joints, capsules, markers.
+"""A hand as URDF and as an OpenSim model, .osim.
 
-The coordinates are those of the `.mot` that `handsim.motion_files` writes: `right_wrist_tx` to `tz` [m],
-`right_wrist_rx` to `rz` (rotations about x, y and z of the body, in this order), then `right_` and the name
-of each joint. A bone with two joints is moved by one custom joint about both axes, the first one first. The
-ground has the axes of the take, z up.
+URDF has a link per bone, revolute joints, and capsules as cylinders with a sphere at each end. A bone with
+two joints has a link between them, `index_proximal_abduction`, which takes a hundredth of the bone's mass and
+inertia, because simulators refuse links without any. The root link is the palm, which a simulator leaves free
+or fixes.
+
+OpenSim's model has a body per bone, custom joints, capsules and markers. Its coordinates are those of the
+`.mot` that `handsim.motion_files` writes: `right_wrist_tx` to `tz` [m], `right_wrist_rx` to `rz` (rotations
+about x, y and z of the body, in this order), then `right_` and the name of each joint. A bone with two joints
+is moved by one custom joint about both axes, the first one first. The ground has the axes of the take, z up.
 """
 
 from __future__ import annotations
@@ -16,16 +21,114 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim.hand.keypoints import KEYPOINT_BONES, KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.mjcf import Site
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
-from handsim.hand.urdf import number_text, vector_text
-from handsim.space.transforms import body_fixed_angles, quaternion_matrix
+from handsim.hand.model import KEYPOINT_BONES, KEYPOINT_NAMES, HandModel, Site, hand_keypoints, join_qpos
+from handsim.hand.shape import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.space.transforms import body_fixed_angles, euler_angles, quaternion_matrix
+
+_SMALL_SHARE: Final = 0.01
+_MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
+_MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
+_COLOR: Final = "0.85 0.65 0.55 1"
+
+
+def hand_urdf(model: HandModel) -> str:
+    """The text of a .urdf file: meters, radians, kilograms."""
+    root = ET.Element("robot", name="hand")
+    ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
+    for number, bone in enumerate(BONES):
+        hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == number]
+        links = [*(_middle_name(index) for index in hinges[:-1]), bone.name]
+        shares = [_SMALL_SHARE] * (len(links) - 1) + [1.0 - _SMALL_SHARE * (len(links) - 1)]
+        for link, share in zip(links, shares, strict=True):
+            _add_link(root, model, number, link, share)
+        for step, index in enumerate(hinges):
+            parent = BONE_NAMES[bone.parent] if step == 0 else links[step - 1]
+            _add_joint(root, model, index, parent, links[step], at_rest=step == 0)
+    ET.indent(root)
+    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _middle_name(joint: int) -> str:
+    """The link between a bone's first joint and its second."""
+    kind = JOINTS[joint].name.rpartition("_")[2]
+    return f"{BONE_NAMES[JOINTS[joint].bone]}_{kind}"
+
+
+def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: float) -> None:
+    """A link with a share of its bone's mass; the shapes belong to the bone's own link."""
+    link = ET.SubElement(root, "link", name=name)
+    compiled, body = model.mj_model, bone + 1  # the world is body 0
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=vector_text(compiled.body_ipos[body]), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=number_text(share * compiled.body_mass[body]))
+    axes = quaternion_matrix(compiled.body_iquat[body])
+    moments = share * axes @ np.diag(compiled.body_inertia[body]) @ axes.T
+    entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    ET.SubElement(inertial, "inertia", {key: number_text(moments[at]) for key, at in entries.items()})
+    if name != BONE_NAMES[bone]:
+        return
+    capsules = model.capsules
+    for index in np.flatnonzero(capsules.bones == bone).tolist():
+        start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
+        for kind in ("visual", "collision"):
+            _add_capsule(link, kind, start, end, radius)
+
+
+def _add_capsule(
+    link: ET.Element, kind: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
+) -> None:
+    """A cylinder and two spheres, since URDF has no capsule."""
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / length
+    pitch, yaw = np.arccos(along[2]), np.arctan2(along[1], along[0])
+    shapes = (
+        ("cylinder", {"radius": number_text(radius), "length": number_text(length)}, 0.5 * (start + end)),
+        ("sphere", {"radius": number_text(radius)}, start),
+        ("sphere", {"radius": number_text(radius)}, end),
+    )
+    for shape, sizes, center in shapes:
+        part = ET.SubElement(link, kind)
+        turn = (
+            f"0 {number_text(pitch)} {number_text(yaw)}" if shape == "cylinder" else "0 0 0"
+        )  # z along the axis
+        ET.SubElement(part, "origin", xyz=vector_text(center), rpy=turn)
+        ET.SubElement(ET.SubElement(part, "geometry"), shape, sizes)
+        if kind == "visual":
+            ET.SubElement(part, "material", name="skin")
+
+
+def _add_joint(
+    root: ET.Element, model: HandModel, joint: int, parent: str, child: str, *, at_rest: bool
+) -> None:
+    """A hinge; the first of a bone stands at the bone's place at rest, the next one in the same place."""
+    skeleton, bone = model.skeleton, JOINTS[joint].bone
+    place, turn = np.zeros(3), np.zeros(3)
+    if at_rest:
+        place, turn = skeleton.offsets[bone], euler_angles(skeleton.rotations[bone][None])[0, ::-1]
+    element = ET.SubElement(root, "joint", name=JOINTS[joint].name, type="revolute")
+    ET.SubElement(element, "parent", link=parent)
+    ET.SubElement(element, "child", link=child)
+    ET.SubElement(element, "origin", xyz=vector_text(place), rpy=vector_text(turn))
+    ET.SubElement(element, "axis", xyz=vector_text(skeleton.axes[joint]))
+    low, high = skeleton.ranges[joint]
+    limits = {"lower": low, "upper": high, "effort": _MOST_TORQUE, "velocity": _MOST_SPEED}
+    ET.SubElement(element, "limit", {key: number_text(value) for key, value in limits.items()})
+    ET.SubElement(element, "dynamics", damping="0.01", friction="0")
+
+
+def vector_text(vector: Float[np.ndarray, "K"]) -> str:
+    """Numbers with blanks between them."""
+    return " ".join(number_text(value) for value in vector)
+
+
+def number_text(value: float) -> str:
+    """A number with twelve digits; zero has no sign."""
+    return f"{float(value) + 0.0:.12g}"
+
 
 _VERSION: Final = "40000"  # of the document: OpenSim 4.0 and later read it
 _GRAVITY: Final = "0 0 -9.80665"
-_COLOR: Final = "0.85 0.65 0.55"
+_OSIM_COLOR: Final = "0.85 0.65 0.55"
 _FARTHEST: Final = 5.0  # [m] of the wrist from the origin
 _MOST_TURN: Final = 2.0 * np.pi  # [rad] of the wrist
 _PARALLEL: Final = 0.5  # of two axes: the cosine of the angle between them
@@ -59,7 +162,7 @@ def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
         _add_body(bodies, model, bone)
     # The palm turns about its own axes and moves along those of the ground, in which it is free.
     names = coordinate_names(side)[:6]
-    joint = _add_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
+    joint = _add_osim_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
     _add_motion(joint, [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)])
     for bone in range(1, len(BONES)):
         _add_knuckle(joints, model, bone)
@@ -94,13 +197,13 @@ def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
     capsules = model.capsules
     for index in np.flatnonzero(capsules.bones == bone).tolist():
         start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
-        _add_capsule(shapes, f"{name}_{index}", start, end, radius)
+        _add_osim_capsule(shapes, f"{name}_{index}", start, end, radius)
     _add(body, "mass", number_text(compiled.body_mass[number]))
     _add(body, "mass_center", vector_text(compiled.body_ipos[number]))
     _add(body, "inertia", vector_text(moments[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
 
 
-def _add_capsule(
+def _add_osim_capsule(
     shapes: ET.Element, name: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
 ) -> None:
     """A cylinder and two spheres, since OpenSim draws no capsule."""
@@ -115,7 +218,7 @@ def _add_capsule(
         kind = "Cylinder" if place == "middle" else "Sphere"
         shape = ET.SubElement(ET.SubElement(frame, "attached_geometry"), kind, name=f"{name}_{place}_shape")
         _add(shape, "socket_frame", "..")
-        _add(ET.SubElement(shape, "Appearance"), "color", _COLOR)
+        _add(ET.SubElement(shape, "Appearance"), "color", _OSIM_COLOR)
         _add(shape, "radius", number_text(radius))
         if kind == "Cylinder":
             _add(shape, "half_height", half_height)
@@ -132,7 +235,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
     T_parent_bone = np.eye(4)
     T_parent_bone[:3, :3], T_parent_bone[:3, 3] = skeleton.rotations[bone], skeleton.offsets[bone]
     parent = f"/bodyset/{side}_{BONE_NAMES[BONES[bone].parent]}"
-    joint = _add_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
+    joint = _add_osim_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
     axes = [skeleton.axes[index] for index in hinges]
     # A custom joint takes three axes, all of them different, also where fewer turn.
     axes += [axis for axis in np.eye(3) if all(abs(axis @ one) < _PARALLEL for one in axes)][: 3 - len(axes)]
@@ -143,7 +246,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
     )
 
 
-def _add_joint(
+def _add_osim_joint(
     joints: ET.Element, name: str, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
     """A custom joint that lets the child lie so in its parent when all its coordinates are zero."""

@@ -1,3 +1,0 @@
-"""The version of handsim, stated here alone."""
-
-__version__ = "0.1.0"

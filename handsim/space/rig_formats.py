@@ -1,0 +1,951 @@
+"""Calibrations of cameras as other programs write them: Vicon, Qualisys, Motive, COLMAP and OpenCV.
+
+Vicon's `.xcp` is what Nexus, Shogun, Tracker and Blade keep beside a capture. A `KeyFrame` has the position
+[mm] and the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down,
+z ahead. Radial coefficients straighten measured points: a point at r pixels from the principal point belongs
+at r (1 + k1 r^2 + k2 r^4 + k3 r^6).
+
+Qualisys' calibration is exported by QTM as XML or text, and sent by its real-time server. `transform` has the
+position [mm] and a matrix whose rows are the camera's axes in the world: x right, y up, z backward.
+`intrinsic` counts in 64ths of a pixel of the sensor, v down; its distortion is OpenCV's.
+
+OptiTrack Motive's `.mcal`, of Motive 3.2 and newer, is in UTF-16. `Extrinsic` has the position [m] and, row
+by row, the matrix whose columns are the camera's axes in the world: x right, y up, z backward. Motive's world
+has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; that of `Intrinsic` is Motive's own.
+
+COLMAP's reconstructions are read as text: `cameras.txt` with the lenses, `images.txt` with the poses.
+
+OpenCV's files are YAML or JSON, of one camera, the two of a stereo pair, or many. Our own few lines read
+them: they are flat tables of numbers, and OpenCV's parser may never come back from a damaged one.
+"""
+
+from __future__ import annotations
+
+import codecs
+import dataclasses
+import itertools
+import json
+import re
+import textwrap
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
+from handsim.files.inputs import read_bytes, shown
+from handsim.space.camera import Camera, Lens, camera_matrix
+from handsim.space.rig import checked_cameras, read_rig_file
+from handsim.space.transforms import quaternion_matrix, vector_quaternions
+
+_LARGEST: Final = 1e9  # in any unit
+_SKEWED: Final = 1e-3  # of a rotation in a file of few digits
+_NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
+_LONGEST_NAME: Final = 56
+
+
+class LabCamera(NamedTuple):
+    """A camera of a calibration."""
+
+    camera: Camera
+    """With its size and lens [px] and its pose in the calibration's world [m]."""
+    video: bool = False
+    """Whether it takes pictures and sees no markers."""
+    y_up: bool = False
+    """Whether y points up in the calibration's world; else it is z, or the file does not say."""
+
+
+class Skipped(NamedTuple):
+    """A camera that a calibration names but does not place."""
+
+    name: str
+    why: str
+
+
+def attribute_numbers(element: ET.Element, key: str, count: int, owner: str) -> tuple[float, ...]:
+    """The numbers of an attribute, parted by spaces."""
+    text = element.get(key)
+    if text is None:
+        raise RigError(f"{owner} lacks {key}")
+    try:
+        values = tuple(float(word) for word in text.split())
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(abs(value) < _LARGEST for value in values):  # never so for NaN
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise RigError(f"{owner}: {key} is {shown(text)}, expected {expected}")
+    return values
+
+
+def attribute_number(element: ET.Element, key: str, owner: str, default: float | None = None) -> float:
+    """The number of an attribute; `default`, unless None, where it is missing.
+
+    Raises:
+        RigError: It is missing without a default, or not a finite number.
+    """
+    if default is not None and element.get(key) is None:
+        return default
+    return attribute_numbers(element, key, 1, owner)[0]
+
+
+def child(element: ET.Element, tag: str, owner: str) -> ET.Element:
+    """The first child of a tag.
+
+    Raises:
+        RigError: There is none.
+    """
+    found = element.find(tag)
+    if found is None:
+        raise RigError(f"{owner} lacks <{tag}>")
+    return found
+
+
+def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
+    """Width and height [px]."""
+    if width != int(width) or height != int(height) or min(width, height) < 1:
+        raise RigError(f"{owner}: the picture is {width:g} x {height:g}, expected whole numbers of pixels")
+    return int(width), int(height)
+
+
+def checked_matrix(
+    owner: str, focal: tuple[float, float], center: tuple[float, float]
+) -> Float[np.ndarray, "3 3"]:
+    """K of focal lengths and a principal point [px]."""
+    if not min(focal) > 0.0:
+        raise RigError(
+            f"{owner}: the focal lengths are {focal[0]:g} and {focal[1]:g}, expected positive pixels"
+        )
+    return camera_matrix(*focal, *center)
+
+
+def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """The rotation (3, 3) that a matrix of few digits stands for."""
+    left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    rotation: NDArray[np.float64] = left @ right
+    if np.abs(stretch - 1.0).max() > _SKEWED or np.linalg.det(rotation) < 0.0:
+        raise RigError(f"{owner} is not a rotation matrix")
+    return rotation
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], position: Sequence[float] | Float[np.ndarray, "3"]
+) -> NDArray[np.float64]:
+    """The transform (4, 4) of a rotation and a position."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, position
+    return transform
+
+
+def brown_lens(*coefficients: float) -> Lens:
+    """OpenCV's lens of k1, k2, p1, p2 and k3; a pinhole where all are zero."""
+    return Lens("brown", coefficients) if any(coefficients) else Lens()
+
+
+def camera_names(given: Sequence[str]) -> list[str]:
+    """Names of cameras with nothing but letters, digits, - and _, each once."""
+    names: list[str] = []
+    for number, text in enumerate(given, 1):
+        plain = _NAMELESS.sub("_", text).strip("_")[:_LONGEST_NAME] or f"camera{number}"
+        names.append(plain if plain not in names else f"{plain}_{number}")
+    return names
+
+
+_MOST_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
+_MOST_ELEMENTS: Final = 200_000
+_DEEPEST: Final = 64
+_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
+_MARKS: Final = (
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
+
+
+class _Refused(Exception):
+    """What the parser must not go on with."""
+
+
+def read_xml(path: Path) -> ET.Element:
+    """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
+    text = _decoded(path, read_bytes(path, error=RigError, most=_MOST_BYTES))
+    try:
+        return _parsed(text)
+    except _Refused as error:
+        raise RigError(f"{path}: {error}") from error
+    except expat.ExpatError as error:
+        reason = expat.ErrorString(error.code)
+        raise RigError(f"{path}: not a calibration: it is no XML (line {error.lineno}: {reason})") from error
+
+
+def _decoded(path: Path, data: bytes) -> str:
+    """The text without its declaration, whose encoding some programs state wrongly."""
+    mark, encoding = next((pair for pair in _MARKS if data.startswith(pair[0])), (b"", ""))
+    if not encoding:
+        encoding = {b"<\0": "utf-16-le", b"\0<": "utf-16-be"}.get(data[:2], "utf-8")
+    try:
+        text = data[len(mark) :].decode(encoding)
+    except UnicodeDecodeError as error:
+        if encoding != "utf-8" or not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
+            raise RigError(f"{path}: not a calibration: it is no XML text") from error
+        text = data.decode("latin-1")
+    return _DECLARATION.sub("", text, count=1)
+
+
+def _parsed(text: str) -> ET.Element:
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate("utf-8")
+    elements = depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal elements, depth
+        elements, depth = elements + 1, depth + 1
+        if elements > _MOST_ELEMENTS or depth > _DEEPEST:
+            raise _Refused(
+                f"the XML has more than {_MOST_ELEMENTS} elements or is nested deeper than {_DEEPEST}, "
+                "expected the calibration of a camera system"
+            )
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def refuse(*_: object) -> None:
+        raise _Refused("the XML has a document type, which no calibration has; it is not read")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.Parse(text.encode("utf-8", "surrogatepass"), True)
+    return builder.close()
+
+
+_VICON: Final = "Cameras"
+_MILLIMETER: Final = 1e-3
+_STRONGEST: Final = 0.5  # of a corner's distance; no lens moves it farther
+_SAMPLES: Final = 256
+_VIDEO: Final = ("vue", "videoinputdevice")
+
+
+def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+    """The camera of an element; a `RigError` where a value is missing or cannot be."""
+    device = entry.get("DEVICEID") or entry.get("USERID") or str(number)
+    owner = f"camera {shown(device)}"
+    frames = entry.findall("KeyFrames/KeyFrame")
+    if not frames:
+        return Skipped(device, "is not calibrated")
+    if len(frames) > 1:
+        told = f"{owner} moves: it has {len(frames)} key frames, of which the first is taken"
+        warnings.warn(told, HandSimWarning, stacklevel=2)
+    frame = frames[0]
+    size = picture_size(owner, *attribute_numbers(entry, "SENSOR_SIZE", 2, owner))
+    focal = attribute_number(frame, "FOCAL_LENGTH", owner)
+    aspect = attribute_number(entry, "PIXEL_ASPECT_RATIO", owner, 1.0)
+    if not aspect > 0.0:
+        raise RigError(f"{owner}: PIXEL_ASPECT_RATIO is {aspect:g}, expected a positive number")
+    center = attribute_numbers(frame, "PRINCIPAL_POINT", 2, owner)
+    K = checked_matrix(owner, (focal, focal / aspect), (center[0], center[1]))
+    kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
+    video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
+    camera = Camera(device, size, K, _vicon_pose(frame, owner), _vicon_lens(frame, owner, size, K))
+    return LabCamera(camera, video=video)
+
+
+def _vicon_pose(frame: ET.Element, owner: str) -> NDArray[np.float64]:
+    x, y, z, w = attribute_numbers(frame, "ORIENTATION", 4, owner)
+    quaternion = np.array([w, x, y, z])
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > 1e-2:
+        raise RigError(f"{owner}: ORIENTATION is a quaternion of length {length:.4g}, expected 1")
+    position = np.array(attribute_numbers(frame, "POSITION", 3, owner))
+    return rigid(quaternion_matrix(quaternion).T, _MILLIMETER * position)
+
+
+def _vicon_lens(frame: ET.Element, owner: str, size: tuple[int, int], K: NDArray[np.float64]) -> Lens:
+    """Our lens bends where Vicon's straightens; the inverse is fitted over the picture."""
+    straighten = _coefficients(frame, owner)
+    if not any(straighten):
+        return Lens()
+    corner = float(np.hypot(*np.maximum(K[:2, 2], size - K[:2, 2])))  # [px]
+    measured = np.linspace(0.0, corner, _SAMPLES + 1)[1:]
+    factor = 1.0 + sum(k * measured ** (2 * n) for n, k in enumerate(straighten, 1))
+    if not np.abs(factor - 1.0).max() < _STRONGEST:
+        told = f"{owner}: its lens would move a corner by more than half its distance; it is left out"
+        warnings.warn(told, HandSimWarning, stacklevel=2)
+        return Lens()
+    straight = measured * factor / K[0, 0]  # [focal lengths]
+    powers = straight[:, None] ** np.array([2, 4, 6])
+    fitted = np.linalg.lstsq(powers * straight[:, None], straight / factor - straight, rcond=None)[0]
+    k1, k2, k3 = map(float, fitted)
+    return Lens("brown", (k1, k2, 0.0, 0.0, k3))
+
+
+def _coefficients(frame: ET.Element, owner: str) -> tuple[float, ...]:
+    """k1, k2, ... [1/px^2, 1/px^4, ...]; of the newer form they follow a name and a center."""
+    words = (frame.get("VICON_RADIAL2") or "").split()
+    if words and len(words) != 6:
+        raise RigError(f"{owner}: VICON_RADIAL2 has {len(words)} words, expected a name and five numbers")
+    if words:
+        newer = ET.Element("KeyFrame", {"VICON_RADIAL2": " ".join(words[1:])})
+        return attribute_numbers(newer, "VICON_RADIAL2", 5, owner)[2:]
+    return attribute_numbers(frame, "VICON_RADIAL", 2, owner) if frame.get("VICON_RADIAL") else ()
+
+
+_QUALISYS: Final = "calibration"
+_PARTS: Final = 64.0  # of a pixel
+_SIDES: Final = ("left", "top", "right", "bottom")
+_TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
+
+
+def _qualisys_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+    """The camera of an element; a `RigError` where a value is missing or cannot be."""
+    serial = entry.get("serial") or str(number)
+    owner = f"camera {shown(serial)}"
+    if entry.get("active", "1").lower() in ("0", "false"):
+        return Skipped(serial, "is switched off")
+    if entry.get("calibrated", "true").lower() in ("0", "false"):
+        return Skipped(serial, "is not calibrated")
+    video = any(word in entry.get("model", "").lower() for word in ("video", "hybrid"))
+    inner, view = child(entry, "intrinsic", owner), "fov_video" if video else "fov_marker"
+    left, top, right, bottom = _sides(entry, view, owner)
+    size = picture_size(owner, right - left + 1, bottom - top + 1)
+    scale = 1.0 / (_PARTS * _binning(entry, view, inner, owner))
+    u, v = (attribute_number(inner, f"centerPoint{axis}", owner) * scale for axis in "UV")
+    focal = tuple(attribute_number(inner, f"focalLength{axis}", owner) * scale for axis in "UV")
+    K = checked_matrix(owner, (focal[0], focal[1]), (u - left, v - top))
+    place = child(entry, "transform", owner)
+    rows = [[attribute_number(place, f"r{i}{j}", owner) for j in (1, 2, 3)] for i in (1, 2, 3)]
+    axes = nearest_rotation(f"{owner}: the matrix r11 to r33", np.array(rows))
+    position = np.array([attribute_number(place, axis, owner) for axis in "xyz"])
+    pose = rigid(axes.T @ _TO_OPENCV, _MILLIMETER * position)
+    return LabCamera(Camera(serial, size, K, pose, _qualisys_lens(inner, owner)), video=video)
+
+
+def _sides(entry: ET.Element, view: str, owner: str) -> tuple[float, ...]:
+    """The part of the sensor that is used: its first and last columns and rows [px]."""
+    found = entry.find(view)
+    if found is None:
+        found = child(entry, "fov_video" if view == "fov_marker" else "fov_marker", owner)
+    sides = tuple(attribute_number(found, side, owner) for side in _SIDES)
+    if sides[2] <= sides[0] or sides[3] <= sides[1]:
+        raise RigError(f"{owner}: <{found.tag}> is empty, expected left < right and top < bottom")
+    return sides
+
+
+def _binning(entry: ET.Element, view: str, inner: ET.Element, owner: str) -> int:
+    """How many pixels of the sensor, each way, are one of the picture."""
+    whole = entry.find(f"{view}_max")
+    if whole is None:
+        return 1
+    width = attribute_number(whole, "right", owner) - attribute_number(whole, "left", owner) + 1
+    span = attribute_number(inner, "sensorMaxU", owner, 0.0) - attribute_number(
+        inner, "sensorMinU", owner, 0.0
+    )
+    return max(1, round(span / _PARTS / width)) if width > 0 else 1
+
+
+def _qualisys_lens(inner: ET.Element, owner: str) -> Lens:
+    k1, k2, k3 = (attribute_number(inner, f"radialDistortion{n}", owner, 0.0) for n in (1, 2, 3))
+    p1, p2 = (attribute_number(inner, f"tangentalDistortion{n}", owner, 0.0) for n in (1, 2))
+    return brown_lens(k1, k2, p1, p2, k3)
+
+
+_MOTIVE: Final = "calibrationProfile"
+_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
+_COLOR: Final = "30"
+"""`ImagerIndex` of color cameras."""
+
+
+def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
+    """The camera of an element; a `RigError` where a value is missing or cannot be."""
+    serial = entry.get("Serial") or str(number)
+    owner = f"camera {shown(serial)}"
+    properties, outer = entry.find("Properties"), entry.find("Extrinsic")
+    if properties is not None and properties.get("Enabled") == "0":
+        return Skipped(serial, "is switched off")
+    standard = entry.find("IntrinsicStandardCameraModel")
+    inner = entry.find("Intrinsic") if standard is None else standard
+    if outer is None or inner is None:
+        return Skipped(serial, "is not calibrated")
+    color = serial.startswith("C") or (properties is not None and properties.get("ImagerIndex") == _COLOR)
+    imager = child(entry, "Attributes", owner)
+    sides = (attribute_number(imager, f"ImagerPixel{side}", owner) for side in ("Width", "Height"))
+    size = picture_size(owner, *sides)
+    focal = tuple(attribute_number(inner, f"{way}FocalLength", owner) for way in ("Horizontal", "Vertical"))
+    center = tuple(attribute_number(inner, f"LensCenter{axis}", owner) for axis in "XY")
+    K = checked_matrix(owner, (focal[0], focal[1]), (center[0], center[1]))
+    numbers = [attribute_number(outer, f"OrientMatrix{n}", owner) for n in range(9)]
+    axes = nearest_rotation(f"{owner}: OrientMatrix", np.array(numbers).reshape(3, 3))
+    position = np.array([attribute_number(outer, axis, owner) for axis in "XYZ"])
+    bends = [] if standard is None else [attribute_number(standard, key, owner, 0.0) for key in _MOTIVE_LENS]
+    camera = Camera(serial, size, K, rigid(axes @ _TO_OPENCV, position), brown_lens(*bends))
+    return LabCamera(camera, video=color, y_up=True)
+
+
+CAMERAS: Final = "cameras.txt"
+IMAGES: Final = "images.txt"
+_MOST_BYTES_COLMAP: Final = 1 << 28  # images.txt lists all points of each image
+_MODELS: Final = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "OPENCV_FISHEYE": 8,
+}
+"""Models that we read, and their numbers of parameters."""
+_ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
+    """A camera for each image of a reconstruction in meters, called after it.
+
+    `path` is the folder of `cameras.txt` and `images.txt`, or one of the two.
+
+    Raises:
+        RigError: A file is missing or damaged, or a model is one that we do not have.
+    """
+    folder = path if path.is_dir() else path.parent
+    lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
+    lines = _colmap_lines(folder / IMAGES, keep_empty=True)
+    cameras = [
+        _colmap_image(folder / IMAGES, line, lenses) for line in lines[::2]
+    ]  # points are on the others
+    return checked_cameras(folder / IMAGES, cameras)
+
+
+def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
+    """Lines without comments; an image without points has an empty one."""
+    try:
+        text = read_bytes(path, error=RigError, most=_MOST_BYTES_COLMAP).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RigError(
+            f"{path}: not COLMAP's text: it is not UTF-8; colmap model_converter writes it"
+        ) from error
+    lines = [line.strip() for line in text.splitlines() if not line.startswith("#")]
+    if not keep_empty:
+        return [line for line in lines if line]
+    while lines and not lines[-1]:
+        lines.pop()
+    return lines
+
+
+def _colmap_lens(path: Path, line: str) -> tuple[str, Camera]:
+    """`CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`."""
+    number, *rest = line.split()
+    owner = f"{path}: camera {shortened(number)}"
+    if len(rest) < 3:
+        raise RigError(f"{owner} has {1 + len(rest)} values, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+    model = rest[0]
+    if model not in _MODELS:
+        raise RigError(f"{owner}: {choices(model, _MODELS, noun='model')}")
+    width, height, *parameters = _numbers(owner, rest[1:])
+    if len(parameters) != _MODELS[model] or not (width.is_integer() and height.is_integer()):
+        raise RigError(
+            f"{owner}: {width:g} x {height:g} pixels and {len(parameters)} parameters, expected whole "
+            f"numbers and {_MODELS[model]} parameters of {model}"
+        )
+    if model in _ONE_FOCAL:
+        parameters.insert(0, parameters[0])
+    try:
+        K, lens = camera_matrix(*parameters[:4]), _bent_lens(model, parameters[4:])
+        return number, Camera(number, (int(width), int(height)), K, lens=lens)
+    except HandSimError as error:
+        raise RigError(f"{owner}: {error}") from error
+
+
+def _bent_lens(model: str, bent: list[float]) -> Lens:
+    if model.endswith("FISHEYE"):
+        return Lens("fisheye", (*bent, 0.0, 0.0, 0.0)[:4])
+    if model.endswith("RADIAL"):
+        return brown_lens(*(*bent, 0.0)[:2], 0.0, 0.0, 0.0)
+    if any(bent[5:]):
+        raise RigError("k4, k5 or k6 of FULL_OPENCV is not 0, expected the model OPENCV")
+    return brown_lens(*(*bent, *[0.0] * 5)[:5])
+
+
+def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
+    """`IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose of the world as the camera sees it."""
+    words = line.split(maxsplit=9)
+    if len(words) != 10:
+        raise RigError(
+            f"{path}: the line '{shortened(line)}' has {len(words)} values, expected "
+            "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points after it"
+        )
+    owner = f"{path}: image {shortened(words[0])}"
+    pose = np.array(_numbers(owner, words[1:8]))
+    length = float(np.linalg.norm(pose[:4]))
+    if abs(length - 1.0) > 1e-3:
+        raise RigError(f"{owner}: a quaternion of length {length:.4g}, expected 1")
+    if words[8] not in lenses:
+        raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
+    R_world_camera = quaternion_matrix(pose[:4] / length).T
+    lens = lenses[words[8]]
+    name = _NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
+    return Camera(name, lens.size, lens.K, rigid(R_world_camera, -R_world_camera @ pose[4:]), lens.lens)
+
+
+def _numbers(owner: str, words: list[str]) -> list[float]:
+    values = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            values.append(np.nan)
+        if not abs(values[-1]) < 1e9:
+            raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
+    return values
+
+
+_MOST_BYTES_OPENCV: Final = 1 << 24
+_MOST_NUMBERS: Final = 16
+"""Of a value that is used; corners of boards may be thousands."""
+_CENTER: Final = 0.5  # OpenCV counts pixels from the first one's center, we from the picture's corner
+_LONGEST_BASELINE: Final = 5.0  # [m]
+_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
+_DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
+_LIST: Final = re.compile(r"[\[\],\s]+")
+_K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
+_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist")
+_WIDTH: Final = ("image_width", "imageWidth", "img_width", "width")
+_HEIGHT: Final = ("image_height", "imageHeight", "img_height", "height")
+_SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
+_FISHEYE: Final = ("fisheye_model", "fisheye")
+_R: Final = ("R", "Rot", "rvec", "rotation")
+_T: Final = ("T", "t", "tvec", "translation")
+_PAIRS: Final = {
+    "intrinsics": "extrinsics",
+    "extrinsics": "intrinsics",
+    "intri": "extri",
+    "extri": "intri",
+}
+"""Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
+_OF_ONE: Final = (*_K, *_D, *_WIDTH, "W", *_HEIGHT, "H", *_SIZE, *_FISHEYE, *_R, *_T)
+_SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
+_MOST_SECTIONS: Final = 256
+
+Values = dict[str, tuple[float, ...] | str]
+Sections = dict[str, Values]
+"""Tables of one camera each, by the cameras' names."""
+
+
+def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
+    """The camera of a calibration, both of a stereo pair, or all of a file (docs/rendering.md has the names).
+
+    The file is a `.yml`, `.yaml` or `.json`. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
+    sample writes them, and of `intri.yml` and `extri.yml`, it is either; the other is read too.
+    """
+    values, sections = _read(path)
+    other = path.with_stem(_PAIRS.get(path.stem, path.stem))
+    if other != path and other.is_file():
+        more, others = _read(other)
+        values, sections = more | values, others | sections
+    try:
+        cameras = _cameras(values, sections or _numbered_sections(values))
+    except HandSimError as error:
+        raise RigError(f"{path}: {error}") from error
+    return checked_cameras(path, cameras)
+
+
+def _cameras(values: Values, sections: Sections) -> list[Camera]:
+    if sections:
+        return _many(values, sections)
+    if _find(values, _numbered(_K, 1)) is not None:
+        return _stereo(values)
+    if _find(values, ("P1",)) is not None:
+        return _rectified(values)
+    return [_camera(values, "camera", _K, _D, _pose(values))]
+
+
+def _many(values: Values, sections: Sections) -> list[Camera]:
+    """Cameras in one world; what is stated once, as the size of the pictures, holds for all."""
+    if len(sections) > _MOST_SECTIONS:
+        raise RigError(f"{len(sections)} cameras, expected at most {_MOST_SECTIONS}")
+    cameras = []
+    common = {key: value for key, value in values.items() if key in (*_WIDTH, *_HEIGHT, *_SIZE)}
+    for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
+        try:
+            if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
+                raise RigError("no R and T, the rotation and translation from the world to the camera")
+            cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
+        except HandSimError as error:
+            raise RigError(f"camera '{shortened(given)}': {error}") from error
+    return cameras
+
+
+def _numbered_sections(values: Values) -> Sections:
+    """Of K_1, dist_1, R_1, T_1, K_2, ...: a table for each camera that has a translation of its own."""
+    found: Sections = {}
+    for key, separator in itertools.product(list(values), ("_", "")):
+        base = next((one for one in _K if key.startswith(one + separator) and key != one + separator), None)
+        if base is None:
+            continue
+        ending = key[len(base) :]
+        own = {one: values[one + ending] for one in _OF_ONE if one + ending in values}
+        for short, name in (("W", _WIDTH[0]), ("H", _HEIGHT[0])):
+            if short in own:
+                own[name] = own.pop(short)
+        if _find(own, _T) is not None:
+            found[ending.removeprefix("_")] = own
+    return found
+
+
+def _camera(
+    values: Values, name: str, K: tuple[str, ...], D: tuple[str, ...], pose: NDArray[np.float64]
+) -> Camera:
+    matrix = _matrix(values, K, (3, 3))
+    return Camera(name, _size(values), _from_corner(matrix), pose, _lens(values, D))
+
+
+def _stereo(values: Values) -> list[Camera]:
+    """R and T take the first camera's coordinates to the second's."""
+    first = _pose(_without_pair(values))
+    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), _translation(values, "T")))
+    return [
+        _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
+        for name, number, pose in (("left", 1, first), ("right", 2, second))
+    ]
+
+
+def _rectified(values: Values) -> list[Camera]:
+    """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
+    first, cameras = _pose(_without_pair(values)), []
+    for name, key in (("left", "P1"), ("right", "P2")):
+        P = _matrix(values, (key,), (3, 4))
+        if not np.linalg.det(P[:, :3]):
+            raise RigError(f"{key} is not a projection matrix of a camera")
+        shift = np.linalg.solve(P[:, :3], P[:, 3]).astype(np.float64)
+        _check_baseline(shift)
+        pose = first @ np.linalg.inv(rigid(np.eye(3), shift))
+        cameras.append(Camera(name, _size(values), _from_corner(P[:, :3]), pose))
+    return cameras
+
+
+def _without_pair(values: Values) -> Values:
+    return {key: value for key, value in values.items() if key not in (*_R, *_T)}
+
+
+def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
+    moved: NDArray[np.float64] = K.astype(np.float64)
+    moved[:2, 2] += _CENTER
+    return moved
+
+
+def _lens(values: Values, names: tuple[str, ...]) -> Lens:
+    found = _find(values, names)
+    given = () if found is None else _value_numbers(values, found, None)
+    model = str(values.get("distortion_model", ""))
+    flag = _find(values, _FISHEYE)
+    if model in ("equidistant", "fisheye") or (flag is not None and any(_value_numbers(values, flag, (1,)))):
+        if len(given) != 4:
+            raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
+        return Lens("fisheye", given)
+    if any(given[5:]):
+        raise RigError(
+            f"{found} has {len(given)} coefficients, of which those after the fifth are not 0, expected the "
+            "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like"
+        )
+    if any(given) and len(given) < 4:
+        raise RigError(f"{found} has {len(given)} coefficients, expected 4 or 5: k1, k2, p1, p2, k3")
+    return brown_lens(*(*given, *[0.0] * 5)[:5])
+
+
+def _size(values: Values) -> tuple[int, int]:
+    width, height, both = (_find(values, names) for names in (_WIDTH, _HEIGHT, _SIZE))
+    if width is not None and height is not None:
+        size = _value_numbers(values, width, (1,)) + _value_numbers(values, height, (1,))
+    elif both is not None:
+        size = _value_numbers(values, both, (2,))
+    else:
+        raise RigError("no size of the pictures; add image_width and image_height in pixels")
+    if not all(length == int(length) for length in size):
+        raise RigError(f"the pictures are {size[0]:g} x {size[1]:g}, expected whole numbers of pixels")
+    return int(size[0]), int(size[1])
+
+
+def _pose(values: Values) -> NDArray[np.float64]:
+    """`T_world_camera`, or the inverse of the extrinsics R and T; without them the camera is the world."""
+    if "T_world_camera" in values:
+        return _matrix(values, ("T_world_camera",), (4, 4))
+    R, T = _find(values, _R), _find(values, _T)
+    if R is not None or T is not None:
+        outer = rigid(_rotation(values, R or "R"), _translation(values, T or "T", longest=None))
+        return np.linalg.inv(outer).astype(np.float64)
+    return np.eye(4)
+
+
+def _rotation(values: Values, key: str) -> NDArray[np.float64]:
+    """A rotation matrix, or a rotation vector [rad]."""
+    given = np.array(_value_numbers(values, key, None))
+    if given.size == 3:
+        turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
+        return turned
+    if given.size != 9:
+        raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
+    return nearest_rotation(key, given.reshape(3, 3))
+
+
+def _translation(
+    values: Values, key: str, *, longest: float | None = _LONGEST_BASELINE
+) -> NDArray[np.float64]:
+    vector = np.array(_value_numbers(values, key, (3,)))
+    if longest is not None:
+        _check_baseline(vector)
+    return vector
+
+
+def _check_baseline(vector: NDArray[np.float64]) -> None:
+    length = float(np.linalg.norm(vector))
+    if length > _LONGEST_BASELINE:
+        raise RigError(
+            f"the cameras are {length:.4g} m apart, expected at most {_LONGEST_BASELINE:g} m; are these "
+            "millimeters, or squares of the board? Positions are in meters"
+        )
+
+
+def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> NDArray[np.float64]:
+    found = _find(values, names)
+    if found is None:
+        raise RigError(f"no '{names[0]}', expected OpenCV's calibration with that name")
+    return np.array(_value_numbers(values, found, shape)).reshape(shape)
+
+
+def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
+    return tuple(name + separator + str(number) for name in names for separator in ("", "_"))
+
+
+def _find(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
+    return next((name for name in names if name in values), None)
+
+
+def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[float, ...]:
+    if key not in values:
+        raise RigError(f"no '{key}'")
+    given = values[key]
+    if isinstance(given, str) or not np.isfinite(given).all():
+        raise RigError(f"{key} is no list of at most {_MOST_NUMBERS} finite numbers")
+    if shape is not None and len(given) != np.prod(shape):
+        expected = " x ".join(map(str, shape))
+        raise RigError(f"{key} has {len(given)} numbers, expected {expected}")
+    return given
+
+
+def _read(path: Path) -> tuple[Values, Sections]:
+    data = read_bytes(path, error=RigError, most=_MOST_BYTES_OPENCV)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
+    if text.lstrip().startswith("<"):
+        raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
+    if not text.lstrip().startswith("{"):
+        return _yaml_tables(text)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RigError(f"{path}: not a calibration: it is no JSON") from error
+    if not isinstance(content, dict):
+        raise RigError(f"{path}: not a calibration: its JSON is no table")
+    return _json_values(content), dict(_json_sections(content))
+
+
+def _yaml_tables(text: str) -> tuple[Values, Sections]:
+    """The values at the top level, and the cameras below them."""
+    values: Values = {}
+    sections: Sections = {}
+    for name, body in _yaml_bodies(text):
+        if _SECTION.search(body):
+            inner = _yaml_bodies(textwrap.dedent(body.strip("\n")))
+            sections[name] = {key: _yaml_value(value) for key, value in inner}
+        else:
+            values[name] = _yaml_value(body)
+    return values, sections
+
+
+def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
+    """Each key at the left margin, and what follows it."""
+    starts = list(_ENTRY.finditer(text))
+    ends = [start.start() for start in starts[1:]]
+    for start, end in itertools.zip_longest(starts, ends):
+        yield start[1], text[start.end() : end]
+
+
+def _yaml_value(body: str) -> tuple[float, ...] | str:
+    """A number, a list of numbers, a matrix; anything else as text."""
+    body = body.strip()
+    data = _DATA.search(body)
+    words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
+    return _as_numbers(words) or body.strip("\"' ")
+
+
+def _json_values(table: Mapping[str, object]) -> Values:
+    return {str(key): _json_value(value) for key, value in table.items()}
+
+
+def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
+    """Tables of cameras at the top level, or in a table or list `cameras`."""
+    cameras = content.get("cameras", content)
+    if isinstance(cameras, list):
+        named = [
+            (str(one["name"]) if "name" in one else str(n), one)
+            for n, one in enumerate(cameras, 1)
+            if isinstance(one, dict)
+        ]
+    else:
+        named = list(cameras.items()) if isinstance(cameras, dict) else []
+    for name, one in named[: _MOST_SECTIONS + 1]:
+        if isinstance(one, dict) and _find(one, _K) is not None:
+            yield name, _json_values(one)
+
+
+def _json_value(value: object) -> tuple[float, ...] | str:
+    if isinstance(value, dict):
+        value = value.get("data")
+    words: list[str] = []
+    waiting = [value]
+    while waiting and len(words) <= _MOST_NUMBERS:
+        first = waiting.pop(0)
+        if isinstance(first, list):
+            waiting[:0] = first[: _MOST_NUMBERS + 1]
+        else:
+            words.append(str(float(first) if isinstance(first, bool) else first))
+    return _as_numbers(words) or str(value)[:80]
+
+
+def _as_numbers(words: list[str]) -> tuple[float, ...]:
+    """Numbers; none where a word is not one, or there are too many."""
+    try:
+        return tuple(float(word) for word in words) if len(words) <= _MOST_NUMBERS else ()
+    except ValueError:
+        return ()
+
+
+Up = Literal["y", "z"]
+_Y_TO_Z: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+"""A turn about x that makes y up into z up."""
+_LEVEL: Final = 0.3  # least share of the cameras' tops, on average, along the axis that points up
+_OPENCV: Final = (".yml", ".yaml", ".json")
+_XML: Final = (".xcp", ".xml", ".txt", ".mcal")
+_READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
+    _VICON: ("Camera", _vicon_camera),
+    _QUALISYS: ("camera", _qualisys_camera),
+    _MOTIVE: ("Camera", _motive_camera),
+}
+"""Of the element that a calibration begins with: those of its cameras, and what reads one."""
+_CLOSED: Final = {
+    ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
+    "from there as .mcal",
+    ".qca": "QTM's .qca is a closed format; export the calibration from QTM as .txt or .xml",
+}
+
+
+def load_cameras(path: str | Path) -> tuple[Camera, ...]:
+    """The cameras of a file, by its ending.
+
+    Args:
+        path: A camera or rig file of ours (`.toml`), Vicon's `.xcp`, Qualisys' calibration (`.xml`, `.txt`),
+            Motive's `.mcal`, OpenCV's calibration (`.yml`, `.yaml`, `.json`), or COLMAP's `cameras.txt`,
+            `images.txt` or their folder.
+
+    Returns:
+        Cameras with intrinsics [px], lenses and poses in the file's world [m].
+
+    Raises:
+        RigError: The file cannot be read, or does not describe cameras; the sentence names it.
+    """
+    return tuple(one.camera for one in load_lab_cameras(path))
+
+
+def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]:
+    """The cameras of a calibration that see markers, in a world with z up.
+
+    Those that take pictures are left out where there are others, and named in a warning.
+
+    Args:
+        path: As for `load_cameras`.
+        up: The axis that points up in the file; when not given y where its format says so, else z.
+
+    Raises:
+        RigError: As `load_cameras`; or no camera is calibrated.
+    """
+    found = load_lab_cameras(path)
+    seeing = [one for one in found if not one.video] or list(found)
+    if len(seeing) < len(found):
+        named = ", ".join(one.camera.name for one in found if one.video)
+        _tell(f"{path}: video cameras see no markers and are left out: {named}")
+    axis = up or ("y" if all(one.y_up for one in seeing) else "z")
+    turn = _Y_TO_Z if axis == "y" else np.eye(4)
+    cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
+    if -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _LEVEL:
+        _tell(
+            f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
+            "another axis up? --up says which"
+        )
+    return cameras
+
+
+def _tell(sentence: str) -> None:
+    warnings.warn(sentence, HandSimWarning, stacklevel=3)
+
+
+def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
+    """The cameras of a file as `load_cameras` gives them, with what the file says of each."""
+    path, ending = Path(path), Path(path).suffix.lower()
+    if ending == ".toml":
+        return _plain(checked_cameras(path, read_rig_file(path).cameras))
+    if ending in _OPENCV:
+        return _plain(read_opencv_cameras(path))
+    if path.is_dir() or path.name in (CAMERAS, IMAGES):
+        return _plain(read_colmap_cameras(path))
+    if ending in _CLOSED:
+        raise RigError(f"{path}: {_CLOSED[ending]}")
+    if ending in _XML:
+        return _of_xml(path)
+    hint = "; colmap model_converter writes text" if ending == ".bin" else ""
+    raise RigError(
+        f"{path}: unknown kind of camera file, expected .toml, Vicon's .xcp, Qualisys' .xml or .txt, "
+        f"Motive's .mcal, OpenCV's .yml or .json, or COLMAP's {CAMERAS} and {IMAGES}{hint}"
+    )
+
+
+def _plain(cameras: Sequence[Camera]) -> tuple[LabCamera, ...]:
+    return tuple(LabCamera(camera) for camera in cameras)
+
+
+def _of_xml(path: Path) -> tuple[LabCamera, ...]:
+    root = read_xml(path)
+    tags = [root.tag, *(entry.tag for entry in root)]  # QTM's server wraps its answer
+    known = next((tag for tag in tags if tag in _READERS), None)
+    if known is None:
+        raise RigError(
+            f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
+            "Vicon's, Qualisys' or Motive's calibration"
+        )
+    try:
+        tag, read_camera = _READERS[known]
+        read = [read_camera(entry, number) for number, entry in enumerate(root.iter(tag), 1)]
+    except HandSimError as error:
+        raise RigError(f"{path}: {error}") from error
+    skipped = [one for one in read if isinstance(one, Skipped)]
+    if skipped:
+        named = ", ".join(f"{shortened(one.name)} {one.why}" for one in skipped[:8])
+        more = f" and {len(skipped) - 8} more" if len(skipped) > 8 else ""
+        told = f"{path}: {len(skipped)} of {len(read)} cameras are left out: {named}{more}"
+        warnings.warn(told, HandSimWarning, stacklevel=3)
+    found = [one for one in read if isinstance(one, LabCamera)]
+    names = camera_names([one.camera.name for one in found])
+    renamed = [
+        one._replace(camera=dataclasses.replace(one.camera, name=name))
+        for one, name in zip(found, names, strict=True)
+    ]
+    checked_cameras(path, [one.camera for one in renamed])
+    return tuple(renamed)

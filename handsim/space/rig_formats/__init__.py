@@ -1,1 +1,0 @@
-"""Calibrations of cameras as other programs write them, one file per format."""

@@ -1,0 +1,108 @@
+"""The device of this process, joined by Fabric with those of the others that torchrun or srun started."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import torch
+from lightning_fabric import Fabric
+from lightning_fabric.loggers.tensorboard import TensorBoardLogger
+from lightning_fabric.plugins.environments.cluster_environment import ClusterEnvironment
+from lightning_fabric.plugins.environments.lightning import LightningEnvironment
+from lightning_fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+
+from handsim.errors import ArgumentError, HandSimError
+from train.settings import TrainSettings
+
+_LOOPBACK: Final = {"linux": "lo", "darwin": "lo0"}
+
+
+def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
+    """The device of this process, a GPU where there is one, and the writer of the curves.
+
+    Waits for the other processes of the run, if there are any.
+    """
+    environment, here, nodes = _processes()
+    if settings.batch < here * nodes:
+        raise ArgumentError(
+            f"batch is {settings.batch}, expected at least {here * nodes}: a cloud for each device"
+        )
+    has_gpu = torch.cuda.is_available()
+    if has_gpu and torch.cuda.device_count() < here:
+        raise ArgumentError(
+            f"{here} processes were started on this machine, expected 1 to {torch.cuda.device_count()}: one "
+            "for each GPU"
+        )
+    torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages are not about this run
+    warnings.filterwarnings("ignore", module="lightning_fabric")
+    if nodes == 1 and sys.platform in _LOOPBACK:  # connections on one machine stay off the network
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", _LOOPBACK[sys.platform])
+    fabric = Fabric(
+        accelerator="cuda" if has_gpu else "cpu",
+        devices=here,
+        num_nodes=nodes,
+        strategy="ddp" if here * nodes > 1 else "auto",
+        plugins=[environment],
+        precision="bf16-mixed" if _takes_bf16(settings.precision) else "32-true",
+        loggers=TensorBoardLogger(out, name="tensorboard", version=""),
+    )
+    fabric.launch()
+    atexit.register(_leave)
+    return fabric
+
+
+def _processes() -> tuple[ClusterEnvironment, int, int]:
+    """What started this process, the number of processes on each machine, and the number of machines.
+
+    A batch script that Slurm runs without srun is one process, however many tasks the job may have.
+    """
+    if TorchElasticEnvironment.detect():
+        here = int(os.environ["LOCAL_WORLD_SIZE"])
+        return TorchElasticEnvironment(), here, int(os.environ["WORLD_SIZE"]) // here
+    tasks = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1"))
+    if tasks == 1:
+        return LightningEnvironment(), 1, 1
+    nodes = int(os.environ.get("SLURM_STEP_NUM_NODES", "1"))
+    if tasks % nodes:
+        raise ArgumentError(
+            f"srun started {tasks} tasks on {nodes} nodes, expected as many on each (--ntasks-per-node)"
+        )
+    os.environ.setdefault("SLURM_NTASKS_PER_NODE", str(tasks // nodes))  # srun -n alone does not set it
+    return SLURMEnvironment(auto_requeue=False), tasks // nodes, nodes
+
+
+def _leave() -> None:
+    """End gloo's threads while there is an interpreter: one that drops a tensor later aborts the process."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+
+
+@contextmanager
+def lost_peers_told() -> Iterator[None]:
+    """Within the block a connection that breaks is an error that says so: another process has ended."""
+    try:
+        yield
+    except RuntimeError as error:
+        # gloo has no class of errors for a process that is lost.
+        if not (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
+            raise
+        raise HandSimError("another process of this run ended, and tells why") from error
+
+
+def _takes_bf16(precision: str) -> bool:
+    """Whether the forward pass runs in bf16; without instructions for it a CPU is many times slower."""
+    if precision != "auto":
+        return precision == "bf16"
+    if torch.cuda.is_available():
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))

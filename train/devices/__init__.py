@@ -1,1 +1,0 @@
-"""Training on many devices: which process this is, its devices, and what the processes agree about."""
