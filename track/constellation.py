@@ -16,8 +16,10 @@ from handsim.kernels import align_rigid, kernel, squared_distance, write_quatern
 
 FEWEST: Final = 3
 """Markers that determine a pose."""
-_NEW: Final = 1.5  # gate of a point with a new ID, over the tight gate
-_FLAT: Final = 0.1  # height of a triangle over its longest side, below which it determines no rotation
+_NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, over the tight gate
+_LEAST_TRIANGLE_HEIGHT: Final = (
+    0.1  # height of a triangle over its longest side, below which it determines no rotation
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -130,7 +132,7 @@ def assign_remaining(
     predicted = transform_markers(positions, pose)
     for marker in range(len(positions)):
         if assignment[marker] < 0:
-            assignment[marker] = _nearest_free(points, predicted[marker], _NEW * tight, assignment)
+            assignment[marker] = _nearest_free(points, predicted[marker], _NEW_ID_FACTOR * tight, assignment)
     return fit_inliers(positions, points, assignment, pose, tight, gate)
 
 
@@ -311,4 +313,4 @@ def _triangle_axes(first: Floats, second: Floats, third: Floats, axes: Floats) -
     axes[2, 0] = axes[0, 1] * axes[1, 2] - axes[0, 2] * axes[1, 1]
     axes[2, 1] = axes[0, 2] * axes[1, 0] - axes[0, 0] * axes[1, 2]
     axes[2, 2] = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
-    return bool(length > 0.0 and height > _FLAT * length)
+    return bool(length > 0.0 and height > _LEAST_TRIANGLE_HEIGHT * length)

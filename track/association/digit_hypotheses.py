@@ -32,11 +32,11 @@ from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_pri
 
 IMPOSSIBLE: Final = 1e9
 """Minus the score of a hypothesis that is excluded."""
-_GRID: Final = 5  # angles of each hinge at which distances are taken
+_ANGLES_PER_HINGE: Final = 5  # angles of each hinge at which distances are taken
 _LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
 _PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
 _START_DISTANCE: Final = float(np.deg2rad(5.0))  # two starts are one if no hinge differs by more
-_STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
+_MOST_FIT_STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
 _SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
 _ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
 
@@ -44,10 +44,8 @@ _ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at whic
 class DigitRanges(NamedTuple):
     """Range of the distance between two markers of one digit over all poses."""
 
-    nearest: Float[np.ndarray, "M M"]
-    """Least distance [m]."""
-    farthest: Float[np.ndarray, "M M"]
-    """Largest distance [m]."""
+    nearest: Float[np.ndarray, "M M"]  # least distance [m]
+    farthest: Float[np.ndarray, "M M"]  # largest distance [m]
 
 
 class DigitModel(NamedTuple):
@@ -81,20 +79,13 @@ class DigitHypotheses(NamedTuple):
 class DigitPoints(NamedTuple):
     """A digit, its candidate points and its prior."""
 
-    hand: HandArrays
-    """The hand, its markers shifted by their biases."""
-    digit: int
-    """Index of the digit."""
-    markers: Int[np.ndarray, "K"]
-    """Markers of the digit."""
-    points: Float[np.ndarray, "C 3"]
-    """The candidates in the wrist's frame [m]."""
-    variance: Float[np.ndarray, "M"]
-    """Variance of each marker of the hand [m^2]."""
-    mean: Float[np.ndarray, "4"]
-    """Mean of the digit's prior [rad]."""
-    precision: Float[np.ndarray, "4 4"]
-    """Its precision [1/rad^2]."""
+    hand: HandArrays  # the hand, its markers shifted by their biases
+    digit: int  # index of the digit
+    markers: Int[np.ndarray, "K"]  # markers of the digit
+    points: Float[np.ndarray, "C 3"]  # the candidates in the wrist's frame [m]
+    variance: Float[np.ndarray, "M"]  # variance of each marker of the hand [m^2]
+    mean: Float[np.ndarray, "4"]  # mean of the digit's prior [rad]
+    precision: Float[np.ndarray, "4 4"]  # its precision [1/rad^2]
 
 
 @kernel
@@ -104,9 +95,11 @@ def digit_ranges(hand: HandArrays) -> DigitRanges:
     nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
     np.fill_diagonal(nearest, 0.0)
     angles = np.empty(NUM_JOINTS)
-    for number in range(_GRID**4):
+    for number in range(_ANGLES_PER_HINGE**4):
         for hinge in range(NUM_JOINTS):
-            share = number // _GRID ** (3 - hinge % 4) % _GRID / (_GRID - 1)
+            share = (
+                number // _ANGLES_PER_HINGE ** (3 - hinge % 4) % _ANGLES_PER_HINGE / (_ANGLES_PER_HINGE - 1)
+            )
             low, high = hand.ranges[hinge]
             angles[hinge] = low + share * (high - low)
         compute_markers(hand, angles, work)
@@ -303,7 +296,7 @@ def fit_hypothesis(
     new_normal, new_gradient = np.empty((4, 4)), np.empty(4)
     cost = _accumulate_digit(own, hypothesis, angles, work, normal, gradient)
     damping = 1e-3
-    for _ in range(_STEPS):
+    for _ in range(_MOST_FIT_STEPS):
         for row in range(4):
             step[row] = -gradient[row]
             for column in range(4):

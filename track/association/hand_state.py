@@ -41,9 +41,9 @@ _WRIST_ACCELERATION: Final = 10.0  # [m/s^2] unforeseen
 _WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # of its predicted orientation in the same frame
 _WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] unforeseen
 # Measurement model: spread and bias of markers.
-_FIRST_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
-_FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
-_LEAST_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
+_INITIAL_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
+_INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
+_LEAST_MARKER_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
 _BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
@@ -65,27 +65,19 @@ MOST_AGE_LOG_ODDS: Final = 3.0
 class Prediction(NamedTuple):
     """A hand's pose before the markers of a frame are used."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The predicted pose."""
-    positions: Float[np.ndarray, "M 3"]
-    """Its markers in the world [m]."""
-    joint_prior: JointPrior
-    """Distribution of the hinges."""
-    wrist_spread: tuple[float, float]
-    """Standard deviations of the wrist's position [m] and orientation [rad]."""
+    qpos: Float[np.ndarray, "27"]  # the predicted pose
+    positions: Float[np.ndarray, "M 3"]  # its markers in the world [m]
+    joint_prior: JointPrior  # distribution of the hinges
+    wrist_spread: tuple[float, float]  # standard deviations of the wrist's position [m] and orientation [rad]
 
 
 class HandEstimate(NamedTuple):
     """A hand's pose that was fitted to the markers of a frame."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The fitted pose."""
-    rms: float
-    """3D RMS distance over the markers that are present [m]."""
-    residuals: Float[np.ndarray, "M 3"]
-    """Model minus marker [m], NaN where a marker is missing."""
-    predicted: MarkerPrediction
-    """Markers and hinges at that pose, with covariances."""
+    qpos: Float[np.ndarray, "27"]  # the fitted pose
+    rms: float  # 3D RMS distance over the markers that are present [m]
+    residuals: Float[np.ndarray, "M 3"]  # model minus marker [m], NaN where a marker is missing
+    predicted: MarkerPrediction  # markers and hinges at that pose, with covariances
 
     @property
     def positions(self) -> Float[np.ndarray, "M 3"]:
@@ -96,14 +88,10 @@ class HandEstimate(NamedTuple):
 class Biases(NamedTuple):
     """What is known of the biases of a hand's markers."""
 
-    bias: Float[np.ndarray, "M 3"]
-    """In the frames of the bones [m]."""
-    frames: Float[np.ndarray, "M"]
-    """Frames that each is averaged over."""
-    learned_variance: Float[np.ndarray, "M"]
-    """Variance of each marker while its bias is certain [m^2]."""
-    variance: Float[np.ndarray, "M"]
-    """Variance of each marker at the last prediction [m^2]."""
+    bias: Float[np.ndarray, "M 3"]  # in the frames of the bones [m]
+    frames: Float[np.ndarray, "M"]  # frames that each is averaged over
+    learned_variance: Float[np.ndarray, "M"]  # variance of each marker while its bias is certain [m^2]
+    variance: Float[np.ndarray, "M"]  # variance of each marker at the last prediction [m^2]
 
 
 class HandState:
@@ -135,7 +123,7 @@ class HandState:
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
         """The hand as arrays, its markers shifted by their biases."""
-        self.variance = np.full(count, _FIRST_SPREAD_MOST**2)
+        self.variance = np.full(count, _INITIAL_SPREAD_MOST**2)
         """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
         self.positions = np.full((count, 3), np.nan)
         """Positions (M, 3) of the pose's markers [m]."""
@@ -269,8 +257,8 @@ class HandState:
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
             self._shift_markers()
             estimate = self.fit(targets, qpos, unknown)
-            spread = _FIRST_SPREAD * estimate.rms
-            self._variance[:] = np.clip(spread, _FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST) ** 2
+            spread = _INITIAL_SPREAD * estimate.rms
+            self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
         self._store(estimate, time)
         return estimate
 
@@ -288,7 +276,7 @@ class HandState:
     def forget(self, markers: Int[np.ndarray, "K"]) -> None:
         """Forget the biases of some markers: they are where the glove has them again, give or take."""
         self._bias[markers], self._bias_frames[markers] = 0.0, 0.0
-        self._variance[markers] = self.variance[markers] = _FIRST_SPREAD_MOST**2
+        self._variance[markers] = self.variance[markers] = _INITIAL_SPREAD_MOST**2
         self._shift_markers()
 
     def recall(self, biases: Biases) -> None:
@@ -352,14 +340,10 @@ class HandState:
 class HandTrack(NamedTuple):
     """A hand with a pose in the current frame."""
 
-    hand: int
-    """Index of the hand."""
-    state: HandState
-    """Its filter state."""
-    prediction: Prediction
-    """The pose before the frame's markers were used."""
-    estimate: HandEstimate
-    """The pose fitted to its labels so far."""
+    hand: int  # index of the hand
+    state: HandState  # its filter state
+    prediction: Prediction  # the pose before the frame's markers were used
+    estimate: HandEstimate  # the pose fitted to its labels so far
 
 
 @kernel
@@ -419,7 +403,7 @@ def _shift_markers(
         count += bias_frames[marker] > 0.0
     square /= max(count, 1)
     for marker in range(len(bias_frames)):
-        variance[marker] = max(variance[marker], _LEAST_SPREAD**2 + _BIAS_VARIATION**2 * square)
+        variance[marker] = max(variance[marker], _LEAST_MARKER_SPREAD**2 + _BIAS_VARIATION**2 * square)
     return np.sqrt(square)  # type: ignore[no-any-return]
 
 

@@ -32,23 +32,17 @@ _MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points 
 class DigitTable(NamedTuple):
     """The D digits of all hands, counted through the hands, with their labels."""
 
-    digits: Int[np.ndarray, "K"]
-    """Digit of each label, -1 for a palm's."""
-    labels: Int[np.ndarray, "D K"]
-    """Labels of each digit, -1 where there are fewer."""
-    markers: Int[np.ndarray, "D K"]
-    """The same in the order of the hand's layout."""
+    digits: Int[np.ndarray, "K"]  # digit of each label, -1 for a palm's
+    labels: Int[np.ndarray, "D K"]  # labels of each digit, -1 where there are fewer
+    markers: Int[np.ndarray, "D K"]  # the same in the order of the hand's layout
 
 
 class MarkerTable(NamedTuple):
     """The K markers of all hands by their labels, and the label of each of N points."""
 
-    positions: Float[np.ndarray, "K 3"]
-    """Predicted positions [m]."""
-    digits: Int[np.ndarray, "K"]
-    """Digit of each marker, counted through the hands; -1 on a palm."""
-    assigned: Int[np.ndarray, "N"]
-    """Label of each point, -1 for none."""
+    positions: Float[np.ndarray, "K 3"]  # predicted positions [m]
+    digits: Int[np.ndarray, "K"]  # digit of each marker, counted through the hands; -1 on a palm
+    assigned: Int[np.ndarray, "N"]  # label of each point, -1 for none
 
 
 class DigitCandidates(NamedTuple):

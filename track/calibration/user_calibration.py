@@ -60,8 +60,8 @@ MOST_STEPS: Final = 30
 _SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
-_BETTER: Final = 0.98  # of the distance before; what is not better than that stays as it was
-_SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
+_BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
+_SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class HeldOut(NamedTuple):
     @property
     def is_better(self) -> bool:
         """Whether the calibrated hand fits better, by more than chance and with labels that are certain."""
-        return not self.hidden and self.after < _BETTER * self.before
+        return not self.hidden and self.after < _BETTER_SHARE * self.before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +149,7 @@ class Calibration:
     @property
     def significant_touches(self) -> tuple[Touch, ...]:
         """Touches with a weight above 0.25."""
-        return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT)
+        return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT_TOUCH)
 
     def gaps(self) -> Float[np.ndarray, "2"]:
         """Mean distance from touching [m], before and after, of the significant touches; NaN without any."""
@@ -335,21 +335,18 @@ NUM_FRAMES: Final = 240
 FEWEST_FRAMES: Final = 100
 """Usable frames without which a capture is refused."""
 _INITIAL_FRAMES: Final = 800
-_FEWEST_MARKERS: Final = 6  # that a frame must have
-_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
-_MOST_RMS: Final = 3.0  # times the median RMS, up to which a frame is used
+_FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
+_LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
+_MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
 
 
 class PoseTrack(NamedTuple):
     """Poses of K frames of a capture."""
 
-    frames: Int[np.ndarray, "K"]
-    """Their numbers in the capture."""
+    frames: Int[np.ndarray, "K"]  # their numbers in the capture
     qpos: Float[np.ndarray, "K 27"]
-    rms: Float[np.ndarray, "K"]
-    """3D RMS distance of the markers from the model's [m]."""
-    residuals: Float[np.ndarray, "K M 3"]
-    """Model minus marker [m], NaN where a marker is missing."""
+    rms: Float[np.ndarray, "K"]  # 3D RMS distance of the markers from the model's [m]
+    residuals: Float[np.ndarray, "K M 3"]  # model minus marker [m], NaN where a marker is missing
 
 
 def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
@@ -367,7 +364,7 @@ def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: fl
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
     """Numbers of the frames with enough markers for a pose."""
     count = markers.shape[1]
-    needed = min(count, max(_FEWEST_MARKERS, round(_MARKER_SHARE * count)))
+    needed = min(count, max(_FEWEST_MARKERS_OF_FRAME, round(_LEAST_MARKER_SHARE * count)))
     usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= needed)
     if len(usable) < FEWEST_FRAMES:
         raise CalibrationError(
@@ -415,7 +412,7 @@ def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) ->
     Frames without missing markers are preferred; frames with an unusual RMS are left out.
     """
     missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
-    well_fitted = track.rms <= _MOST_RMS * np.median(track.rms)
+    well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
         candidates = np.flatnonzero((missing <= allowed) & well_fitted)
         if len(candidates) >= min(3 * NUM_FRAMES, well_fitted.sum()):
@@ -433,7 +430,7 @@ def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) ->
 _ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
-_USUAL_WORTH: Final = 12.0  # coordinates of markers that the usual spread counts as
+_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
@@ -493,7 +490,11 @@ def _learned(
 ) -> float:
     """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
-    return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
+    return float(
+        np.sqrt(
+            (squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2) / (determined + _USUAL_SPREAD_COORDINATES)
+        )
+    )
 
 
 def standard_errors(

@@ -58,13 +58,15 @@ _THUMB: Final = (
     (20, 25, 45, 60),
     (-20, 35, 50, 40),
 )
-_ROUNDS: Final = 3  # of choosing digits and aligning again; the choice no longer changes after these
-_STEADY: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
-_EASING: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
-_EASING_STEPS: Final = 8  # at most at each widened scale
+_ALIGNMENT_ROUNDS: Final = (
+    3  # of choosing digits and aligning again; the choice no longer changes after these
+)
+_LEAST_SHAPE_SPREAD: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
+_ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
+_STEPS_AT_WIDE_SCALES: Final = 8  # at most at each widened scale
 _REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
 _COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
-_GOOD_RMS: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
+_RMS_OF_LAST_START: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
 _MOST_STEPS: Final = 30  # from each start
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
 _ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all markers nearer by 30 um
@@ -84,12 +86,9 @@ class _StartingShapes(NamedTuple):
 class _PosePrior(NamedTuple):
     """What is known of the poses of frames before their markers are used."""
 
-    angles: Float[np.ndarray, "P 20"]
-    """Mean of the hinges [rad], one row per frame or none."""
-    precision: Float[np.ndarray, "P 20"]
-    """Their precision [1/rad^2]."""
-    wrist: Float[np.ndarray, "9"]
-    """Position [m] and orientation of the wrist, then the precisions of both."""
+    angles: Float[np.ndarray, "P 20"]  # mean of the hinges [rad], one row per frame or none
+    precision: Float[np.ndarray, "P 20"]  # their precision [1/rad^2]
+    wrist: Float[np.ndarray, "9"]  # position [m] and orientation of the wrist, then the precisions of both
 
 
 _NO_ROWS: Final = np.empty((0, NUM_JOINTS))
@@ -154,7 +153,7 @@ class PoseSolver:
         """The hand and its glove; a change of its marker positions takes effect in the next solution."""
         angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
         markers = fit.markers(join_qpos(angles))[0]
-        weights = 1.0 / (_STEADY**2 + markers.var(axis=0).sum(axis=1))
+        weights = 1.0 / (_LEAST_SHAPE_SPREAD**2 + markers.var(axis=0).sum(axis=1))
         self._shapes = _StartingShapes(angles, markers, weights)
         self._robust_scale = 0.0 if outlier_distance is None else outlier_distance**-2
         self.on_part: Int[np.ndarray, "6"] = np.array(
@@ -332,17 +331,17 @@ def _fit_frames(
         for number in range(len(starts)):
             pose[:] = starts[number]
             cost = np.inf
-            for part in _EASING:
+            for part in _ROBUST_SCALES:
                 if robust_scale == 0.0 and part < 1.0:
                     continue
-                most = iterations if part == 1.0 else min(iterations, _EASING_STEPS)
+                most = iterations if part == 1.0 else min(iterations, _STEPS_AT_WIDE_SCALES)
                 energy = PoseEnergy(target, mean, precision, part * robust_scale)
                 cost, tried = levenberg_marquardt(hand, energy, pose, most, small_gain, work)
                 steps[frame] += tried
             if cost < least:
                 least = cost
                 qpos[frame] = pose
-            if least < present * (_GOOD_RMS / MARKER_NOISE) ** 2:
+            if least < present * (_RMS_OF_LAST_START / MARKER_NOISE) ** 2:
                 break
         rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
     return -1, qpos, rms, residuals, steps
@@ -454,7 +453,7 @@ def _initial_poses(
         poses[1 + better] = aligned[number]
     markers = np.empty_like(target)
     poses[0] = poses[1]
-    for _ in range(_ROUNDS):
+    for _ in range(_ALIGNMENT_ROUNDS):
         _choose_digits(shapes, digits, target, poses[0], markers)
         align_rigid(markers, target, shapes.weights, poses[0])
     return poses

@@ -71,12 +71,9 @@ _CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
 class JointPrior(NamedTuple):
     """A normal distribution of the hinges."""
 
-    angles: Float[np.ndarray, "20"]
-    """Mean [rad]."""
-    covariance: Float[np.ndarray, "20 20"]
-    """Covariance [rad^2]."""
-    precision: Float[np.ndarray, "20 20"]
-    """Inverse of the covariance [1/rad^2]."""
+    angles: Float[np.ndarray, "20"]  # mean [rad]
+    covariance: Float[np.ndarray, "20 20"]  # covariance [rad^2]
+    precision: Float[np.ndarray, "20 20"]  # inverse of the covariance [1/rad^2]
 
     @property
     def spread(self) -> Float[np.ndarray, "20"]:
@@ -127,18 +124,12 @@ class HandDoubt(NamedTuple):
 class _Proportions(NamedTuple):
     """How far a hand that is not calibrated is from its user's: standard deviations."""
 
-    size: float
-    """Logarithm."""
-    place: float
-    """Of a marker [m]."""
-    knuckle: float
-    """[m]"""
-    turn: float
-    """Of a finger's direction [deg]."""
-    thumb: float
-    """Times the fingers' directions."""
-    bones: tuple[float, float]
-    """Logarithms, of each bone and of all of a digit."""
+    size: float  # logarithm
+    place: float  # of a marker [m]
+    knuckle: float  # [m]
+    turn: float  # of a finger's direction [deg]
+    thumb: float  # times the fingers' directions
+    bones: tuple[float, float]  # logarithms, of each bone and of all of a digit
 
 
 # Chosen on simulated people that benchmarks.doubt does not try. What the fit of the proportions makes up for
