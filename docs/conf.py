@@ -20,8 +20,11 @@ DOCS: Final = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
 from handsim import __version__  # noqa: E402
-from handsim.cli.command_table import COMMANDS, load  # noqa: E402
-from handsim.cli.main import main  # noqa: E402
+from handsim.cli.main import (  # noqa: E402
+    COMMANDS,
+    load,
+    main,
+)
 
 PACKAGES: Final = ("handsim", "poses", "gloves", "render", "train", "track")
 COLUMNS: Final = 126  # of the help: lines of docstrings are not wrapped once more

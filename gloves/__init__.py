@@ -8,7 +8,7 @@ them and the labels, simulated or tracked; `load_take` reads one.
 from typing import TYPE_CHECKING
 
 from handsim import __version__ as __version__  # the first import: it warns about a package of the same name
-from handsim._lazy import lazy_exports
+from handsim._imports import lazy_exports
 
 if TYPE_CHECKING:
     from gloves.captures.capture import Capture as Capture

@@ -7,17 +7,15 @@ wrist orientation (wxyz), twenty joint angles [rad]. A `CameraRig` is a set of c
 
 from typing import TYPE_CHECKING
 
-from handsim._kernel_cache import ensure_kernel_cache
-from handsim._lazy import lazy_exports
-from handsim._siblings import ShadowedPackageWarning as ShadowedPackageWarning
-from handsim._siblings import warn_if_shadowed
+from handsim._imports import ShadowedPackageWarning as ShadowedPackageWarning
+from handsim._imports import ensure_kernel_cache, lazy_exports, warn_if_shadowed
 from handsim.errors import HandSimError as HandSimError
 from handsim.errors import HandSimWarning as HandSimWarning
 
 if TYPE_CHECKING:
     from handsim.hand.model import HandModel as HandModel
+    from handsim.hand.model import HandMotion as HandMotion
     from handsim.hand.model import join_qpos as join_qpos
-    from handsim.hand.motion import HandMotion as HandMotion
     from handsim.hand.shape import HandShape as HandShape
     from handsim.hand.shape import Population as Population
     from handsim.hand.shape import sample_shape as sample_shape

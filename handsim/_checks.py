@@ -18,13 +18,7 @@ Settings = TypeVar("Settings")
 def check_type(
     name: str, value: object, kinds: type | tuple[type, ...], expected: str, valid: Iterable[str] = ()
 ) -> None:
-    """Refuse an argument of another type by an `ArgumentError`; the one check of all public functions.
-
-    Args:
-        kinds: The types that it may have; a bool is none of them unless it is named.
-        expected: What is wanted, in words, such as "a MarkerLayout, or the name or path of one".
-        valid: The names that there are.
-    """
+    """Refuse an argument of another type by an `ArgumentError`; the one check of all public functions."""
     named = kinds if isinstance(kinds, tuple) else (kinds,)
     if isinstance(value, kinds) and (not isinstance(value, bool) or bool in named):
         return
@@ -46,9 +40,6 @@ def fill_settings(config: Any) -> None:
     """Put settings in the place of mappings, in the fields of a frozen dataclass that are groups of settings.
 
     A mapping holds what differs from the field's default.
-
-    Raises:
-        ArgumentError: A setting is unknown, or a field is no such group.
     """
     for one in dataclasses.fields(config):
         if one.default_factory is dataclasses.MISSING:
@@ -74,11 +65,7 @@ def make_settings(
 
 
 def check_rng(rng: object) -> None:
-    """Refuse anything but a generator of numpy as the source of randomness.
-
-    Raises:
-        ArgumentError: It is something else.
-    """
+    """Refuse anything but a generator of numpy as the source of randomness."""
     check_type("rng", rng, np.random.Generator, "a numpy.random.Generator, such as default_rng(0)")
 
 

@@ -36,11 +36,7 @@ def list_plugins(group: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
-    """What a name stands for, imported now; a class is called without arguments, once.
-
-    The name is `module:name`, or that of an entry point of the group. The current folder is searched last,
-    after everything that is installed.
-    """
+    """What a name stands for, imported now; a class is called without arguments, once."""
     found = _find(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
@@ -53,11 +49,6 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
 
     The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
     `?option=value&option=value`.
-
-    Raises:
-        ArgumentError: There is nothing of that name, its module cannot be imported, or it does not take the
-            options.
-        HandSimError: It raised an error; the sentence has its line.
     """
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))
@@ -65,10 +56,7 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
 
 
 def plugin_name(value: Any) -> str:
-    """How a function or an object is called in records and messages: `module:name`, or its name as it is.
-
-    What has no name of its own is shown as Python shows it, without addresses in memory.
-    """
+    """How a function or an object is called in records and messages: `module:name`, or its name as it is."""
     if isinstance(value, str):
         return value
     if isinstance(value, functools.partial):

@@ -8,7 +8,7 @@ sampler of your own is any callable that fulfills `PoseSampler`.
 from typing import TYPE_CHECKING
 
 from handsim import __version__ as __version__  # the first import: it warns about a package of the same name
-from handsim._lazy import lazy_exports
+from handsim._imports import lazy_exports
 
 if TYPE_CHECKING:
     from poses.motion import MotionConfig as MotionConfig

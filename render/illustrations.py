@@ -51,10 +51,8 @@ _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down,
 class Balls(NamedTuple):
     """Spheres of one radius, such as markers or the points that an optical system sees."""
 
-    centers: Float[np.ndarray, "N 3"]
-    """Centers in the world [m]; NaN rows are not drawn."""
-    radius: float
-    """Radius [m]."""
+    centers: Float[np.ndarray, "N 3"]  # centers in the world [m]; NaN rows are not drawn
+    radius: float  # radius [m]
     colors: Float[np.ndarray, "N 3"] | tuple[float, float, float] = MARKER_COLOR
     """sRGB in [0, 1], one for all or one each."""
 
@@ -73,12 +71,9 @@ class Balls(NamedTuple):
 class PosedHand(NamedTuple):
     """A hand in a pose, with or without a glove's markers."""
 
-    hand: GloveFit | HandModel
-    """In a glove whose markers are drawn, or without one."""
-    qpos: Float[np.ndarray, "27"]
-    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
-    covering: Covering = "skin"
-    """Bare skin or a dark glove."""
+    hand: GloveFit | HandModel  # in a glove whose markers are drawn, or without one
+    qpos: Float[np.ndarray, "27"]  # wrist position [m], wrist orientation (wxyz), joint angles [rad]
+    covering: Covering = "skin"  # bare skin or a dark glove
     marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
     """sRGB in [0, 1], one for all markers or one each."""
 
@@ -184,12 +179,9 @@ class ClipFrame(NamedTuple):
 
     hands: Sequence[tuple[HandModel, Float[np.ndarray, "27"]]]
     """Hands with their poses in the world [m, rad]."""
-    points: Float[np.ndarray, "N 3"]
-    """World [m]."""
-    colors: Float[np.ndarray, "N 3"]
-    """Of the points, sRGB in [0, 1]."""
-    caption: str
-    """One line of text at the bottom."""
+    points: Float[np.ndarray, "N 3"]  # world [m]
+    colors: Float[np.ndarray, "N 3"]  # of the points, sRGB in [0, 1]
+    caption: str  # one line of text at the bottom
 
 
 def write_clip(

@@ -25,9 +25,8 @@ from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from handsim.files.inputs import checksum
-from handsim.files.json_files import load_json, save_json
-from handsim.files.outputs import check_free
+from handsim.files.inputs import checksum, load_json
+from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.rig import CameraRig, check_names
@@ -89,7 +88,7 @@ def draw(
     config = configured(config, camera, settings).resolved()
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
-    drawing.check_view()
+    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
 
 
@@ -97,6 +96,8 @@ def configured(
     config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
 ) -> RenderConfig:
     """A configuration with the camera and the settings that were named beside it."""
+    config = RenderConfig() if config is None else config
+    check_type("config", config, RenderConfig, "a RenderConfig")
     config = RenderConfig.of(config, settings)
     if camera is None:
         return config
@@ -119,12 +120,6 @@ class Drawing:
         self.subject, self.take, self.config = subject, subject.take, config
         self.viewpoints = Viewpoints(config.view, subject.take, rng=SpawnKey.VIEWPOINTS.rng(config.seed))
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
-
-    def check_view(self) -> None:
-        """Refuse the user's own cameras where none has a hand in its pictures."""
-        if self.config.view.cameras is not None:
-            cameras = self.viewpoints.cameras(0)
-            check_hands_in_view(self.config.view.own_cameras, cameras, self.take)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
         """Numbers of frames as asked for; else those with a hand."""
@@ -158,15 +153,14 @@ class Drawing:
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
         size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
-        studio = self._studio(self.take.hands, rng) if cast is None else None
+        if cast is None:  # a take has its own hands; their looks change with the shard
+            studio = open_studio(self.take.hands, config, bodies=self.take.bodies, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            # A take has its own hands; their looks change with the shard.
             person = shard if cast is None else cast.person_in(frame, shard)
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
-            assert studio is not None
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
                 chosen = sample_choices(config, studio.skin, own, size, around)
@@ -185,14 +179,12 @@ class Drawing:
                 drawn = studio.photograph(moment, camera, fresh)
                 yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
-    def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
-        return open_studio(hands, self.config, bodies=self.take.bodies, rng=rng)
-
     def _studio_of_person(self, person: int) -> Studio:
         """The hands of one of the cast, with a skin of their own; cached, because they come back."""
         cast = self.subject.cast
         assert cast is not None
-        return self._studio(cast.hands(person, self.take.hands), cast.rng(person))
+        hands = cast.hands(person, self.take.hands)
+        return open_studio(hands, self.config, bodies=self.take.bodies, rng=cast.rng(person))
 
 
 def open_studio(
@@ -260,9 +252,7 @@ def render_take(
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
     Args:
-        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
-            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
-            that is not there.
+        source: What to draw, as in `draw`.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
         formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
@@ -273,7 +263,7 @@ def render_take(
         person: Which of the people is in each pose (T,); when not given, a number of people is distributed at
             random, and of hands there is one, or one for each pose.
         glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
-        camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
+        camera: Camera of your own, as in `draw`.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
         progress: Called with the numbers of finished pictures and of all pictures: first with what is there
@@ -303,8 +293,11 @@ def render_take(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
-    _check_cameras(formats, drawing)
-    drawing.check_view()
+    cameras = drawing.viewpoints.cameras(0)
+    check_names("cameras", cameras)
+    for one in cameras if {"freihand", "interhand"} & set(formats) else ():
+        centered_K(one)  # refuses other lenses before a folder is begun
+    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
     record = _settings(drawing, kept) | {"formats": list(formats)}
@@ -447,14 +440,6 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
-
-
-def _check_cameras(formats: Sequence[str], drawing: Drawing) -> None:
-    """Refuse cameras that a format or a file's name has no place for, before a folder is begun."""
-    cameras = drawing.viewpoints.cameras(0)
-    check_names("cameras", cameras)
-    for camera in cameras if {"freihand", "interhand"} & set(formats) else ():
-        centered_K(camera)
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
@@ -18,7 +18,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, DatasetError, PoseError
-from handsim.files.json_files import load_json
+from handsim.files.inputs import load_json
 from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
@@ -45,20 +45,7 @@ class LabeledHand(NamedTuple):
     keypoints: Float[np.ndarray, "21 2"]
     """[px] from the photograph's corner; NaN for those without a label."""
     visible: Bool[np.ndarray, "21"]
-    side: int
-    """0 left, 1 right, -1 unknown."""
-
-
-class CutOut(NamedTuple):
-    """A square of a photograph with a hand."""
-
-    rgb: UInt8[np.ndarray, "S S 3"]
-    keypoints: Float[np.ndarray, "21 2"]
-    """[px] from the square's corner; NaN for those without a label."""
-    visible: Bool[np.ndarray, "21"]
-    box: Float[np.ndarray, "4"]
-    """Left, top, width, height around the labeled keypoints [px]."""
-    side: Int64[np.ndarray, ""]
+    side: int  # 0 left, 1 right, -1 unknown
 
 
 def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
@@ -101,10 +88,12 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     )
 
 
-def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator) -> CutOut:
+def cut_out(
+    hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator
+) -> dict[str, NDArray[np.generic]]:
     """A square of `size` pixels around a hand, whose labeled keypoints span a share of it, somewhere in it.
 
-    What is outside of the photograph has the color of its border.
+    What is outside of the photograph has the color of its border; keypoints and box count from the square's.
     """
     with plain_path(hand.file) as plain:
         photograph = cv2.imread(str(plain), cv2.IMREAD_COLOR)
@@ -120,15 +109,13 @@ def cut_out(hand: LabeledHand, size: int, share: float, *, rng: np.random.Genera
     if scale < 0.5:  # or fine detail would become noise
         photograph = cv2.GaussianBlur(photograph, (0, 0), 0.4 / scale)
     square = cv2.warpAffine(photograph, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
-    keypoints: Doubles = (hand.keypoints - corner) * scale
-    box = np.array([*(low - corner), *(high - low)]) * scale
-    return CutOut(
-        np.asarray(cv2.cvtColor(square, cv2.COLOR_BGR2RGB)),
-        keypoints,
-        hand.visible,
-        box,
-        np.array(hand.side, dtype=np.int64),
-    )
+    return {
+        "rgb": np.moveaxis(cv2.cvtColor(square, cv2.COLOR_BGR2RGB), 2, 0),
+        "keypoints": (hand.keypoints - corner) * scale,
+        "visible": hand.visible,
+        "box": np.array([*(low - corner), *(high - low)]) * scale,
+        "side": np.array(hand.side, dtype=np.int64),
+    }
 
 
 _PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # what a stream's spawn key goes on with
@@ -144,10 +131,8 @@ class _Sitting(NamedTuple):
 
     studio: Studio
     subject: Subject
-    frames: Integers
-    """Of the take, in the order in which they are drawn."""
-    person: int
-    """Number of the person."""
+    frames: Integers  # of the take, in the order in which they are drawn
+    person: int  # number of the person
 
 
 class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
@@ -302,16 +287,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         assert self._photographs is not None and self._crop is not None
         hand = self._photographs[rng.integers(len(self._photographs))]
         cut = cut_out(hand, self._crop, float(rng.uniform(*self._fill)), rng=rng)
-        arrays = {
-            "rgb": np.moveaxis(cut.rgb, 2, 0),
-            "keypoints": cut.keypoints.astype(np.float32),
-            "visible": cut.visible,
-            "box": cut.box.astype(np.float32),
-            "side": cut.side,
-            "drawn": np.bool_(False),
-            "number": np.int64(number),
-        }
-        return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+        return _tensors(cut | {"drawn": np.array(False), "number": np.array(number)})
 
     def _new_sitting(self, person: int) -> _Sitting:
         """Somebody new, with poses for all of his or her pictures."""
@@ -364,19 +340,18 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
         if len(hands) == 1:
             merged = {name: array[0] for name, array in merged.items()}
-        arrays = (
+        return _tensors(
             _picture_arrays(frame)
             | merged
             | {
-                "K": camera.K.astype(np.float32),
-                "T_world_camera": camera.T_world_camera.astype(np.float32),
-                "person": np.int64(sitting.person),
-                "tone": np.float32(np.nan if skin is None else skin.typology_angle),
-                "drawn": np.bool_(True),
-                "number": np.int64(number),
+                "K": camera.K,
+                "T_world_camera": camera.T_world_camera,
+                "person": np.array(sitting.person),
+                "tone": np.array(np.nan if skin is None else skin.typology_angle),
+                "drawn": np.array(True),
+                "number": np.array(number),
             }
         )
-        return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
 
     def _placed(
         self,
@@ -454,16 +429,20 @@ def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:
 
 def _hand_arrays(hand: HandTruth | None, camera: Camera, shape: HandShape) -> dict[str, NDArray[np.generic]]:
     """What belongs to a hand; NaN of one that is absent."""
+    if hand is None:
+        nothing = np.full((NUM_KEYPOINTS, 3), np.nan)
+        found = {"keypoints": nothing[:, :2], "keypoints_camera": nothing, "box": nothing[:4, 0]}
+        found |= {"visible": np.zeros(NUM_KEYPOINTS, dtype=bool), "qpos": np.full(NUM_QPOS, np.nan)}
+    else:
+        found = {name: getattr(hand, name) for name in ("keypoints", "visible", "box", "qpos")}
+        found["keypoints_camera"] = camera.local(hand.keypoints_world)
     numbers = np.concatenate([np.ravel(value) for value in pack_hand(shape)[1:]])
-    nothing = np.full((NUM_KEYPOINTS, 3), np.nan, dtype=np.float32)
+    return found | {"shape": numbers, "side": np.array(SIDES.index(shape.side))}
+
+
+def _tensors(arrays: dict[str, NDArray[np.generic]]) -> dict[str, torch.Tensor]:
+    """Arrays as tensors, float64 as float32."""
     return {
-        "keypoints": nothing[:, :2] if hand is None else hand.keypoints.astype(np.float32),
-        "keypoints_camera": nothing
-        if hand is None
-        else camera.local(hand.keypoints_world).astype(np.float32),
-        "visible": np.zeros(NUM_KEYPOINTS, dtype=bool) if hand is None else hand.visible,
-        "box": np.full(4, np.nan, dtype=np.float32) if hand is None else hand.box.astype(np.float32),
-        "qpos": np.full(NUM_QPOS, np.nan, np.float32) if hand is None else hand.qpos.astype(np.float32),
-        "shape": numbers.astype(np.float32),
-        "side": np.array(SIDES.index(shape.side)),
+        name: torch.from_numpy(np.array(array, dtype=np.float32 if array.dtype == np.float64 else None))
+        for name, array in arrays.items()
     }

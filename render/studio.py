@@ -132,14 +132,10 @@ class FrameChoices:
 
     lighting: Lighting
     background: Background
-    exposure: Exposure | None
-    """None for a perfect color sensor."""
-    shutter: Shutter | None
-    """None for a picture of a moment."""
-    depth_noise: DepthNoise | None
-    """None for a perfect depth sensor."""
-    seed: int
-    """Seed of the sensors' noise."""
+    exposure: Exposure | None  # None for a perfect color sensor
+    shutter: Shutter | None  # None for a picture of a moment
+    depth_noise: DepthNoise | None  # None for a perfect depth sensor
+    seed: int  # seed of the sensors' noise
     enclosure: Enclosure | None = None
     """The box whose walls have the background, for several cameras; None: a picture without depth."""
 
@@ -278,7 +274,7 @@ class Studio:
         for number, hand in enumerate(self._hands):
             pose = moment.hand(number)
             if pose is not None:
-                elbow, forearm = hand.forearm_line(pose)
+                elbow, forearm = hand.skin.forearm_line(pose)
                 there.append(number)
                 elbows.append(elbow)
                 forearms.append(forearm)

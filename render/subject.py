@@ -33,7 +33,7 @@ from handsim.hand.shape import (
     shape_from_measures,
     unpack_hand,
 )
-from handsim.motion_files.joint_files import read_joint_csv
+from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
@@ -52,12 +52,9 @@ class OwnPoses(NamedTuple):
 
     qpos: Float[np.ndarray, "T H 27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand is not there."""
-    times: Float[np.ndarray, "T"] | None = None
-    """Increasing [s]; None for poses that are no motion."""
-    person: Int[np.ndarray, "T"] | None = None
-    """Who is in each frame; None where the poses do not say."""
-    shapes: tuple[HandShape, ...] | None = None
-    """Hands of the people; None where the poses do not say."""
+    times: Float[np.ndarray, "T"] | None = None  # increasing [s]; None for poses that are no motion
+    person: Int[np.ndarray, "T"] | None = None  # who is in each frame; None where the poses do not say
+    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None where the poses do not say
 
 
 def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[OwnPoses, tuple[Side, ...]]:
@@ -70,14 +67,18 @@ def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[Own
     else:
         arrays, sides = _arrays(path), tuple(sides or ("right",))
     try:
-        qpos = _stored_qpos(arrays, len(sides))
-        times = _times(arrays, len(qpos))
-        shapes = _stored_shapes(arrays)
-        person = _person(arrays, len(qpos), shapes)
+        poses = _own_poses(arrays, len(sides), _stored_shapes(arrays))
     except HandSimError as error:
         raise CaptureError(f"{path}: {error}") from error
-    _tell_beyond(str(path), qpos)
-    return OwnPoses(qpos, times, person, shapes), sides
+    _tell_beyond(str(path), poses.qpos)
+    return poses, sides
+
+
+def _own_poses(
+    arrays: Mapping[str, NDArray[Any]], num_hands: int, shapes: tuple[HandShape, ...] | None
+) -> OwnPoses:
+    qpos = _stored_qpos(arrays, num_hands)
+    return OwnPoses(qpos, _times(arrays, len(qpos)), _person(arrays, len(qpos), shapes), shapes)
 
 
 def _columns(path: Path, sides: Sequence[Side] | None) -> tuple[dict[str, NDArray[Any]], tuple[Side, ...]]:
@@ -89,28 +90,6 @@ def _columns(path: Path, sides: Sequence[Side] | None) -> tuple[dict[str, NDArra
             raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
     qpos = table.qpos[:, [table.sides.index(side) for side in chosen]]
     return {"qpos": qpos, "times": table.times}, chosen
-
-
-def check_poses(
-    qpos: NDArray[Any],
-    num_hands: int,
-    *,
-    times: NDArray[Any] | None = None,
-    person: NDArray[Any] | None = None,
-    shapes: tuple[HandShape, ...] | None = None,
-) -> OwnPoses:
-    """A user's arrays as poses: (T, 27), (T, H, 27), or (T, 20) without wrists, [m, rad].
-
-    Times (T,) increase [s], and poses are no motion without them; `person` (T,) is who is in each frame.
-    """
-    arrays = {"qpos": np.asarray(qpos)}
-    if num_hands == 1 and arrays["qpos"].ndim == 2 and arrays["qpos"].shape[1] == NUM_JOINTS:
-        arrays["qpos"] = join_qpos(arrays["qpos"])
-    arrays |= {} if times is None else {"times": np.asarray(times)}
-    arrays |= {} if person is None else {"person": np.asarray(person)}
-    whole = _stored_qpos(arrays, num_hands)
-    _tell_beyond("poses", whole)
-    return OwnPoses(whole, _times(arrays, len(whole)), _person(arrays, len(whole), shapes), shapes)
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -286,12 +265,10 @@ Model = HandModel | HandShape | str
 class Cast:
     """Who is in each frame, where poses are struck by others than those whose hands a take has."""
 
-    seed: int
-    """Of what the people draw: their hands, where there are no `shapes`, and their skins."""
+    seed: int  # of what the people draw: their hands, where there are no `shapes`, and their skins
     person: Int[np.ndarray, "T"] | None = None
     """Number of the person in each frame; None: another person in every shard."""
-    shapes: tuple[HandShape, ...] | None = None
-    """Hands of the people; None: adults who are drawn."""
+    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None: adults who are drawn
 
     def person_in(self, frame: int, shard: int) -> int:
         """Number of the person in a frame of a shard."""
@@ -315,14 +292,10 @@ class Cast:
 class Subject:
     """What pictures show."""
 
-    take: Take
-    """Poses, NaN where a hand is not there; rigid bodies; points of the optical system."""
-    name: str
-    """What a rendering's settings call it: its file, or the digest of what is in memory."""
-    cast: Cast | None = None
-    """Who is in each frame; None: those whose hands these are."""
-    is_motion: bool = True
-    """Whether frames follow one another; else they are poses of their own."""
+    take: Take  # poses, NaN where a hand is not there; rigid bodies; points of the optical system
+    name: str  # what a rendering's settings call it: its file, or the digest of what is in memory
+    cast: Cast | None = None  # who is in each frame; None: those whose hands these are
+    is_motion: bool = True  # whether frames follow one another; else they are poses of their own
     poses: dict[str, Any] | None = None
     """What else decides the pictures of poses, as JSON; None for a take."""
 
@@ -362,38 +335,18 @@ Source = Path | PoseFile | Subject
 """Where a subject comes from; files are read again by every process that draws."""
 
 
-def source_of(
-    source: Take | str | Path | PoseFile | ArrayLike,
-    *,
-    model: Model | tuple[Model, Model] | None = None,
-    times: ArrayLike | None = None,
-    people: int | Sequence[Model] | None = None,
-    person: ArrayLike | None = None,
-    glove: MarkerLayout | str | None = None,
-    seed: int = 0,
-) -> Source:
-    """What a public function was given, as a source; see `subject_of_poses` for what belongs to poses."""
-    given = {"model": model, "times": times, "people": people, "person": person, "glove": glove}
-    if isinstance(source, Take | str | Path | PoseFile):
-        for name, value in given.items():
-            if value is not None:
-                raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
-        if isinstance(source, Take):
-            return subject_of_take(source)
-        return _of_file(Path(source)) if isinstance(source, str | Path) else source
-    return subject_of_poses(
-        source,
-        model=model,
-        times=times,
-        people=people,
-        person=person,
-        glove="dense19" if glove is None else glove,
-        seed=seed,
-    )
-
-
-def _of_file(path: Path) -> Path | PoseFile:
-    """A take's file, or a table of poses."""
+def source_of(source: Take | str | Path | PoseFile | ArrayLike, *, seed: int = 0, **options: Any) -> Source:
+    """What a public function was given, as a source; the options are those of `subject_of_poses`."""
+    given = {name: value for name, value in options.items() if value is not None}
+    if not isinstance(source, Take | str | Path | PoseFile):
+        return subject_of_poses(source, seed=seed, **given)
+    for name in given:
+        raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
+    if isinstance(source, Take):
+        return subject_of_take(source)
+    if isinstance(source, PoseFile):
+        return source
+    path = Path(source)
     return PoseFile(path) if path.suffix.lower() == CSV else path
 
 
@@ -429,6 +382,8 @@ def subject_of_poses(
     """A user's own poses."""
     array = np.asarray(qpos)
     models = models_of(model, 2 if array.ndim == 3 else 1)
+    if len(models) == 1 and array.ndim == 2 and array.shape[1] == NUM_JOINTS:
+        array = join_qpos(array)
     if model is not None and person is not None and people is None:
         raise ArgumentError("person says who strikes each pose, and the model is one hand; give people")
     if people is not None:
@@ -437,13 +392,10 @@ def subject_of_poses(
     _check_people(count)
     known = () if people is None or isinstance(people, int) else people
     shapes = tuple(load_model(one).shape for one in known) or None
-    poses = check_poses(
-        array,
-        len(models),
-        times=None if times is None else np.asarray(times),
-        person=None if person is None else np.asarray(person),
-        shapes=shapes,
-    )
+    given = {"qpos": array, "times": times, "person": person}
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    poses = _own_poses(arrays, len(models), shapes)
+    _tell_beyond("poses", poses.qpos)
     cast = None
     if model is None or people is not None:
         cast = _cast(poses, count, seed)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -258,10 +258,8 @@ class _Path(NamedTuple):
     """A camera on its way."""
 
     camera: Camera
-    poses: Doubles
-    """(T, 4, 4)."""
-    zoom: Doubles | None = None
-    """Factor on its focal lengths (T,); None: it keeps them."""
+    poses: Doubles  # (T, 4, 4)
+    zoom: Doubles | None = None  # factor on its focal lengths (T,); None: it keeps them
 
     def at(self, frame: int) -> Camera:
         """The camera of one frame."""
@@ -275,18 +273,16 @@ class Viewpoints:
     """Cameras of every frame."""
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
-        if config.cameras is not None:
-            own = config.cameras
+        framing, own = Framing(take), config.cameras
+        if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
-            self._centers = hand_centers(take)
         else:
-            framing = Framing(take)
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-            self._centers = framing.centers
+        self._centers = framing.centers
 
     @property
     def num_cameras(self) -> int:
@@ -305,11 +301,6 @@ class Viewpoints:
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
         return [path.at(frame) for path in self._paths]
-
-
-def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
-    """Middle of the box around the hands of each frame [m]; interpolated over frames without hands."""
-    return Framing(take).centers
 
 
 def _along(take: Take) -> Doubles:
@@ -576,11 +567,11 @@ def zoomed(camera: Camera, zoom: float) -> Camera:
     return dataclasses.replace(camera, K=K)
 
 
-def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
-    """Refuse cameras (of a file, or by names) that never have a hand in their pictures, hidden or not.
-
-    Cameras among them without a hand are told.
-    """
+def check_hands_in_view(config: ViewConfig, viewpoints: Viewpoints, take: Take) -> None:
+    """Refuse the user's own cameras if none has a hand in its pictures, and warn of those that have none."""
+    if config.cameras is None:
+        return
+    cameras, name = viewpoints.cameras(0), config.own_cameras
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
         there = qpos[np.isfinite(qpos).all(axis=1)]

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MOST_LEVELS = 11
-LOADERS = {"handsim/cli/command_table.py", "handsim/_lazy.py", "handsim/pages.py"}
+LOADERS = {"handsim/cli/main.py", "handsim/_imports.py", "handsim/pages.py"}
 
 
 def relative(path: Path) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from handsim.cli.command_table import COMMANDS, load
+from handsim.cli.main import COMMANDS, load
 
 pytestmark = pytest.mark.xdist_group("site")  # what they share is made once
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,7 +11,7 @@ is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans
 from typing import TYPE_CHECKING
 
 from handsim import __version__ as __version__  # the first import: it warns about a package of the same name
-from handsim._lazy import lazy_exports
+from handsim._imports import lazy_exports
 
 if TYPE_CHECKING:
     from gloves.takes.points import Status as Status

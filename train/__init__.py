@@ -9,7 +9,7 @@ import os
 from typing import TYPE_CHECKING
 
 from handsim import __version__ as __version__  # the first import: it warns about a package of the same name
-from handsim._lazy import lazy_exports
+from handsim._imports import lazy_exports
 
 if TYPE_CHECKING:
     from train.data.batches import Cloud as Cloud

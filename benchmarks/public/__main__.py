@@ -26,8 +26,7 @@ from benchmarks.record import describe
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
-from handsim.files.json_files import save_json
-from handsim.files.outputs import atomic_write, check_outputs, shown_bytes
+from handsim.files.outputs import atomic_write, check_outputs, save_json, shown_bytes
 
 _TABLE: Final = ("frame_accuracy", "slot_accuracy", "mpjpe", "angle_error")
 _MOST_SHOWN: Final = 3  # files that differ

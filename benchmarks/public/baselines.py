@@ -19,7 +19,7 @@ from benchmarks.public.difficulties import BENCHMARK, GLOVE
 from benchmarks.public.manifest import Benchmark
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
-from handsim.files.json_files import claim
+from handsim.files.outputs import claim
 from handsim.hand.shape import NUM_QPOS
 from track.captures import measure_hands
 from track.frames import FrameTracker

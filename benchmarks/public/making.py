@@ -33,8 +33,7 @@ from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
-from handsim.files.json_files import claim
-from handsim.files.outputs import atomic_write, check_free, remove_leftovers
+from handsim.files.outputs import atomic_write, check_free, claim, remove_leftovers
 from handsim.hand.model import HandModel
 from handsim.space.rig import load_rig
 from track.user import User, load_user

@@ -19,8 +19,8 @@ from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from handsim import __version__
 from handsim.errors import DatasetError
-from handsim.files.inputs import checksum
-from handsim.files.json_files import load_json, save_json
+from handsim.files.inputs import checksum, load_json
+from handsim.files.outputs import save_json
 from handsim.hand.model import KEYPOINT_NAMES
 from track.user import User, load_user
 from train.simulation.scenes import RATE

@@ -74,11 +74,7 @@ class Parameters:
         return Parameters(processor, values)
 
     def number(self, group: str, name: str, *, default: float | None = None) -> float:
-        """The first number of a parameter.
-
-        Raises:
-            CaptureError: It is not finite, or there is none and no default.
-        """
+        """The first number of a parameter."""
         values = self.values.get((group, name), [])
         if values and isinstance(values[0], float):
             if not math.isfinite(values[0]):
@@ -349,10 +345,7 @@ _MOST_LABEL_BYTES: Final = 255
 
 
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a C3D file; points with a negative residual are missing.
-
-    A missing unit is told, and where the file contradicts itself.
-    """
+    """The capture in the bytes of a C3D file; points with a negative residual are missing."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
     parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)
@@ -375,10 +368,6 @@ def write_c3d(path: Path, capture: Capture) -> None:
 
     A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
     programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
-
-    Raises:
-        CaptureError: A label is too long.
-        OSError: The file cannot be opened, or the disk did not take the whole file.
     """
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:

@@ -90,12 +90,7 @@ def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
 
 
 def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[np.ndarray, "G"]:
-    """Lengths of all unbroken stretches of True, column by column [frames].
-
-    Args:
-        flags: For instance, where markers are missing.
-        inside: Leave out stretches that touch the first or the last frame: their true length is unknown.
-    """
+    """Lengths of all unbroken stretches of True, column by column [frames]."""
     padded = np.zeros((len(flags) + 2, flags.shape[1]), dtype=np.int8)
     padded[1:-1] = flags
     steps = np.diff(padded, axis=0).T
@@ -169,12 +164,7 @@ def labeled_columns(
     names: Sequence[str],
     rate: float,
 ) -> Capture:
-    """Labeled points as a capture: one column per marker, then columns for the points without one.
-
-    Args:
-        labels: Marker of every point, -1 for none.
-        names: Marker names in label order.
-    """
+    """Labeled points as a capture: one column per marker, then columns for the points without one."""
     extra = max((int((label < 0).sum()) for label in labels), default=0)
     positions = np.full((len(frames), len(names) + extra, 3), np.nan)
     for frame, (points, label) in enumerate(zip(frames, labels, strict=True)):
@@ -216,13 +206,7 @@ def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
 
 
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
-    """What tells that clouds are not in meters, if anything does.
-
-    Medians over the frames decide, since strays of a real system lie anywhere.
-
-    Args:
-        only_wide: Ask only whether they span more than a room, since they may be parts of one frame.
-    """
+    """What tells that clouds are not in meters, if anything does."""
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
     step = -(-len(shown) // _SAMPLED) or 1
     shown = shown[::step]

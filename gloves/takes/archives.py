@@ -69,10 +69,6 @@ class GrowingArchive(Closing):
         header: The header, as JSON.
         arrays: The arrays that do not grow, by name.
         columns: Those that do, with numbers for all letters but T and P.
-
-    Raises:
-        CaptureError: The file exists: a recording that was cut off is never overwritten.
-        OSError: It cannot be written.
     """
 
     def __init__(
@@ -105,11 +101,7 @@ class GrowingArchive(Closing):
         return self._written + len(self._waiting)
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
-        """Add a frame; columns of points have an entry for each of its points.
-
-        Raises:
-            OSError: The disk is full, or the file cannot be written.
-        """
+        """Add a frame; columns of points have an entry for each of its points."""
         rows: Mapping[str, Any] = {**values, POINT_COUNTS.name: num_points}
         packed = []
         for column in self._columns:
@@ -164,15 +156,7 @@ class _Block(NamedTuple):
 
 
 class GrownArchive:
-    """Reads an archive that grew, or still grows, up to its last whole block.
-
-    Args:
-        check: Whether checksums are compared.
-
-    Raises:
-        ValueError: It is damaged before its first block.
-        OSError: It cannot be read.
-    """
+    """Reads an archive that grew, or still grows, up to its last whole block."""
 
     def __init__(self, path: Path, *, check: bool = True) -> None:
         self.path = path
@@ -271,13 +255,7 @@ def is_growing(path: Path) -> bool:
 def finish_archive(
     grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
 ) -> None:
-    """Write an archive that grew in its usual form, whole or not at all, and read it back.
-
-    Memory does not grow with the archive.
-
-    Raises:
-        OSError: The file cannot be written, or is not what was written when it is read back.
-    """
+    """Write an archive that grew in its usual form, whole or not at all, and read it back."""
     with atomic_write(path) as temporary:
         write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
         try:
@@ -345,13 +323,7 @@ class CutOffWarning(HandSimWarning):
 
 
 def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays and a header.
-
-    Args:
-        path: The file, whose name should end in .npz.
-        header: As JSON, with `kind` and `schema`.
-        arrays: By name; the name `header` is taken.
-    """
+    """Write arrays and a header."""
     with atomic_write(path) as temporary:
         every = {"header": np.array(json.dumps(dict(header))), **arrays}
         write_npz(temporary, (Member.of(name, array) for name, array in every.items()))

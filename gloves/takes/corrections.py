@@ -84,11 +84,7 @@ def load_corrections(path: Path) -> tuple[Correction, ...]:
 
 
 def corrections_of(take: Path) -> tuple[Correction, ...]:
-    """The corrections beside a take; none where there is no such file.
-
-    Raises:
-        CaptureError: There is one that cannot be read.
-    """
+    """The corrections beside a take; none where there is no such file."""
     path = corrections_path(take)
     return load_corrections(path) if path.exists() else ()
 
@@ -167,12 +163,7 @@ def _nearest(
 
 
 def pin_labels(points: PointList, pinned: Int[np.ndarray, "P"]) -> NDArray[np.int16]:
-    """Labels with the pinned ones; another point of the same frame that has such a label loses it.
-
-    Args:
-        points: The points with their labels.
-        pinned: `Pins.labels`.
-    """
+    """Labels with the pinned ones; another point of the same frame that has such a label loses it."""
     result: NDArray[np.int16] = np.where(pinned != FREE, pinned, points.labels).astype(np.int16)
     for frame in np.unique(points.frames[pinned >= 0]):
         part = points.of(frame)

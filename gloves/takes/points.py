@@ -123,11 +123,7 @@ STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *WORN)
 
 
 def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
-    """Values as an array of a column's type, of these sizes by letter.
-
-    Raises:
-        ValueError: They have another shape, or numbers of this type cannot hold them.
-    """
+    """Values as an array of a column's type, of these sizes by letter."""
     array, dtype = np.asarray(values), np.dtype(column.dtype)
     expected = column.sized(sizes).shape
     if array.shape != expected:

@@ -51,10 +51,7 @@ def told_warnings(program: str) -> Iterator[None]:
 
 
 class LiveStatus(Closing):
-    """Shows a line on standard error until the end of a `with` block.
-
-    A terminal shows as much of it as fits into one of its lines. A terminal that is gone ends nothing.
-    """
+    """Shows a line on standard error until the end of a `with` block."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()

@@ -80,13 +80,7 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
 
 @contextmanager
 def named_steps(first: str) -> Iterator[Callable[[str], None]]:
-    """Names steps whose length is not known, on standard error: on a terminal the running one, else all.
-
-    A step's name may hold counts; without a terminal it is a new line only now and then.
-
-    Args:
-        first: Name of the first step.
-    """
+    """Names steps whose length is not known, on standard error: on a terminal the running one, else all."""
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status(first) as status:

@@ -1,4 +1,4 @@
 """The command `handsim`: one module a command, above all packages.
 
-`main` parses the first word and calls the command that `command_table` names for it.
+`main` parses the first word and calls the command that its table names for it.
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes.util
-import operator
 import os
 import re
 import shutil
@@ -15,9 +14,11 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Final
 
-from handsim._kernel_cache import VARIABLE, kernel_cache
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+from handsim._imports import SIBLINGS, VARIABLE, kernel_cache, shadowed_siblings
 from handsim._plugins import EGL_PACKAGES
-from handsim._siblings import SIBLINGS, shadowed_siblings
 from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
@@ -37,14 +38,6 @@ _FIND_GPU: Final = """
 import torch
 print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none; the CPU does it, slower")
 """
-_COMPARE: Final = {
-    ">=": operator.ge,
-    "<=": operator.le,
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    ">": operator.gt,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +90,8 @@ def check_requirements() -> Iterator[Finding]:
         yield Finding("handsim", "not installed", remedy="run `pip install -e .` in handsim's folder")
         return
     python = ".".join(map(str, sys.version_info[:3]))
-    remedy = "" if satisfies(python, limits) else "make a virtual environment with one of these versions"
+    fits = SpecifierSet(limits).contains(python)
+    remedy = "" if fits else "make a virtual environment with one of these versions"
     yield Finding("Python", python, limits, remedy)
     for requirement in metadata.requires("handsim") or ():
         if ";" not in requirement:  # what has a marker belongs to an extra
@@ -106,24 +100,14 @@ def check_requirements() -> Iterator[Finding]:
 
 def check_requirement(requirement: str) -> Finding:
     """One dependency, written as in pyproject.toml: a name, then limits joined by commas."""
-    name, limits = re.fullmatch(r"([\w.-]+)\s*(.*)", requirement).groups()  # type: ignore[union-attr]
-    remedy = f"run `pip install '{name}{limits}'`"
+    asked = Requirement(requirement)
+    limits, remedy = str(asked.specifier), f"run `pip install '{requirement}'`"
     try:
-        found = metadata.version(name)
+        found = metadata.version(asked.name)
     except metadata.PackageNotFoundError:
-        return Finding(name, "missing", limits, remedy)
-    return Finding(name, found, limits, "" if satisfies(found, limits) else remedy)
-
-
-def satisfies(version: str, limits: str) -> bool:
-    """Whether a version keeps limits such as '>=13,<15'; only the release numbers are compared."""
-    signs_and_bounds = re.findall(r"([<>=!]+)\s*([\d.]+)", limits)
-    return all(_COMPARE[sign](_release(version), _release(bound)) for sign, bound in signs_and_bounds)
-
-
-def _release(version: str) -> tuple[int, ...]:
-    numbers = [int(part) for part in re.findall(r"\d+", re.split(r"[^\d.]", version)[0])]
-    return tuple(numbers + [0] * (4 - len(numbers)))  # 2.8 and 2.8.0 are equal
+        return Finding(asked.name, "missing", limits, remedy)
+    fits = asked.specifier.contains(found, prereleases=True)
+    return Finding(asked.name, found, limits, "" if fits else remedy)
 
 
 def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:

@@ -7,21 +7,71 @@ Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 
 from __future__ import annotations
 
 import errno
+import importlib
 import io
 import os
+import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from handsim import __version__
 from handsim.app.messages import told_warnings
-from handsim.cli.command_table import COMMANDS, PresetCommand, load
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
+# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
+# loads for --help and no package names one above in an import.
+COMMANDS: Final[dict[str, tuple[str, str]]] = {
+    "demo": (
+        "handsim.cli.demo:demo",
+        "Run the whole chain on a built-in example; ends with a page of pictures.",
+    ),
+    "hand": ("handsim.cli.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
+    "glove": (
+        "handsim.cli.glove:GLOVE",
+        "List, show, start and check marker layouts; score and improve one before it is worn.",
+    ),
+    "rig": (
+        "handsim.cli.rig:RIG",
+        "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
+    ),
+    "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
+    "train": (
+        "handsim.cli.train:train",
+        "Train a labeler on a training set; goes on where it was stopped.",
+    ),
+    "label": ("handsim.cli.label:label", "Label every frame of a marker capture."),
+    "export": (
+        "handsim.cli.export:export",
+        "Write a take's motion for other programs (.glb, .bvh, .usdc, .csv, ...), or a labeler as .onnx.",
+    ),
+    "evaluate": ("handsim.cli.train:evaluate", "Measure a labeler on a labeled capture."),
+    "simulate": ("handsim.cli.simulate:simulate", "Simulate a capture of hands, with its truth."),
+    "calibrate": ("handsim.cli.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
+    "track": ("handsim.cli.track:track", "Follow hands through a marker capture or a live stream."),
+    "report": (
+        "handsim.cli.report:report",
+        "Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.",
+    ),
+    "replay": ("handsim.cli.replay:replay", "Play a capture as a NatNet server, to try a live set-up."),
+    "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
+    "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),
+    "render": ("handsim.cli.render:render", "Draw the hands of a take, with the truth of each picture."),
+    "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
+}
+_SHELLS: Final = ("bash", "fish", "zsh")
+_SYSTEM_SENTENCES: Final = {
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.ENOENT: "no such file or folder",
+    errno.EACCES: "permission denied",
+    errno.EISDIR: "this is a folder, expected a file",
+    errno.ENOTDIR: "this is a file, expected a folder",
+    errno.EEXIST: "exists already",
+}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -50,9 +100,20 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
     except SystemExit as end:
         return _leave(end)
     except KeyboardInterrupt as stop:
-        return _say_stopped(program, stop)
+        number, kept = (stop.number, stop.kept) if isinstance(stop, Stopped) else (signal.SIGINT, "")
+        how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+        _complain(f"{program}: {'; '.join(filter(None, (how, kept)))}")
+        return 128 + number
     except Exception as error:
-        return _say_failed(program, error)
+        expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
+        _complain(f"{program}: {_sentence(error) if expected else _unexpected(program, error)}")
+        return 1
+
+
+def load(target: str) -> Any:
+    """What "module:name" stands for, imported now and not before."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def _prepare_streams() -> None:
@@ -80,28 +141,6 @@ def _leave(end: SystemExit) -> int:
     return _BROKEN_PIPE
 
 
-def _say_failed(program: str, error: Exception) -> int:
-    """Say in one line what went wrong; the exit code."""
-    expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
-    _complain(f"{program}: {sentence(error) if expected else _unexpected(program, error)}")
-    return 1
-
-
-def _say_stopped(program: str, stop: KeyboardInterrupt) -> int:
-    """Say what is kept after a signal; the exit code says which signal it was."""
-    number, kept = (stop.number, stop.kept) if isinstance(stop, Stopped) else (2, "")
-    how = "interrupted" if number == 2 else f"ended by {signal_name(number)}"
-    _complain(f"{program}: {how}{'; ' if kept else ''}{kept}")
-    return 128 + number
-
-
-def signal_name(number: int) -> str:
-    """The name of a signal, such as SIGTERM."""
-    import signal
-
-    return signal.Signals(number).name
-
-
 def _complain(line: str) -> None:
     """Print a line for the user; nobody may be there to read it."""
     try:
@@ -126,7 +165,7 @@ def _unexpected(program: str, error: Exception) -> str:
     return f"{what}; this is a mistake in handsim, please report it with {log.name}"
 
 
-def sentence(error: Exception) -> str:
+def _sentence(error: Exception) -> str:
     """One line for a user, out of an error that the user can do something about."""
     if isinstance(error, MemoryError):
         return "out of memory; ask for fewer frames, a smaller batch or fewer workers"
@@ -138,22 +177,12 @@ def sentence(error: Exception) -> str:
     return _one_line(error)
 
 
-_SYSTEM_SENTENCES: Final = {
-    errno.ENOSPC: "the disk is full; free some space and run the same command again",
-    errno.ENOENT: "no such file or folder",
-    errno.EACCES: "permission denied",
-    errno.EISDIR: "this is a folder, expected a file",
-    errno.ENOTDIR: "this is a file, expected a folder",
-    errno.EEXIST: "exists already",
-}
-
-
 def _one_line(error: Exception) -> str:
     return shortened(" ".join(str(error).splitlines()), SENTENCE) or type(error).__name__
 
 
 def _abandon_stdout() -> None:
-    """Give up what could not be written, or Python tries once more at its end and exits with 120."""
+    """Point stdout at /dev/null, so that Python's flush at exit cannot fail."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # a stream without a file
@@ -162,44 +191,31 @@ def _abandon_stdout() -> None:
 
 def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
     """Print the overview or the version, or call the command that the first argument names."""
-    if not args or args[0] in ("-h", "--help"):
+    name = args[0] if args else "--help"
+    if name in ("-h", "--help"):
         _print_overview(commands)
-        return 0
-    if args[0] == "--version":
+    elif name == "--version":
         print(f"handsim {__version__}")
-        return 0
-    if args[0] == "--print-completion":
-        return _print_completion(commands, args[1:])
-    name = args[0]
-    if name not in commands:
+    elif name == "--print-completion":
+        from handsim.cli.parsing import completion_script
+
+        if len(args) != 2 or args[1] not in _SHELLS:
+            shells = ", ".join(_SHELLS)
+            print(f"handsim: --print-completion takes one shell; valid names: {shells}", file=sys.stderr)
+            return 2
+        print(completion_script({name: load(target) for name, (target, _) in commands.items()}, args[1]))
+    elif name in commands:
+        from handsim.cli.parsing import run_command
+
+        target, help_line = commands[name]
+        result = run_command(load(target), prog=f"handsim {name}", help_line=help_line, args=args[1:])
+        return result if isinstance(result, int) else 0
+    else:
         noun = "option" if name.startswith("-") else "command"
         valid = ("--help", "--version", "--print-completion") if noun == "option" else commands
         print(f"handsim: {choices(name, valid, noun=noun)}", file=sys.stderr)
         return 2
-    target, help_line = commands[name]
-    return _call(target, prog=f"handsim {name}", help_line=help_line, args=args[1:])
-
-
-def _print_completion(commands: Mapping[str, tuple[str, str]], shells: Sequence[str]) -> int:
-    """Print the script that completes commands and options in a shell."""
-    if list(shells) != ["bash"]:
-        print("handsim: --print-completion takes one shell; valid names: bash", file=sys.stderr)
-        return 2
-    from handsim.cli.parsing import bash_completion
-
-    print(bash_completion(commands), end="")
     return 0
-
-
-def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int:
-    """Load "module:name", hand it the arguments through tyro, and return its exit code."""
-    from handsim.cli.parsing import run_command
-
-    command: Callable[..., Any] | PresetCommand | dict[str, Callable[..., Any]] = load(target)
-    if isinstance(command, PresetCommand):
-        command = command.choose(args, prog)
-    result = run_command(command, prog=prog, help_line=help_line, args=args)
-    return result if isinstance(result, int) else 0
 
 
 def _print_overview(commands: Mapping[str, tuple[str, str]]) -> None:

@@ -3,15 +3,65 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import tyro
 
 from handsim.errors import ArgumentError
 from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:
-    from track.settings import AnyHands
+    from track.settings import TrackSettings
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerOptions:
+    """Options of a tracker."""
+
+    glove: str | None = None
+    """Marker layout: a shipped name or the path of a .toml file; that of --shape, or dense19, when not
+    given."""
+    size: Size | None = None
+    """Size of the hands; auto, which is the default, measures it in the capture or in the first second of a
+    stream."""
+    shape: Path | None = None
+    """The user's file from handsim calibrate: hands and gloves."""
+    hands: tuple[Side, ...] | None = None
+    """Which hands to track; both, or those of --shape, when not given."""
+    body: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
+    handsim's own objects."""
+    labeler: str | None = None
+    """Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when not given."""
+
+    def files(self) -> tuple[object, ...]:
+        """What may be files that no output must overwrite."""
+        return self.shape, self.glove, self.labeler, *self.body
+
+    def settings(self, *, calibrate: bool = False) -> TrackSettings:
+        """The settings of `track_capture`.
+
+        Raises:
+            UserError: The user's file cannot be read.
+            ArgumentError: Size and file are both given, or the file has no such hand.
+        """
+        from track.settings import TrackSettings
+        from track.user import load_user
+
+        if self.shape is not None and self.size is not None:
+            raise ArgumentError(f"given --size {self.size} and --shape {self.shape}, expected one of them")
+        settings = TrackSettings(
+            glove=self.glove, labeler=self.labeler, bodies=self.body, calibrate=calibrate
+        )
+        if self.shape is None:
+            return dataclasses.replace(settings, hands=self.hands or BOTH, size=self.size or "auto")
+        if self.hands is None:
+            return dataclasses.replace(settings, hands=self.shape)
+        user = load_user(self.shape).of_sides(self.hands)
+        return dataclasses.replace(settings, hands=dataclasses.replace(user, notes=self.shape.name))
 
 
 def check_take_file(out: Path, *, live: bool) -> None:
@@ -31,28 +81,3 @@ def check_take_file(out: Path, *, live: bool) -> None:
         raise ArgumentError(
             f"{corrections} corrects the take that --live would replace, expected another --out than {out}"
         )
-
-
-def chosen_hands(
-    shape: Path | None, hands: tuple[Side, ...] | None, size: Size | None
-) -> tuple[AnyHands, Size]:
-    """The hands and the size that options name, as `track_capture` takes them.
-
-    Args:
-        shape: The option --shape, a user's file.
-        hands: The option --hands; both, or all of the file, when None.
-        size: The option --size, which must not be given with a file.
-
-    Raises:
-        UserError: The file cannot be read.
-        ArgumentError: Size and file are both given, or the file has no such hand.
-    """
-    from track.user import load_user
-
-    if shape is None:
-        return BOTH if hands is None else hands, size or "auto"
-    if size is not None:
-        raise ArgumentError(f"given --size {size} and --shape {shape}, expected one of them")
-    if hands is None:
-        return shape, "auto"
-    return dataclasses.replace(load_user(shape).of_sides(hands), notes=shape.name), "auto"

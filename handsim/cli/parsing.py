@@ -1,17 +1,18 @@
-"""How the signatures of commands become options: one reading of types, and of what help says of defaults.
-
-The same options stand in the script that completes commands in bash.
-"""
+"""How the signatures of commands become options: one reading of types, and of what help says of defaults."""
 
 from __future__ import annotations
 
+import argparse
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
+import io
 import textwrap
 import types
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
 
@@ -26,29 +27,34 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from handsim.cli.command_table import PresetCommand, load
-
 Command = Callable[..., Any]
 _UNIONS: Final = (Union, types.UnionType)
-_SCRIPT: Final = """\
-# Completion of handsim in bash; in zsh, after `autoload -U bashcompinit && bashcompinit`.
-_handsim() {{
-    local words
-    if [ "$COMP_CWORD" -eq 1 ]; then
-        words="{commands} --help --version"
-    else
-        case "${{COMP_WORDS[1]}}" in
-{cases}
-        esac
-    fi
-    COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
-}}
-complete -o default -F _handsim handsim
-"""
+_SPECIFICATION: Final = "COMPLETION_SPEC = "  # in scripts for completion, of commands and options
+
+
+@dataclass(frozen=True, slots=True)
+class PresetCommand:
+    """A command that reads its arguments once before they are parsed.
+
+    A preset must become the default of the other options: compared afterwards, an option that was given and
+    equals the usual default cannot be distinguished from one that was not given.
+    """
+
+    choose: Callable[[Sequence[str], str], Command]
+    """From the arguments and the program's name for messages to the function that they are parsed for."""
+
+
+def given_option(args: Sequence[str], option: str) -> str | None:
+    """The value of one option among arguments, None where it is not given; nothing else is checked."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(option, dest="value", nargs="?")
+    known, _ = parser.parse_known_args(list(args))
+    value: str | None = known.value
+    return value
 
 
 def run_command(
-    command: Command | dict[str, Command],
+    command: Command | PresetCommand | dict[str, Command],
     *,
     prog: str,
     help_line: str = "",
@@ -60,6 +66,8 @@ def run_command(
     Raises:
         SystemExit: After help (code 0) or a mistake in the options (code 2).
     """
+    if isinstance(command, PresetCommand):
+        command = command.choose(args or (), prog)
     if isinstance(command, dict):
         table = {name: _with_hints(one) for name, one in command.items()}
         return tyro.extras.subcommand_cli_from_dict(
@@ -70,16 +78,32 @@ def run_command(
     )
 
 
-def options_of(command: Command) -> list[str]:
-    """The options of a command, as they are written."""
-    with registry():
-        parser: Any = tyro.extras.get_parser(_with_hints(command))
-    return [
-        option
-        for action in parser._actions  # argparse has no other way to list them
-        for option in action.option_strings
-        if option.startswith("--")
-    ]
+def completion_script(
+    commands: Mapping[str, Command | PresetCommand | dict[str, Command]], shell: str
+) -> str:
+    """The script that completes commands and options in a shell, as tyro makes it."""
+    table = {name: _completed(command) for name, command in commands.items()}
+    script, args = io.StringIO(), ["--tyro-print-completion", shell]
+    with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
+        tyro.extras.subcommand_cli_from_dict(table, prog="handsim", args=args, registry=registry())
+    lines = script.getvalue().splitlines()  # a line break in a help text would end a proposal
+    return "\n".join(line.replace(r"\n", " ") if line.startswith(_SPECIFICATION) else line for line in lines)
+
+
+def _completed(command: Command | PresetCommand | dict[str, Command]) -> Command:
+    """A command as one function."""
+    if isinstance(command, PresetCommand):
+        command = command.choose((), "handsim")
+    if not isinstance(command, dict):
+        return _with_hints(command)
+    words = [tyro.conf.subcommand(name=name, constructor=_with_hints(one)) for name, one in command.items()]
+
+    def chosen(word: Any) -> Any:
+        return word
+
+    union: Any = Union[tuple(Annotated[Any, word] for word in words)]  # noqa: UP007  # made from a list
+    chosen.__annotations__ = {"word": Annotated[union, tyro.conf.arg(name="")], "return": Any}
+    return chosen
 
 
 def registry() -> ConstructorRegistry:
@@ -177,23 +201,3 @@ def _with_hints(command: Command) -> Command:
     wrapped.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": Any}
     wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return wrapped
-
-
-def bash_completion(commands: Mapping[str, tuple[str, str]]) -> str:
-    """The script for a table of commands; loads all of them, which takes some seconds."""
-    cases = [
-        f'            {name}) words="{" ".join(_words(target))}" ;;' for name, (target, _) in commands.items()
-    ]
-    return _SCRIPT.format(commands=" ".join(commands), cases="\n".join(cases))
-
-
-def _words(target: str) -> list[str]:
-    """The options of a command, and its sub-commands."""
-    command: Any = load(target)
-    if isinstance(command, PresetCommand):
-        command = command.choose((), "handsim")
-    functions = list(command.values()) if isinstance(command, dict) else [command]
-    found = list(command) if isinstance(command, dict) else []
-    for function in functions:
-        found += [word for word in options_of(function) if word not in found]
-    return found

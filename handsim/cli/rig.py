@@ -15,8 +15,14 @@ from rich.text import Text
 from handsim.app.messages import print_line
 from handsim.app.progress import named_steps
 from handsim.errors import RigError
-from handsim.files.json_files import save_json
-from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter, written_together
+from handsim.files.outputs import (
+    as_text,
+    check_ending,
+    check_outputs,
+    save_json,
+    write_starter,
+    written_together,
+)
 from handsim.space.rig import (
     ROOM_CENTER,
     CameraRig,

@@ -13,17 +13,17 @@ from rich.console import Console
 
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
+from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
-from handsim.hand.shape import Side
-from track.config import Size
-from track.frames import TrackedFrame
 
 if TYPE_CHECKING:
     from track.captures import OnFrame
+    from track.frames import TrackedFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
     from track.sinks import SinkGroup
+    from track.streams.frame_source import StreamedFrame
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
@@ -35,12 +35,7 @@ def track(
     live: str | None = None,
     seconds: float | None = None,
     send: tuple[str, ...] = (),
-    glove: str | None = None,
-    size: Size | None = None,
-    shape: Path | None = None,
-    hands: tuple[Side, ...] | None = None,
-    body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    labeler: str | None = None,
+    options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     calibrate: bool = False,
     labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
@@ -59,34 +54,25 @@ def track(
         send: Where hands are sent as they are tracked, one or several of osc://host:port, udp://host:port,
             ws://host:port, which is a server, lsl:NAME, and module:name, a sink of your own. Without a host
             it is this machine. A capture is then played at its own rate.
-        glove: Marker layout: a shipped name or the path of a .toml file; that of --shape, or dense19, when
-            not given.
-        size: Size of the hands; auto, which is the default, measures it in the capture or in the first second
-            of a stream.
-        shape: The user's file from handsim calibrate: hands and gloves.
-        hands: Which hands to track; both, or those of --shape, when not given.
-        body: A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
-            handsim's own objects.
-        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
-            not given.
+        options: Which hands to track.
         calibrate: Track a capture twice: first to calibrate its hands, then with those that fit frames better
             which they were not calibrated on. For those who did not capture a minute for handsim calibrate.
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """
-    from gloves.captures.formats import write_capture
+    from gloves.captures.formats import WRITABLE, check_suffix, write_capture
     from gloves.takes.take import load_take
-    from handsim.cli.options import chosen_hands
     from track.live import track_live
-    from track.settings import TrackerSetup, TrackSettings
+    from track.settings import TrackerSetup
     from track.sinks import open_sinks
-    from track.streams.frame_source import StreamedFrame
     from track.tracker import warm_up
 
-    _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)
-    check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
-    worn, worn_size = chosen_hands(shape, hands, size)
-    settings = TrackSettings(glove, worn, worn_size, labeler, body, calibrate)
+    _check_source(capture, live, seconds, calibrate=calibrate)
+    check_take_file(out, live=live is not None)
+    if labeled is not None:
+        check_suffix(labeled, WRITABLE)
+    check_outputs((capture, *options.files()), (out, labeled))
+    settings = options.settings(calibrate=calibrate)
     times: deque[float] = deque(maxlen=_TIMED)  # [s]
 
     def on_frame(frame: StreamedFrame, tracked: TrackedFrame) -> None:
@@ -101,12 +87,11 @@ def track(
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
             if labeled is not None:  # after the recording, which nobody can make again
-                write_capture(
-                    labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture()
-                )
-    if shape is not None and glove is None:
-        print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _tell(out, tracked, float(np.median(times)))
+                take = tracked.take if tracked.is_whole else load_take(out)
+                write_capture(labeled, take.labeled_capture())
+    if options.shape is not None and options.glove is None:
+        print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
+    _print_take(out, tracked, float(np.median(times)))
 
 
 def _track_file(
@@ -147,16 +132,15 @@ def _track_file(
     return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))
 
 
-def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
+def _print_take(out: Path, tracked: LiveTake, seconds: float) -> None:
     """Print what was tracked, and warn of what looks wrong; `seconds` is the time of the median frame."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
 
-    take, frames = tracked.take, tracked.num_frames
-    _, measured, size = take.settings["user"].partition(MEASURED)
-    lines = [f"size of the hands: {size}"] if measured else []
-    if take.settings["user"].startswith("calibrated on"):
-        lines = take.settings["user"].split("; ")
+    take, frames, user = tracked.take, tracked.num_frames, tracked.take.settings["user"]
+    lines = [f"size of the hands: {user.removeprefix(MEASURED)}"] if user.startswith(MEASURED) else []
+    if user.startswith("calibrated on"):
+        lines = user.split("; ")
     lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
     for line in (*lines, *tracked.notes, *summarize(take), f"{1e3 * seconds:.2f} ms per frame"):
         print_line(line)
@@ -164,23 +148,13 @@ def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
 
 
-def _check_options(
-    capture: Path | None,
-    live: str | None,
-    seconds: float | None,
-    out: Path,
-    labeled: Path | None,
-    *,
-    calibrate: bool,
-) -> None:
-    from gloves.captures.formats import WRITABLE, check_suffix
-    from handsim.cli.options import check_take_file
+def _check_source(capture: Path | None, live: str | None, seconds: float | None, *, calibrate: bool) -> None:
+    """Refuse a capture beside a stream, and options that go with the other one."""
     from track.streams.live_stream import check_address
 
     if (capture is None) == (live is None):
-        given = (
-            "neither a capture nor --live" if capture is None else f"a capture, {capture}, and --live {live}"
-        )
+        both = f"a capture, {capture}, and --live {live}"
+        given = "neither a capture nor --live" if capture is None else both
         raise ArgumentError(f"given {given}, expected a capture or --live natnet://host")
     if seconds is not None and live is None:
         raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
@@ -192,6 +166,3 @@ def _check_options(
         raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
     if live is not None:
         check_address(live)  # before kernels are compiled
-    check_take_file(out, live=live is not None)
-    if labeled is not None:
-        check_suffix(labeled, WRITABLE)

@@ -11,11 +11,10 @@ from rich.console import Console
 
 from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
+from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.files.signals import InterruptFlag, interrupt_flag
-from handsim.hand.shape import Side
-from track.config import Size
 from track.streams import LOOPBACK
 from track.viewer.server import address_of, opened_server
 
@@ -32,12 +31,7 @@ def view(
     out: Path | None = None,
     rig: str | None = None,
     live: str | None = None,
-    glove: str | None = None,
-    size: Size | None = None,
-    shape: Path | None = None,
-    hands: tuple[Side, ...] | None = None,
-    body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    labeler: str | None = None,
+    options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     video: Path | None = None,
     time: float | None = None,
 ) -> None:
@@ -55,18 +49,11 @@ def view(
             of a live tracker (.npz), which is not recorded when not given.
         rig: Cameras to show with a capture, a take or a stream: a shipped name or the path of a .toml file.
         live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
-        glove: Marker layout of a live tracker; that of --shape, or dense19, when not given.
-        size: Size of a live tracker's hands, measured in the first second when not given; or of the hand that
-            wears a layout, M when not given.
-        shape: The user's file from handsim calibrate, for a live tracker.
-        hands: Which hands a live tracker follows; both, or those of --shape, when not given.
-        body: A rigid body for a live tracker, once per body.
-        labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
+        options: Options of a live tracker; --size is also that of the hand that wears a layout.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
         time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
     """
-    from handsim.cli.options import check_take_file, chosen_hands
-    from track.settings import USUAL_SIZE, TrackerSetup, TrackSettings
+    from track.settings import USUAL_SIZE, TrackerSetup
     from track.viewer.contents import open_content
 
     if (file is None) == (live is None):
@@ -79,16 +66,11 @@ def view(
             raise ArgumentError(f"--time is {time:g} with --live, expected a file")
         if out is not None:
             check_take_file(out, live=True)
-            check_outputs((shape, glove, labeler, rig, *body), (out,))
-        worn, worn_size = chosen_hands(shape, hands, size)
-        setup = TrackerSetup.of(
-            TrackSettings(glove=glove, hands=worn, size=worn_size, labeler=labeler, bodies=body)
-        )
-        _view_live(live, setup, host, port, rig, out)
+            check_outputs((rig, *options.files()), (out,))
+        _view_live(live, TrackerSetup.of(options.settings()), host, port, rig, out)
         return
-    content = open_content(
-        str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig, time=time
-    )
+    size = USUAL_SIZE if options.size in (None, "auto") else options.size
+    content = open_content(str(file), out=out, size=size, rig=rig, time=time)
     if video is not None:
         _draw(str(file), content, video)
         return

@@ -49,9 +49,6 @@ def write_npz(path: Path, members: Iterable[Member]) -> None:
 
     Arrays are compressed. The reader refuses an archive that expands too much; one that would, such as hours
     in which nothing moves, is written again without compression.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     members = list(members)
     for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
@@ -72,12 +69,7 @@ def write_npz(path: Path, members: Iterable[Member]) -> None:
 
 
 def check_npz(path: Path) -> None:
-    """Read an `.npz` to its end without keeping its arrays.
-
-    Raises:
-        ValueError: `read_npz` would refuse it, or a checksum is wrong.
-        OSError: It cannot be read.
-    """
+    """Read an `.npz` to its end without keeping its arrays."""
     with _damage_named(), zipfile.ZipFile(path) as archive:
         _check_archive(archive, path)
         if archive.testzip() is not None:
@@ -85,13 +77,7 @@ def check_npz(path: Path) -> None:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """All arrays of an `.npz`, by name.
-
-    Raises:
-        ValueError: Not an archive of plain arrays, a header that does not fit its bytes, or far more bytes
-            than such a file may hold.
-        OSError: It cannot be read.
-    """
+    """All arrays of an `.npz`, by name."""
     with _damage_named():
         with zipfile.ZipFile(path) as archive:
             _check_archive(archive, path)

@@ -5,6 +5,7 @@ A wrong value raises a `HandSimError` that names the key; the caller, which know
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -12,13 +13,14 @@ import re
 import stat
 import tomllib
 from collections.abc import Collection, Mapping
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, choices, shortened
+from handsim.errors import DatasetError, HandSimError, choices, shortened
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_MOST_JSON: Final = 1 << 26  # bytes
 _INTEGER_BITS: Final = 63
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 _KINDS: Final = (
@@ -37,13 +40,7 @@ _KINDS: Final = (
 
 
 def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
-    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes.
-
-    A path that does not exist, or is a folder, is left to whoever opens it.
-
-    Raises:
-        HandSimError: Of class `error`: the path is not a regular file, or is too long.
-    """
+    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes."""
     try:
         found = path.stat()
     except OSError:
@@ -58,11 +55,7 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
 
 
 def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
-    """The bytes of a regular file of at most `most` bytes.
-
-    Raises:
-        HandSimError: Of class `error`: the file cannot be read, is not a regular one, or is too long.
-    """
+    """The bytes of a regular file of at most `most` bytes."""
     check_regular(path, error=error, most=most)
     try:
         # Without waiting: the path may have become a pipe since it was checked.
@@ -82,11 +75,7 @@ _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyon
 
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
-    """The tables of a TOML file.
-
-    Args:
-        error: What to raise, in one sentence, when the file cannot be read or is not TOML.
-    """
+    """The tables of a TOML file."""
     data = read_bytes(path, error=error, most=_MOST_TOML)
     try:
         text = data.decode("utf-8")
@@ -112,6 +101,25 @@ def _has_long_integer(value: object) -> bool:
     if isinstance(value, dict | list):
         return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
     return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object."""
+    try:
+        content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
+    return content
+
+
+@functools.cache
+def package_data(package: str, name: str) -> dict[str, Any]:
+    """A JSON file of a package's own data."""
+    text = resources.files(package).joinpath(f"data/{name}.json").read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
 
 
 def check_keys(

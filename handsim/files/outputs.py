@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import errno
 import glob
+import json
+import math
 import os
 import platform
 import shutil
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from handsim._checks import check_type
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError, HandSimError, shortened
+from handsim.files.inputs import load_json
 from handsim.files.signals import signals_wait
 
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
@@ -32,13 +35,7 @@ def as_text(name: str) -> str:
 
 @contextmanager
 def plain_path(path: Path) -> Iterator[Path]:
-    """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other.
-
-    The file need not exist: what is written to the link is written to the file.
-
-    Raises:
-        OSError: The link cannot be made.
-    """
+    """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -66,17 +63,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     the way to `path` are made. The finished file has the mode that the umask asks for, whatever its writer
     chose. What a killed process left of the same file is removed first.
 
-    Args:
-        path: Where the finished file shall be; an existing file there is replaced, of a link the file that
-            it points to.
-
     Yields:
         The path to write to.
-
-    Raises:
-        ArgumentError: `path` is no path.
-        OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
-            wrote nothing.
     """
     check_type("path", path, (str, os.PathLike), "a path")
     final = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
@@ -124,9 +112,6 @@ def written_together() -> Iterator[None]:
     If the block raises, or one file cannot take its name, older files stay as they were, and those that were
     not there before are not there. Signals to end wait for the renames. Only a process that is killed between
     two of them leaves new files beside older ones.
-
-    Raises:
-        OSError: A file cannot take its name.
     """
     if _TOGETHER.get() is not None:
         yield
@@ -143,11 +128,7 @@ def written_together() -> Iterator[None]:
 
 
 def _name(files: Mapping[Path, Path]) -> None:
-    """Rename all temporary files, or none.
-
-    Args:
-        files: The temporary file of each final name.
-    """
+    """Rename all temporary files, or none."""
     older: dict[Path, Path] = {}
     named: list[Path] = []
     with signals_wait():
@@ -199,11 +180,7 @@ def unwritten(path: Path) -> OSError:
 
 
 def make_folder_of(path: Path) -> None:
-    """Make the folders that are missing on the way to a file.
-
-    Raises:
-        OSError: One cannot be made, or there is a file in its place.
-    """
+    """Make the folders that are missing on the way to a file."""
     for folder in path.parents:
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
@@ -237,10 +214,7 @@ def _remove(leftover: Path) -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove what was to become `final`, or was it before, and whose process is gone.
-
-    What processes of other machines left stays.
-    """
+    """Remove what was to become `final`, or was it before, and whose process is gone."""
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
@@ -283,12 +257,7 @@ _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
-    """Refuse an output that names an input or another one, in whatever spelling, or has no place.
-
-    Args:
-        inputs: Files and folders that a command reads, and names that may be none; objects are no files.
-        outputs: What it writes; None where not given.
-    """
+    """Refuse an output that names an input or another one, in whatever spelling, or has no place."""
     read, written = [Path(name) for name in inputs if isinstance(name, str | Path)], set()
     for output in (path for path in outputs if path is not None):
         _check_links(output)
@@ -350,13 +319,7 @@ def _same(source: Path, output: Path) -> bool:
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
-    """Refuse work that the disk has no space for; the folder need not exist yet.
-
-    Args:
-        needed: Bytes still to be written.
-        what: What needs them, for the message, in the plural.
-        remedy: What to do beside freeing space, as in `ask for fewer frames`.
-    """
+    """Refuse work that the disk has no space for; the folder need not exist yet."""
     there = folder.absolute()
     while not there.exists():
         there = there.parent
@@ -395,3 +358,91 @@ def shown_bytes(count: float) -> str:
     while count >= 1000.0 and unit < len(_UNITS) - 1:
         count, unit = count / 1000.0, unit + 1
     return f"{count:.3g} {_UNITS[unit]}"
+
+
+_MOST_SHOWN: Final = 4  # settings that a message lists
+
+
+def save_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file, whole or not at all; JSON knows no NaN and no infinity, which become null."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """The same, with None for what is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def claim(
+    path: Path,
+    settings: dict[str, Any],
+    *,
+    noun: str,
+    error: type[HandSimError],
+    grows: str = "",
+    free: Collection[str] = (),
+    result: Path | None = None,
+    shown: str = "",
+) -> None:
+    """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
+
+    The setting `grows`, written like `train.samples`, may be larger than in the file, which then takes the
+    new settings; the file `result`, which is true for the old ones only, is removed before. Settings that are
+    `free` may differ. `shown` is the name of the folder in messages.
+    """
+    out, shown = path.parent, shown or str(path.parent)
+    if path.is_file():
+        found, expected = _flat(load_json(path)), _flat(json.loads(json.dumps(settings)))
+        keys = sorted((found.keys() | expected) - set(free))
+        differing = [key for key in keys if key not in found.keys() & expected or found[key] != expected[key]]
+        new, old = expected.get(grows), found.get(grows)
+        grown = differing == [grows] and isinstance(new, int) and isinstance(old, int) and new > old
+        if differing and not grown:
+            hint = f" ({grows} may only grow)" if grows and differing == [grows] else ""
+            raise error(
+                f"{shown} holds a {noun} begun with other settings "
+                f"({_differences(differing, found, expected)}); use them or another folder{hint}"
+            )
+        remove_leftovers(out)
+        if grown:
+            if result is not None:
+                result.unlink(missing_ok=True)
+            save_json(path, settings)
+    elif out.exists() and not out.is_dir():
+        raise error(f"{out} is a file, expected a folder")
+    elif out.is_dir() and {*out.iterdir()} - {*out.glob(f".{path.stem}.tmp-*")}:  # left by a killed run
+        raise error(f"{out} is not empty and holds no {noun}; name another folder")
+    else:
+        if out.is_dir():
+            remove_leftovers(out)
+        save_json(path, settings)
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by their path of names, `train.network.width`; lists are values."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _differences(differing: Collection[str], found: dict[str, Any], expected: dict[str, Any]) -> str:
+    """The settings that differ, with both values."""
+    pairs = [
+        f"{key}: {_shown(found, key)} there, {_shown(expected, key)} here"
+        for key in list(differing)[:_MOST_SHOWN]
+    ]
+    more = len(differing) - _MOST_SHOWN
+    return "; ".join(pairs) + (f"; and {more} more" if more > 0 else "")
+
+
+def _shown(settings: dict[str, Any], key: str) -> str:
+    return shortened(json.dumps(settings[key], ensure_ascii=False)) if key in settings else "nothing"

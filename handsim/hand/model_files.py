@@ -141,13 +141,7 @@ def coordinate_names(side: Side) -> tuple[str, ...]:
 
 
 def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
-    """The text of a .osim file: meters, radians, kilograms.
-
-    Args:
-        markers: Of its glove, each fixed to one bone. They are named as `handsim label` names them in a file
-            of one hand, `ThumbTip`, and again as in one of two, `right:ThumbTip`. The joints and tips
-            follow, as `handsim export` names them in a .trc, `right_index_tip`.
-    """
+    """The text of a .osim file: meters, radians, kilograms."""
     side = model.shape.side
     document = ET.Element("OpenSimDocument", Version=_VERSION)
     root = ET.SubElement(document, "Model", name=f"{side}_hand")

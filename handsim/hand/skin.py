@@ -42,13 +42,7 @@ def edge_table(quads: Int[np.ndarray, "Q 4"]) -> tuple[Int[np.ndarray, "E 2"], I
 def catmull_clark(
     quads: Int[np.ndarray, "Q 4"], num_vertices: int
 ) -> tuple[sparse.csr_array, Int[np.ndarray, "Q4 4"]]:
-    """One step of Catmull-Clark on a closed quad mesh.
-
-    New vertices are the old ones, then one for each row of `edge_table`, then one for each quad.
-
-    Returns:
-        Matrix (V + E + Q, V) from old positions to new ones, and the 4 Q new quads with the old winding.
-    """
+    """One step of Catmull-Clark on a closed quad mesh."""
     edges, edge_of_corner = edge_table(quads)
     num_edges, num_quads = len(edges), len(quads)
     corner, quad = quads.ravel(), np.repeat(np.arange(num_quads), 4)
@@ -383,10 +377,7 @@ class CageHands(NamedTuple):
         return rows
 
     def _finger_bases(self, distances: NDArray[np.float64], deepen: float) -> NDArray[np.float64]:
-        """A palm row (B, 1, 18, 3) across the fingers, `distances` (B, 4, 6) [m] past their first joints.
-
-        Neighbors share their sides.
-        """
+        """A palm row (B, 1, 18, 3) across the fingers, `distances` (B, 4, 6) [m] past their first joints."""
         radius = 1.2 * self._radius_at(_FINGERS, distances)
         section = (_ROUND + _PALMWARD) * radius[..., None]
         section[..., 3:, 1] -= deepen * radius[..., 3:]
@@ -544,12 +535,7 @@ def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
 def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
-    """Outward unit normals, each the area-weighted mean of the faces around its vertex.
-
-    Args:
-        vertices: Positions in any frame [m].
-        faces: Triangles, counter-clockwise from outside.
-    """
+    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
     return _vertex_normals(
         np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64)
     )
@@ -620,17 +606,7 @@ def skin_frames(
     rest_transforms: Float[np.ndarray, "L 4 4"],
     transforms: Float[np.ndarray, "T L 4 4"],
 ) -> Float[np.ndarray, "T V 3"]:
-    """Points attached at rest, carried by the bones.
-
-    Args:
-        points: Rest positions, in the frame of `rest_transforms` [m].
-        bone_weights: Their shares in descending order; the first zero ends a point's list.
-        rest_transforms: Bones at rest.
-        transforms: Bones in every frame, in any one frame of reference.
-
-    Returns:
-        Positions in the frame of `transforms` [m].
-    """
+    """Points attached at rest, carried by the bones."""
     motion = np.ascontiguousarray((transforms @ np.linalg.inv(rest_transforms))[..., :3, :])
     skinned: NDArray[np.float64] = _skin(points, bone_indices, bone_weights, motion)
     return skinned

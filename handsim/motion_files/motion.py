@@ -1,22 +1,52 @@
-"""What the writers of motion files take: hands and rigid bodies over time, as a take has them.
+"""What the formats of motion share, and joints of hands as tables, as BVH and as OpenXR's joints.
 
-Skeletons of other programs have rotations of the bones relative to their parents (`local_rotations`).
+A table .csv or .parquet has a row per frame and hand, a column per number, its unit in its name. Where a hand
+has no pose, its row is there and its numbers are missing: empty in a .csv, null in .parquet. OpenSim's .mot
+has a row per frame, angles in degrees and NaN without a pose.
+
+BVH has no unit and no comments, so the root is named `world_cm`: lengths are centimeters, which animation
+programs expect, with y up. Below it stand the palm of each hand and the things, which have positions; every
+other joint has rotations alone. All rotations zero is the flat hand. BVH cannot leave a frame out: a hand
+without a pose keeps its last one.
+
+A joint of OpenXR's hand tracking (XR_EXT_hand_tracking) is the near end of the bone that it is named after;
+its -z axis points along that bone to the fingertip, its +y axis out of the back (nail) side, so +x points to
+the right of a hand that lies on its palm. Our bones have x along, z out of the back: OpenXR's x, y and z are
+our -y, z and -x. Tips have the axes of their last bone. The near ends of the four finger metacarpals, which
+do not move in our hand, are put at 38 percent of the way from the wrist to the knuckle (the carpus of
+Buryanov and Kotiuk); the palm joint is the middle of the middle metacarpal. The world has y up, as OpenXR's
+reference spaces have. Quaternions are xyzw, as in XrQuaternionf. A hand without a pose in a frame is null
+there, as `isActive` would be false.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple, Protocol
+from pathlib import Path
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.hand.model import HandModel
-from handsim.hand.shape import BONES, PALM, Side
+from handsim.errors import CaptureError, HandSimError, choices
+from handsim.files.inputs import read_bytes
+from handsim.files.outputs import as_text, atomic_write
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
+from handsim.hand.model_files import coordinate_names
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import UpAxis, pose_matrices, rotation_quaternions
+from handsim.space.transforms import (
+    UpAxis,
+    body_fixed_angles,
+    euler_angles,
+    pose_matrices,
+    quaternion_matrix,
+    rotation_quaternions,
+)
 
 CHILDREN: Final = tuple(
     tuple(number for number, bone in enumerate(BONES) if bone.parent == parent)
@@ -39,72 +69,25 @@ SKIN: Final = Material("skin", (0.66, 0.38, 0.28), 0.65)
 THING: Final = Material("thing", (0.16, 0.2, 0.26), 0.5)
 
 
-class HasModel(Protocol):
-    """Anything with a hand: a `gloves.GloveFit`."""
-
-    @property
-    def model(self) -> HandModel:
-        """The hand."""
-        ...
-
-
-class NamedBody(Protocol):
-    """A rigid body."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def shape(self) -> RigidObject | None:
-        """Its surface; None where only its poses are known."""
-        ...
-
-
-class Motion(Protocol):
-    """Hands and rigid bodies, frame by frame: a `gloves.Take`. Each has a pose in one frame at least."""
-
-    @property
-    def rate(self) -> float:
-        """Frames per second [Hz]; of a stream, the usual one."""
-        ...
-
-    @property
-    def times(self) -> Float[np.ndarray, "T"]:
-        """Time of each frame [s], increasing."""
-        ...
-
-    @property
-    def hands(self) -> Sequence[HasModel]:
-        """The hands, at most one per side."""
-        ...
-
-    @property
-    def qpos(self) -> Float[np.ndarray, "T H 27"]:
-        """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where there is no pose."""
-        ...
-
-    @property
-    def bodies(self) -> Sequence[NamedBody]:
-        """The rigid bodies."""
-        ...
-
-    @property
-    def body_poses(self) -> Float[np.ndarray, "T B 7"]:
-        """Position [m] and orientation (wxyz); NaN where there is no pose."""
-        ...
-
-
 class PosedHand(NamedTuple):
     """A hand of a motion."""
 
     model: HandModel
-    side: Side
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose."""
+    """The frames with a pose; there is one at least."""
     qpos: Float[np.ndarray, "T 27"]
     """The poses [m, rad]; without one the last pose, and before the first one that."""
+
+    @property
+    def side(self) -> Side:
+        """Which hand it is."""
+        return self.model.shape.side
+
+    @classmethod
+    def of(cls, model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> PosedHand:
+        """A hand with its poses, NaN where it has none."""
+        present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
+        return cls(model, present, _held(qpos, present))
 
 
 class PosedBody(NamedTuple):
@@ -112,32 +95,34 @@ class PosedBody(NamedTuple):
 
     name: str
     shape: RigidObject | None
+    """Its surface; None where only its poses are known."""
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose."""
+    """The frames with a pose; there is one at least."""
     T_world_body: Float[np.ndarray, "T 4 4"]
     """The poses [m]; without one the last pose, and before the first one that."""
 
-
-def posed_hands(motion: Motion) -> Iterator[PosedHand]:
-    """Each hand, with its last pose where it has none."""
-    for number, hand in enumerate(motion.hands):
-        qpos = motion.qpos[:, number]
-        present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        yield PosedHand(hand.model, hand.model.shape.side, present, _held(qpos, present))
-
-
-def posed_bodies(motion: Motion) -> Iterator[PosedBody]:
-    """Each rigid body, with its last pose where it has none."""
-    for number, body in enumerate(motion.bodies):
-        poses = motion.body_poses[:, number]
+    @classmethod
+    def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
+        """A body with its positions [m] and orientations (wxyz), NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
-        yield PosedBody(body.name, body.shape, present, pose_matrices(_held(poses, present)))
+        return cls(name, shape, present, pose_matrices(_held(poses, present)))
 
 
-def seconds_of(motion: Motion) -> Float[np.ndarray, "T"]:
-    """Time since the first frame [s]."""
-    seconds: NDArray[np.float64] = motion.times - motion.times[0]
-    return seconds
+class Motion(NamedTuple):
+    """Hands and rigid bodies, frame by frame."""
+
+    rate: float
+    """Frames per second [Hz]; of a stream, the usual one."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s], increasing."""
+    hands: Sequence[PosedHand]
+    bodies: Sequence[PosedBody]
+
+    @property
+    def seconds(self) -> Float[np.ndarray, "T"]:
+        """Time since the first frame [s]."""
+        seconds: NDArray[np.float64] = self.times - self.times[0]
+        return seconds
 
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
@@ -180,11 +165,7 @@ _SHARP: Final = np.cos(np.deg2rad(40.0))
 def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
-    """Outward unit normal at each corner of each face: of the faces there that meet at less than 40 degrees.
-
-    Args:
-        faces: Triangles, counter-clockwise from outside.
-    """
+    """Outward unit normal at each corner of a face: of the faces there that meet at less than 40 degrees."""
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     areas = np.cross(second - first, third - first)
     units = _unit(areas)
@@ -216,3 +197,330 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     unit: NDArray[np.float64] = np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.0)
     unit[lengths[:, 0] == 0.0] = (0.0, 0.0, 1.0)
     return unit
+
+
+_FIRST: Final = ("frame", "time_s", "hand")
+_QPOS: Final = (
+    *(f"wrist_{axis}_m" for axis in "xyz"),
+    *(f"wrist_q{part}" for part in "wxyz"),
+    *(f"{joint}_rad" for joint in JOINT_NAMES),
+)
+NUMBERS: Final[tuple[str, ...]] = (
+    *_QPOS,
+    *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
+)
+"""Columns after `frame`, `time_s` and `hand`: the world's positions and the wrist's quaternion, angles."""
+
+
+class JointTable(NamedTuple):
+    """The poses of a table."""
+
+    sides: tuple[Side, ...]
+    """Whose they are, in the order in which the table names the hands first."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s]."""
+    qpos: Float[np.ndarray, "T H 27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN without a pose."""
+
+
+def read_joint_csv(path: Path) -> JointTable:
+    """The poses in a .csv of `write_joint_csv`, or another with its columns of frame, time, hand and qpos."""
+    text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
+    lines = csv.reader(text.splitlines())
+    try:
+        titles = [title.strip() for title in next(lines, [])]
+        wanted = [*_FIRST, *_QPOS]
+        missing = [name for name in wanted if name not in titles]
+        if missing:
+            raise CaptureError(
+                f"{path}: no column '{missing[0]}'; of a .csv are read {', '.join(_FIRST)}, {_QPOS[0]} to "
+                f"{_QPOS[6]} and the joint angles {_QPOS[7]} to {_QPOS[-1]}, as handsim export writes them"
+            )
+        columns = [titles.index(name) for name in wanted]
+        rows = [(lines.line_num, [row[column].strip() for column in columns]) for row in lines if any(row)]
+    except (csv.Error, IndexError) as error:
+        raise CaptureError(f"{path}: line {lines.line_num} cannot be read: {error}") from error
+    if not rows:
+        raise CaptureError(f"{path}: no frames: nothing follows the line of titles")
+    return _table(path, rows)
+
+
+def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
+    """Rows of the columns `_FIRST` and `_QPOS` with the numbers of their lines, by frame and hand."""
+    frames: dict[str, int] = {}
+    sides: dict[str, int] = {}
+    for number, (frame, _, side, *_) in rows:
+        if side not in SIDES:
+            raise CaptureError(f"{path}: line {number}: {choices(side, SIDES, noun='hand')}")
+        frames.setdefault(frame, len(frames))
+        sides.setdefault(side, len(sides))
+    times = np.full(len(frames), np.nan)
+    qpos = np.full((len(frames), len(sides), len(_QPOS)), np.nan)
+    filled = np.zeros(qpos.shape[:2], dtype=np.bool_)
+    for number, (frame, time, side, *cells) in rows:
+        place = frames[frame], sides[side]
+        if filled[place]:
+            raise CaptureError(f"{path}: line {number} has frame {frame} of the {side} hand again")
+        filled[place] = True
+        try:
+            times[place[0]] = float(time)
+            qpos[place] = [float(cell) if cell else np.nan for cell in cells]
+        except ValueError as error:
+            raise CaptureError(f"{path}: line {number}: {error}") from error
+    return JointTable(cast("tuple[Side, ...]", tuple(sides)), times, qpos)
+
+
+def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is."""
+    hands = motion.hands
+    tables = [_numbers(hand) for hand in hands]
+    row_format = ",%.9g" * len(NUMBERS)
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(",".join([*_FIRST, *NUMBERS]) + "\n")
+        for frame, time in enumerate(motion.times.tolist()):
+            for hand, table in zip(hands, tables, strict=True):
+                row = table[frame]
+                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(NUMBERS)
+                file.write(f"{frame},{time:.9g},{hand.side}{text}\n")
+
+
+def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write the table as Apache Parquet, in the take's axes whatever `up` is."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise HandSimError(".parquet needs pyarrow; run `pip install 'handsim[parquet]'`") from error
+    hands = motion.hands
+    count = len(hands)
+    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(NUMBERS))
+    columns = {
+        "frame": pyarrow.array(np.repeat(np.arange(len(motion.times)), count)),
+        "time_s": pyarrow.array(np.repeat(motion.times, count)),
+        "hand": pyarrow.array([hand.side for hand in hands] * len(motion.times)),
+        **{
+            name: pyarrow.array(np.ascontiguousarray(column), from_pandas=True)  # NaN becomes null
+            for name, column in zip(NUMBERS, numbers.T, strict=True)
+        },
+    }
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        parquet.write_table(pyarrow.table(columns), file)
+
+
+def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
+    """The columns `NUMBERS`; NaN in frames without a pose."""
+    qpos = hand.qpos
+    keypoints = hand_keypoints(hand.model, qpos)[:, 1:].reshape(len(qpos), -1)
+    numbers = np.concatenate([qpos, keypoints], axis=1)
+    numbers[~hand.present] = np.nan
+    return numbers
+
+
+def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write the angles of all hands, in the take's axes whatever `up` is."""
+    hands = motion.hands
+    table = np.concatenate([motion.seconds[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
+    names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
+    header = [
+        as_text(path.stem),
+        "version=1",
+        f"nRows={len(table)}",
+        f"nColumns={table.shape[1]}",
+        "inDegrees=yes",
+        "endheader",
+        "\t".join(names),
+    ]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(header) + "\n")
+        np.savetxt(file, table, fmt="%.9f", delimiter="\t")
+
+
+def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
+    """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
+    qpos = hand.qpos
+    turns = np.unwrap(body_fixed_angles(quaternion_matrix(qpos[:, 3:7])), axis=0)
+    angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
+    coordinates: NDArray[np.float64] = np.concatenate([qpos[:, :3], angles], axis=1)
+    coordinates[~hand.present] = np.nan
+    return coordinates
+
+
+_BVH_ROOT: Final = "world_cm"
+_CENTIMETERS: Final = 100.0
+_ROTATIONS: Final = "Zrotation Yrotation Xrotation"
+_POSITIONS: Final = "Xposition Yposition Zposition"
+
+
+def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write hands and things, of a motion at a steady rate; an `OSError` if the file cannot be written."""
+    turn = file_axes(up)
+    columns = [np.zeros((len(motion.times), 6))]
+    lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
+    for hand in motion.hands:
+        lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
+        columns.append(_hand_columns(hand, turn))
+    for thing in motion.bodies:
+        content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
+        lines += _indented([f"JOINT {_word(thing.name)}", "{", *_indented(content), "}"])
+        poses = thing.T_world_body
+        angles = _degrees(turn @ poses[:, :3, :3] @ turn.T)
+        columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
+    with atomic_write(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.write("HIERARCHY\n" + "\n".join([*lines, "}"]) + "\n")
+        table = np.concatenate(columns, axis=1)
+        file.write(f"MOTION\nFrames: {len(table)}\nFrame Time: {1.0 / motion.rate:.9f}\n")
+        np.savetxt(file, table, fmt="%.6f")
+
+
+def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "T 51"]:
+    """Position of the palm [cm] and rotations of all bones [deg] from the flat hand, in the file's order."""
+    qpos = hand.qpos
+    rest = hand.model.rest_transforms[:, :3, :3]
+    # In BVH all joints have the same axes at rest, here the file's.
+    rotations = turn @ hand.model.forward_kinematics(qpos)[..., :3, :3] @ np.swapaxes(rest, -1, -2) @ turn.T
+    local = local_rotations(rotations)
+    position = _CENTIMETERS * qpos[:, :3] @ turn.T
+    return np.concatenate([position, *(_degrees(local[:, bone]) for bone in _order(PALM))], axis=1)
+
+
+def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) about z, y and x [deg], without jumps from frame to frame."""
+    return np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
+
+
+def _order(bone: int) -> Iterator[int]:
+    """Bones in the order of the file: each before its children."""
+    yield bone
+    for child in CHILDREN[bone]:
+        yield from _order(child)
+
+
+def _bone_lines(model: HandModel, side: str, bone: int, lay: Float[np.ndarray, "3 3"]) -> list[str]:
+    """A bone and its children; `lay` takes the flat hand from the wrist's frame [m] to the file's [cm]."""
+    rest = model.rest_transforms
+    offset = np.zeros(3) if bone == PALM else rest[bone, :3, 3] - rest[BONES[bone].parent, :3, 3]
+    lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(_joint(lay @ offset, moves=bone == PALM))]
+    for child in CHILDREN[bone]:
+        lines += _indented(_bone_lines(model, side, child, lay))
+    if not CHILDREN[bone]:
+        lines += _indented(_end(lay @ (model.skeleton.lengths[bone] * rest[bone, :3, 0])))
+    return [*lines, "}"]
+
+
+def _joint(offset: Float[np.ndarray, "3"], *, moves: bool) -> list[str]:
+    channels = f"CHANNELS 6 {_POSITIONS} {_ROTATIONS}" if moves else f"CHANNELS 3 {_ROTATIONS}"
+    return [_offset(offset), channels]
+
+
+def _end(offset: Float[np.ndarray, "3"]) -> list[str]:
+    return ["End Site", "{", f"\t{_offset(offset)}", "}"]
+
+
+def _offset(offset: Float[np.ndarray, "3"]) -> str:
+    return "OFFSET " + " ".join(f"{value:.6f}" for value in offset.tolist())
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return [f"\t{line}" for line in lines]
+
+
+def _word(name: str) -> str:
+    """A name as one word."""
+    return "".join(one if one.isascii() and one.isalnum() else "_" for one in name) or "thing"
+
+
+OPENXR_JOINTS: Final[tuple[str, ...]] = (
+    "PALM",
+    "WRIST",
+    *(f"THUMB_{part}" for part in ("METACARPAL", "PROXIMAL", "DISTAL", "TIP")),
+    *(
+        f"{digit.upper()}_{part}"
+        for digit in DIGITS[1:]
+        for part in ("METACARPAL", "PROXIMAL", "INTERMEDIATE", "DISTAL", "TIP")
+    ),
+)
+"""The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
+OPENXR_SUFFIX: Final = ".openxr.json"
+_CARPUS: Final = 0.38
+_MIDDLE: Final = 2  # of the digits
+_AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
+
+
+def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write the joints of all hands as JSON, by custom to a name that ends in `.openxr.json`."""
+    tracks = motion.hands
+    header = {
+        "format": "XR_EXT_hand_tracking joints by handsim",
+        "schema": 1,
+        "units": {"position": "m", "orientation": "xyzw", "radius": "m", "time": "s"},
+        "axes": "x right, y up, -z forward",
+        "pose": ["x", "y", "z", "qx", "qy", "qz", "qw"],
+        "rate": motion.rate,
+        "joints": OPENXR_JOINTS,
+        "radius": {hand.side: np.round(joint_radii(hand.model), 7).tolist() for hand in tracks},
+    }
+    poses = [_pose_rows(hand, file_axes(up)) for hand in tracks]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(json.dumps(header, indent=1)[:-2] + ',\n "frames": [')
+        for frame, time in enumerate(motion.times.tolist()):
+            hands = {
+                hand.side: rows[frame].tolist() if hand.present[frame] else None
+                for hand, rows in zip(tracks, poses, strict=True)
+            }
+            file.write((",\n" if frame else "\n") + json.dumps({"time": time, "hands": hands}))
+        file.write("\n ]\n}\n")
+
+
+def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:
+    """`T_world_joint` of OpenXR's joints, in our world [m]."""
+    bones = model.forward_kinematics(qpos)
+    poses = np.empty((len(bones), len(OPENXR_JOINTS), 4, 4))
+    number = 2
+    in_palm = _palm_joints(model)
+    poses[:, :2] = bones[:, PALM, None] @ in_palm[:2]
+    for digit, name in enumerate(DIGITS):
+        first, second, third = bones_of(name)
+        if digit:
+            poses[:, number] = bones[:, PALM] @ in_palm[1 + digit]
+            number += 1
+        tip = np.eye(4)
+        tip[0, 3] = model.skeleton.lengths[third]
+        ends = (bones[:, first], bones[:, second], bones[:, third], bones[:, third] @ tip)
+        for offset, end in enumerate(ends):
+            poses[:, number + offset] = end
+            poses[:, number + offset, :3, :3] = end[:, :3, :3] @ _AXES
+        number += 4
+    return poses
+
+
+def joint_radii(model: HandModel) -> Float[np.ndarray, "26"]:
+    """Distance from each joint to the skin [m]: of the digits their girths', elsewhere half the palm."""
+    shape, palm = model.shape, 0.5 * model.shape.palm_thickness
+    fingers = [radius for row in shape.radii[1:].tolist() for radius in (palm, *row)]
+    return np.array([palm, palm, *shape.radii[0].tolist(), *fingers])
+
+
+def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
+    """`T_wrist_joint` of palm, wrist and the four finger metacarpals."""
+    knuckles = np.array([model.skeleton.offsets[bones_of(digit)[0]] for digit in DIGITS[1:]])
+    bases = _CARPUS * knuckles
+    middle = _MIDDLE - 1
+    starts = [0.5 * (bases[middle] + knuckles[middle]), np.zeros(3), *bases]
+    ways = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]
+    joints = np.tile(np.eye(4), (len(starts), 1, 1))
+    for joint, start, way in zip(joints, starts, ways, strict=True):
+        along = way / np.linalg.norm(way)
+        back = np.array([0.0, 0.0, 1.0]) - along[2] * along
+        back /= np.linalg.norm(back)
+        joint[:3, :3] = np.stack([along, np.cross(back, along), back], axis=1) @ _AXES
+        joint[:3, 3] = start
+    return joints
+
+
+def _pose_rows(hand: PosedHand, turn: NDArray[np.float64]) -> Float[np.ndarray, "T 26 7"]:
+    """Positions and quaternions (xyzw) in the file's axes."""
+    poses = joint_poses(hand.model, hand.qpos)
+    quaternions = smooth_quaternions(turn @ poses[..., :3, :3])
+    rows = np.concatenate([poses[..., :3, 3] @ turn.T, np.roll(quaternions, -1, axis=-1)], axis=-1)
+    return np.round(rows, 8)

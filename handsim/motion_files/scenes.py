@@ -42,9 +42,6 @@ from handsim.motion_files.motion import (
     corner_normals,
     file_axes,
     local_rotations,
-    posed_bodies,
-    posed_hands,
-    seconds_of,
     smooth_quaternions,
     split_vertices,
 )
@@ -61,12 +58,7 @@ _MOST: Final = (1 << 32) - 1  # bytes that the header can state
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things; a motion of one frame is written as a pose, without an animation.
-
-    Raises:
-        OSError: The file cannot be written.
-        ArgumentError: The file would be larger than a .glb can be.
-    """
+    """Write hands and things; a motion of one frame is written as a pose, without an animation."""
     content = _Scene(motion, up).pack()
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -76,7 +68,7 @@ class _Scene:
     """The document while it grows."""
 
     def __init__(self, motion: Motion, up: UpAxis) -> None:
-        self._times = seconds_of(motion)
+        self._times = motion.seconds
         self._buffer = GlbBuffer()
         self._meshes: list[dict[str, Any]] = []
         self._skins: list[dict[str, Any]] = []
@@ -88,9 +80,9 @@ class _Scene:
         self._seconds = (
             self._buffer.add(self._times.astype("<f4"), bounds=True) if len(self._times) > 1 else None
         )
-        for hand in posed_hands(motion):
+        for hand in motion.hands:
             self._add_hand(hand)
-        for thing in posed_bodies(motion):
+        for thing in motion.bodies:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
@@ -241,14 +233,7 @@ class GlbBuffer:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: NDArray[Any], *, target: Target | None = None, bounds: bool = False) -> int:
-        """Add an array and return the index of its accessor.
-
-        Args:
-            array: Entries along the first axis: numbers, vectors or matrices (4, 4), of unsigned bytes or
-                words, or of float32.
-            target: What a graphics card uses it for.
-            bounds: Whether its least and greatest values are stated, as for positions and times.
-        """
+        """Add an array and return the index of its accessor."""
         content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # by columns
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": content.nbytes}
         if target is not None:
@@ -268,11 +253,7 @@ class GlbBuffer:
         return len(self._accessors) - 1
 
     def pack(self, document: dict[str, Any]) -> bytes:
-        """The whole file.
-
-        Args:
-            document: The JSON without buffers, views and accessors.
-        """
+        """The whole file."""
         arrays = {"buffers": [{"byteLength": self._size}], "bufferViews": self._views}
         text = json.dumps(
             {**document, **arrays, "accessors": self._accessors}, separators=(",", ":"), allow_nan=False
@@ -294,12 +275,7 @@ _AROUND: Final = 0.03  # [m] of skin around keypoints
 
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things.
-
-    Raises:
-        OSError: The file cannot be written.
-        HandSimError: usd-core is not installed.
-    """
+    """Write hands and things."""
     try:
         from pxr import Tf, Usd, UsdGeom
     except ImportError as error:
@@ -307,15 +283,15 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    codes = np.round(seconds_of(motion) * motion.rate, 6)  # whole ones at a steady rate
+    codes = np.round(motion.seconds * motion.rate, 6)  # whole ones at a steady rate
     stage.SetTimeCodesPerSecond(motion.rate)
     stage.SetFramesPerSecond(motion.rate)
     stage.SetStartTimeCode(0.0)
     stage.SetEndTimeCode(float(codes[-1]))
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/hands").GetPrim())
-    for hand in posed_hands(motion):
+    for hand in motion.hands:
         _add_hand(stage, hand, codes)
-    for number, thing in enumerate(posed_bodies(motion)):
+    for number, thing in enumerate(motion.bodies):
         _add_thing(stage, thing, number, codes)
     with atomic_write(path) as temporary, plain_path(temporary) as plain:
         try:

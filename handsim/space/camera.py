@@ -393,12 +393,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarra
 def pinhole(
     name: str, size: tuple[int, int], focal: float, center: tuple[float, float] | None = None
 ) -> Camera:
-    """A camera without distortion.
-
-    Args:
-        focal: Focal length [px].
-        center: Principal point [px]; the picture's center when not given.
-    """
+    """A camera without distortion."""
     x, y = (size[0] / 2, size[1] / 2) if center is None else center
     return Camera(name, size, camera_matrix(focal, focal, x, y))
 
@@ -469,10 +464,7 @@ def points_in_view(
 
 @kernel(inline=True)
 def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
-    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture.
-
-    The camera is its rows of `CameraArrays`: intrinsics, sizes and lenses.
-    """
+    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture."""
     u, v = x / z, y / z
     if lens[0] != PINHOLE:  # the call costs more than all the rest
         u, v = distort_ray(lens, x, y, z)
@@ -519,11 +511,7 @@ PRESETS: Final = tuple(_presets())
 
 
 def preset(name: str) -> Camera:
-    """One of the cameras that come with the package, at the world's origin.
-
-    Raises:
-        ArgumentError: There is no camera of that name.
-    """
+    """One of the cameras that come with the package, at the world's origin."""
     cameras = _presets()
     check_choice(name, cameras, noun="camera")
     return cameras[name]

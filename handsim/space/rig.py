@@ -93,11 +93,7 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
 
 
 def check_names(owner: str, cameras: Sequence[Camera]) -> None:
-    """Refuse two cameras of one name, and names that cannot be part of a file's.
-
-    Raises:
-        RigError: There are such.
-    """
+    """Refuse two cameras of one name, and names that cannot be part of a file's."""
     names = [camera.name for camera in cameras]
     for name in names:
         if not _NAME.fullmatch(name):
@@ -350,20 +346,12 @@ def list_rigs() -> tuple[str, ...]:
 
 
 def named_rig(name: str) -> CameraRig:
-    """A rig that comes with the package: `figure5` (sixteen cameras, as in the paper), `eight` or `six`.
-
-    Raises:
-        ArgumentError: There is no rig of that name.
-    """
+    """A rig that comes with the package: `figure5` (sixteen cameras, as in the paper), `eight` or `six`."""
     return _read(_shipped(name))
 
 
 def rig_description(name: str) -> str:
-    """What a rig that comes with the package is, in one sentence.
-
-    Raises:
-        ArgumentError: There is no rig of that name.
-    """
+    """What a rig that comes with the package is, in one sentence."""
     return read_rig_file(_shipped(name)).description
 
 
@@ -393,12 +381,7 @@ def load_rig(rig: CameraRig | str | Path) -> CameraRig:
 
 
 def as_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
-    """The rig of whatever stands for one: as `load_rig`, and the record of one (`CameraRig.record`).
-
-    Raises:
-        ArgumentError: It is nothing of these.
-        RigError: There is no such rig, or it cannot be one.
-    """
+    """The rig of whatever stands for one: as `load_rig`, and the record of one (`CameraRig.record`)."""
     if not isinstance(rig, Mapping):
         return load_rig(rig)
     try:
@@ -410,11 +393,7 @@ def as_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
 
 
 def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[str, Any]:
-    """What stands for a rig in settings: its name if it comes with the package, else its cameras.
-
-    Raises:
-        RigError: As `as_rig`.
-    """
+    """What stands for a rig in settings: its name if it comes with the package, else its cameras."""
     found = as_rig(rig)
     return found.name if found.name in list_rigs() and found == named_rig(found.name) else found.record()
 
@@ -457,11 +436,7 @@ def distances_to_volume(
 
 
 def check_outside_volume(rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float) -> None:
-    """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
-
-    Raises:
-        ArgumentError: A camera is nearer to the cube than hands reach.
-    """
+    """Refuse a rig with a camera inside or near the cube that wrists move in."""
     distances = distances_to_volume(rig, center, half_side)
     if distances.min() < HAND_REACH:
         raise ArgumentError(

@@ -68,42 +68,45 @@ class Skipped(NamedTuple):
     why: str
 
 
-def attribute_numbers(element: ET.Element, key: str, count: int, owner: str) -> tuple[float, ...]:
-    """The numbers of an attribute, parted by spaces."""
-    text = element.get(key)
-    if text is None:
-        raise RigError(f"{owner} lacks {key}")
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, HandSimWarning, stacklevel=4)
+
+
+class _Element(NamedTuple):
+    """An element of XML with the words that messages call its camera."""
+
+    element: ET.Element
+    owner: str
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """The numbers of an attribute, separated by spaces."""
+        text = self.element.get(key)
+        if text is None:
+            raise RigError(f"{self.owner} lacks {key}")
+        values = _words_numbers(text.split())
+        if len(values) != count or not all(abs(value) < _LARGEST for value in values):  # never so for NaN
+            expected = "a finite number" if count == 1 else f"{count} finite numbers"
+            raise RigError(f"{self.owner}: {key} is {shown(text)}, expected {expected}")
+        return values
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """The number of an attribute; `default`, unless None, where it is missing."""
+        return self.numbers(key, 1)[0] if default is None or key in self.element.attrib else default
+
+    def child(self, tag: str) -> _Element:
+        """The first child of a tag."""
+        found = self.element.find(tag)
+        if found is None:
+            raise RigError(f"{self.owner} lacks <{tag}>")
+        return _Element(found, self.owner)
+
+
+def _words_numbers(words: list[str]) -> tuple[float, ...]:
+    """Words as numbers; none where a word is not one."""
     try:
-        values = tuple(float(word) for word in text.split())
+        return tuple(float(word) for word in words)
     except ValueError:
-        values = ()
-    if len(values) != count or not all(abs(value) < _LARGEST for value in values):  # never so for NaN
-        expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise RigError(f"{owner}: {key} is {shown(text)}, expected {expected}")
-    return values
-
-
-def attribute_number(element: ET.Element, key: str, owner: str, default: float | None = None) -> float:
-    """The number of an attribute; `default`, unless None, where it is missing.
-
-    Raises:
-        RigError: It is missing without a default, or not a finite number.
-    """
-    if default is not None and element.get(key) is None:
-        return default
-    return attribute_numbers(element, key, 1, owner)[0]
-
-
-def child(element: ET.Element, tag: str, owner: str) -> ET.Element:
-    """The first child of a tag.
-
-    Raises:
-        RigError: There is none.
-    """
-    found = element.find(tag)
-    if found is None:
-        raise RigError(f"{owner} lacks <{tag}>")
-    return found
+        return ()
 
 
 def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
@@ -113,9 +116,7 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def checked_matrix(
-    owner: str, focal: tuple[float, float], center: tuple[float, float]
-) -> Float[np.ndarray, "3 3"]:
+def checked_matrix(owner: str, focal: Sequence[float], center: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """K of focal lengths and a principal point [px]."""
     if not min(focal) > 0.0:
         raise RigError(
@@ -160,11 +161,6 @@ _MOST_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these fil
 _MOST_ELEMENTS: Final = 200_000
 _DEEPEST: Final = 64
 _DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
-_MARKS: Final = (
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-)
 
 
 class _Refused(Exception):
@@ -185,13 +181,14 @@ def read_xml(path: Path) -> ET.Element:
 
 def _decoded(path: Path, data: bytes) -> str:
     """The text without its declaration, whose encoding some programs state wrongly."""
-    mark, encoding = next((pair for pair in _MARKS if data.startswith(pair[0])), (b"", ""))
-    if not encoding:
-        encoding = {b"<\0": "utf-16-le", b"\0<": "utf-16-be"}.get(data[:2], "utf-8")
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    else:
+        encoding = {b"<\0": "utf-16-le", b"\0<": "utf-16-be"}.get(data[:2], "utf-8-sig")
     try:
-        text = data[len(mark) :].decode(encoding)
+        text = data.decode(encoding)
     except UnicodeDecodeError as error:
-        if encoding != "utf-8" or not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
+        if encoding != "utf-8-sig" or not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
             raise RigError(f"{path}: not a calibration: it is no XML text") from error
         text = data.decode("latin-1")
     return _DECLARATION.sub("", text, count=1)
@@ -226,58 +223,51 @@ def _parsed(text: str) -> ET.Element:
     return builder.close()
 
 
-_VICON: Final = "Cameras"
 _MILLIMETER: Final = 1e-3
 _STRONGEST: Final = 0.5  # of a corner's distance; no lens moves it farther
 _SAMPLES: Final = 256
 _VIDEO: Final = ("vue", "videoinputdevice")
+_PARTS: Final = 64.0  # Qualisys' counts of a pixel
+_TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
+_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
+_COLOR: Final = "30"  # `ImagerIndex` of Motive's color cameras
 
 
 def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
-    """The camera of an element; a `RigError` where a value is missing or cannot be."""
     device = entry.get("DEVICEID") or entry.get("USERID") or str(number)
     owner = f"camera {shown(device)}"
     frames = entry.findall("KeyFrames/KeyFrame")
     if not frames:
         return Skipped(device, "is not calibrated")
     if len(frames) > 1:
-        told = f"{owner} moves: it has {len(frames)} key frames, of which the first is taken"
-        warnings.warn(told, HandSimWarning, stacklevel=2)
-    frame = frames[0]
-    size = picture_size(owner, *attribute_numbers(entry, "SENSOR_SIZE", 2, owner))
-    focal = attribute_number(frame, "FOCAL_LENGTH", owner)
-    aspect = attribute_number(entry, "PIXEL_ASPECT_RATIO", owner, 1.0)
+        _warn(f"{owner} moves: it has {len(frames)} key frames, of which the first is taken")
+    outer, frame = _Element(entry, owner), _Element(frames[0], owner)
+    size = picture_size(owner, *outer.numbers("SENSOR_SIZE", 2))
+    focal, aspect = frame.number("FOCAL_LENGTH"), outer.number("PIXEL_ASPECT_RATIO", 1.0)
     if not aspect > 0.0:
         raise RigError(f"{owner}: PIXEL_ASPECT_RATIO is {aspect:g}, expected a positive number")
-    center = attribute_numbers(frame, "PRINCIPAL_POINT", 2, owner)
-    K = checked_matrix(owner, (focal, focal / aspect), (center[0], center[1]))
-    kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
-    video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
-    camera = Camera(device, size, K, _vicon_pose(frame, owner), _vicon_lens(frame, owner, size, K))
-    return LabCamera(camera, video=video)
-
-
-def _vicon_pose(frame: ET.Element, owner: str) -> NDArray[np.float64]:
-    x, y, z, w = attribute_numbers(frame, "ORIENTATION", 4, owner)
+    K = checked_matrix(owner, (focal, focal / aspect), frame.numbers("PRINCIPAL_POINT", 2))
+    x, y, z, w = frame.numbers("ORIENTATION", 4)
     quaternion = np.array([w, x, y, z])
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1.0) > 1e-2:
         raise RigError(f"{owner}: ORIENTATION is a quaternion of length {length:.4g}, expected 1")
-    position = np.array(attribute_numbers(frame, "POSITION", 3, owner))
-    return rigid(quaternion_matrix(quaternion).T, _MILLIMETER * position)
+    pose = rigid(quaternion_matrix(quaternion).T, _MILLIMETER * np.array(frame.numbers("POSITION", 3)))
+    kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
+    video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
+    return LabCamera(Camera(device, size, K, pose, _vicon_lens(frame, size, K)), video=video)
 
 
-def _vicon_lens(frame: ET.Element, owner: str, size: tuple[int, int], K: NDArray[np.float64]) -> Lens:
+def _vicon_lens(frame: _Element, size: tuple[int, int], K: NDArray[np.float64]) -> Lens:
     """Our lens bends where Vicon's straightens; the inverse is fitted over the picture."""
-    straighten = _coefficients(frame, owner)
+    straighten = _vicon_coefficients(frame)
     if not any(straighten):
         return Lens()
     corner = float(np.hypot(*np.maximum(K[:2, 2], size - K[:2, 2])))  # [px]
     measured = np.linspace(0.0, corner, _SAMPLES + 1)[1:]
     factor = 1.0 + sum(k * measured ** (2 * n) for n, k in enumerate(straighten, 1))
     if not np.abs(factor - 1.0).max() < _STRONGEST:
-        told = f"{owner}: its lens would move a corner by more than half its distance; it is left out"
-        warnings.warn(told, HandSimWarning, stacklevel=2)
+        _warn(f"{frame.owner}: its lens would move a corner by more than half its distance; it is left out")
         return Lens()
     straight = measured * factor / K[0, 0]  # [focal lengths]
     powers = straight[:, None] ** np.array([2, 4, 6])
@@ -286,106 +276,81 @@ def _vicon_lens(frame: ET.Element, owner: str, size: tuple[int, int], K: NDArray
     return Lens("brown", (k1, k2, 0.0, 0.0, k3))
 
 
-def _coefficients(frame: ET.Element, owner: str) -> tuple[float, ...]:
+def _vicon_coefficients(frame: _Element) -> tuple[float, ...]:
     """k1, k2, ... [1/px^2, 1/px^4, ...]; of the newer form they follow a name and a center."""
-    words = (frame.get("VICON_RADIAL2") or "").split()
+    words = (frame.element.get("VICON_RADIAL2") or "").split()
     if words and len(words) != 6:
-        raise RigError(f"{owner}: VICON_RADIAL2 has {len(words)} words, expected a name and five numbers")
+        raise RigError(
+            f"{frame.owner}: VICON_RADIAL2 has {len(words)} words, expected a name and five numbers"
+        )
     if words:
         newer = ET.Element("KeyFrame", {"VICON_RADIAL2": " ".join(words[1:])})
-        return attribute_numbers(newer, "VICON_RADIAL2", 5, owner)[2:]
-    return attribute_numbers(frame, "VICON_RADIAL", 2, owner) if frame.get("VICON_RADIAL") else ()
-
-
-_QUALISYS: Final = "calibration"
-_PARTS: Final = 64.0  # of a pixel
-_SIDES: Final = ("left", "top", "right", "bottom")
-_TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
+        return _Element(newer, frame.owner).numbers("VICON_RADIAL2", 5)[2:]
+    return frame.numbers("VICON_RADIAL", 2) if frame.element.get("VICON_RADIAL") else ()
 
 
 def _qualisys_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
-    """The camera of an element; a `RigError` where a value is missing or cannot be."""
     serial = entry.get("serial") or str(number)
-    owner = f"camera {shown(serial)}"
-    if entry.get("active", "1").lower() in ("0", "false"):
-        return Skipped(serial, "is switched off")
-    if entry.get("calibrated", "true").lower() in ("0", "false"):
-        return Skipped(serial, "is not calibrated")
+    camera = _Element(entry, f"camera {shown(serial)}")
+    for key, why in (("active", "is switched off"), ("calibrated", "is not calibrated")):
+        if entry.get(key, "1").lower() in ("0", "false"):
+            return Skipped(serial, why)
     video = any(word in entry.get("model", "").lower() for word in ("video", "hybrid"))
-    inner, view = child(entry, "intrinsic", owner), "fov_video" if video else "fov_marker"
-    left, top, right, bottom = _sides(entry, view, owner)
-    size = picture_size(owner, right - left + 1, bottom - top + 1)
-    scale = 1.0 / (_PARTS * _binning(entry, view, inner, owner))
-    u, v = (attribute_number(inner, f"centerPoint{axis}", owner) * scale for axis in "UV")
-    focal = tuple(attribute_number(inner, f"focalLength{axis}", owner) * scale for axis in "UV")
-    K = checked_matrix(owner, (focal[0], focal[1]), (u - left, v - top))
-    place = child(entry, "transform", owner)
-    rows = [[attribute_number(place, f"r{i}{j}", owner) for j in (1, 2, 3)] for i in (1, 2, 3)]
-    axes = nearest_rotation(f"{owner}: the matrix r11 to r33", np.array(rows))
-    position = np.array([attribute_number(place, axis, owner) for axis in "xyz"])
+    inner, place = camera.child("intrinsic"), camera.child("transform")
+    view, other = ("fov_video", "fov_marker") if video else ("fov_marker", "fov_video")
+    area = camera.child(view if entry.find(view) is not None else other)
+    left, top, right, bottom = (area.number(side) for side in ("left", "top", "right", "bottom"))
+    if right <= left or bottom <= top:
+        raise RigError(
+            f"{camera.owner}: <{area.element.tag}> is empty, expected left < right and top < bottom"
+        )
+    size = picture_size(camera.owner, right - left + 1, bottom - top + 1)
+    scale = 1.0 / (_PARTS * _binning(camera, view, inner))
+    u, v = (inner.number(f"centerPoint{axis}") * scale for axis in "UV")
+    fx, fy = (inner.number(f"focalLength{axis}") * scale for axis in "UV")
+    K = checked_matrix(camera.owner, (fx, fy), (u - left, v - top))
+    rows = [[place.number(f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)]
+    axes = nearest_rotation(f"{camera.owner}: the matrix r11 to r33", np.array(rows))
+    position = np.array([place.number(axis) for axis in "xyz"])
+    k1, k2, k3 = (inner.number(f"radialDistortion{n}", 0.0) for n in (1, 2, 3))
+    p1, p2 = (inner.number(f"tangentalDistortion{n}", 0.0) for n in (1, 2))
     pose = rigid(axes.T @ _TO_OPENCV, _MILLIMETER * position)
-    return LabCamera(Camera(serial, size, K, pose, _qualisys_lens(inner, owner)), video=video)
+    return LabCamera(Camera(serial, size, K, pose, brown_lens(k1, k2, p1, p2, k3)), video=video)
 
 
-def _sides(entry: ET.Element, view: str, owner: str) -> tuple[float, ...]:
-    """The part of the sensor that is used: its first and last columns and rows [px]."""
-    found = entry.find(view)
-    if found is None:
-        found = child(entry, "fov_video" if view == "fov_marker" else "fov_marker", owner)
-    sides = tuple(attribute_number(found, side, owner) for side in _SIDES)
-    if sides[2] <= sides[0] or sides[3] <= sides[1]:
-        raise RigError(f"{owner}: <{found.tag}> is empty, expected left < right and top < bottom")
-    return sides
-
-
-def _binning(entry: ET.Element, view: str, inner: ET.Element, owner: str) -> int:
+def _binning(camera: _Element, view: str, inner: _Element) -> int:
     """How many pixels of the sensor, each way, are one of the picture."""
-    whole = entry.find(f"{view}_max")
-    if whole is None:
+    if camera.element.find(f"{view}_max") is None:
         return 1
-    width = attribute_number(whole, "right", owner) - attribute_number(whole, "left", owner) + 1
-    span = attribute_number(inner, "sensorMaxU", owner, 0.0) - attribute_number(
-        inner, "sensorMinU", owner, 0.0
-    )
+    whole = camera.child(f"{view}_max")
+    width = whole.number("right") - whole.number("left") + 1
+    span = inner.number("sensorMaxU", 0.0) - inner.number("sensorMinU", 0.0)
     return max(1, round(span / _PARTS / width)) if width > 0 else 1
 
 
-def _qualisys_lens(inner: ET.Element, owner: str) -> Lens:
-    k1, k2, k3 = (attribute_number(inner, f"radialDistortion{n}", owner, 0.0) for n in (1, 2, 3))
-    p1, p2 = (attribute_number(inner, f"tangentalDistortion{n}", owner, 0.0) for n in (1, 2))
-    return brown_lens(k1, k2, p1, p2, k3)
-
-
-_MOTIVE: Final = "calibrationProfile"
-_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
-_COLOR: Final = "30"
-"""`ImagerIndex` of color cameras."""
-
-
 def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
-    """The camera of an element; a `RigError` where a value is missing or cannot be."""
     serial = entry.get("Serial") or str(number)
-    owner = f"camera {shown(serial)}"
-    properties, outer = entry.find("Properties"), entry.find("Extrinsic")
-    if properties is not None and properties.get("Enabled") == "0":
+    camera = _Element(entry, f"camera {shown(serial)}")
+    properties = entry.find("Properties")
+    own = {} if properties is None else properties.attrib
+    if own.get("Enabled") == "0":
         return Skipped(serial, "is switched off")
-    standard = entry.find("IntrinsicStandardCameraModel")
-    inner = entry.find("Intrinsic") if standard is None else standard
-    if outer is None or inner is None:
+    standard = entry.find("IntrinsicStandardCameraModel") is not None
+    lens = "IntrinsicStandardCameraModel" if standard else "Intrinsic"
+    if entry.find("Extrinsic") is None or entry.find(lens) is None:
         return Skipped(serial, "is not calibrated")
-    color = serial.startswith("C") or (properties is not None and properties.get("ImagerIndex") == _COLOR)
-    imager = child(entry, "Attributes", owner)
-    sides = (attribute_number(imager, f"ImagerPixel{side}", owner) for side in ("Width", "Height"))
-    size = picture_size(owner, *sides)
-    focal = tuple(attribute_number(inner, f"{way}FocalLength", owner) for way in ("Horizontal", "Vertical"))
-    center = tuple(attribute_number(inner, f"LensCenter{axis}", owner) for axis in "XY")
-    K = checked_matrix(owner, (focal[0], focal[1]), (center[0], center[1]))
-    numbers = [attribute_number(outer, f"OrientMatrix{n}", owner) for n in range(9)]
-    axes = nearest_rotation(f"{owner}: OrientMatrix", np.array(numbers).reshape(3, 3))
-    position = np.array([attribute_number(outer, axis, owner) for axis in "XYZ"])
-    bends = [] if standard is None else [attribute_number(standard, key, owner, 0.0) for key in _MOTIVE_LENS]
-    camera = Camera(serial, size, K, rigid(axes @ _TO_OPENCV, position), brown_lens(*bends))
-    return LabCamera(camera, video=color, y_up=True)
+    imager, outer, inner = (camera.child(tag) for tag in ("Attributes", "Extrinsic", lens))
+    size = picture_size(camera.owner, *(imager.number(f"ImagerPixel{side}") for side in ("Width", "Height")))
+    fx, fy = (inner.number(f"{way}FocalLength") for way in ("Horizontal", "Vertical"))
+    cx, cy = (inner.number(f"LensCenter{axis}") for axis in "XY")
+    K = checked_matrix(camera.owner, (fx, fy), (cx, cy))
+    matrix = np.array([outer.number(f"OrientMatrix{n}") for n in range(9)]).reshape(3, 3)
+    axes = nearest_rotation(f"{camera.owner}: OrientMatrix", matrix)
+    position = np.array([outer.number(axis) for axis in "XYZ"])
+    bends = [inner.number(key, 0.0) for key in _MOTIVE_LENS] if standard else []
+    video = serial.startswith("C") or own.get("ImagerIndex") == _COLOR
+    pose = rigid(axes @ _TO_OPENCV, position)
+    return LabCamera(Camera(serial, size, K, pose, brown_lens(*bends)), video=video, y_up=True)
 
 
 CAMERAS: Final = "cameras.txt"
@@ -407,13 +372,7 @@ _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
-    """A camera for each image of a reconstruction in meters, called after it.
-
-    `path` is the folder of `cameras.txt` and `images.txt`, or one of the two.
-
-    Raises:
-        RigError: A file is missing or damaged, or a model is one that we do not have.
-    """
+    """A camera for each image of a reconstruction in meters, called after it."""
     folder = path if path.is_dir() else path.parent
     lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
     lines = _colmap_lines(folder / IMAGES, keep_empty=True)
@@ -608,8 +567,9 @@ def _camera(
 
 def _stereo(values: Values) -> list[Camera]:
     """R and T take the first camera's coordinates to the second's."""
-    first = _pose(_without_pair(values))
-    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), _translation(values, "T")))
+    first, shift = _own_pose(values), np.array(_value_numbers(values, "T", (3,)))
+    _check_baseline(shift)
+    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), shift))
     return [
         _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
         for name, number, pose in (("left", 1, first), ("right", 2, second))
@@ -618,7 +578,7 @@ def _stereo(values: Values) -> list[Camera]:
 
 def _rectified(values: Values) -> list[Camera]:
     """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
-    first, cameras = _pose(_without_pair(values)), []
+    first, cameras = _own_pose(values), []
     for name, key in (("left", "P1"), ("right", "P2")):
         P = _matrix(values, (key,), (3, 4))
         if not np.linalg.det(P[:, :3]):
@@ -628,10 +588,6 @@ def _rectified(values: Values) -> list[Camera]:
         pose = first @ np.linalg.inv(rigid(np.eye(3), shift))
         cameras.append(Camera(name, _size(values), _from_corner(P[:, :3]), pose))
     return cameras
-
-
-def _without_pair(values: Values) -> Values:
-    return {key: value for key, value in values.items() if key not in (*_R, *_T)}
 
 
 def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -674,13 +630,16 @@ def _size(values: Values) -> tuple[int, int]:
 
 def _pose(values: Values) -> NDArray[np.float64]:
     """`T_world_camera`, or the inverse of the extrinsics R and T; without them the camera is the world."""
-    if "T_world_camera" in values:
-        return _matrix(values, ("T_world_camera",), (4, 4))
     R, T = _find(values, _R), _find(values, _T)
-    if R is not None or T is not None:
-        outer = rigid(_rotation(values, R or "R"), _translation(values, T or "T", longest=None))
+    if "T_world_camera" not in values and (R is not None or T is not None):
+        outer = rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
         return np.linalg.inv(outer).astype(np.float64)
-    return np.eye(4)
+    return _own_pose(values)
+
+
+def _own_pose(values: Values) -> NDArray[np.float64]:
+    """`T_world_camera`; without it the camera is the world."""
+    return _matrix(values, ("T_world_camera",), (4, 4)) if "T_world_camera" in values else np.eye(4)
 
 
 def _rotation(values: Values, key: str) -> NDArray[np.float64]:
@@ -692,15 +651,6 @@ def _rotation(values: Values, key: str) -> NDArray[np.float64]:
     if given.size != 9:
         raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
     return nearest_rotation(key, given.reshape(3, 3))
-
-
-def _translation(
-    values: Values, key: str, *, longest: float | None = _LONGEST_BASELINE
-) -> NDArray[np.float64]:
-    vector = np.array(_value_numbers(values, key, (3,)))
-    if longest is not None:
-        _check_baseline(vector)
-    return vector
 
 
 def _check_baseline(vector: NDArray[np.float64]) -> None:
@@ -784,7 +734,12 @@ def _yaml_value(body: str) -> tuple[float, ...] | str:
     body = body.strip()
     data = _DATA.search(body)
     words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
-    return _as_numbers(words) or body.strip("\"' ")
+    return _few_numbers(words) or body.strip("\"' ")
+
+
+def _few_numbers(words: list[str]) -> tuple[float, ...]:
+    """Words as numbers; none where a word is not one, or there are too many."""
+    return _words_numbers(words) if len(words) <= _MOST_NUMBERS else ()
 
 
 def _json_values(table: Mapping[str, object]) -> Values:
@@ -818,15 +773,7 @@ def _json_value(value: object) -> tuple[float, ...] | str:
             waiting[:0] = first[: _MOST_NUMBERS + 1]
         else:
             words.append(str(float(first) if isinstance(first, bool) else first))
-    return _as_numbers(words) or str(value)[:80]
-
-
-def _as_numbers(words: list[str]) -> tuple[float, ...]:
-    """Numbers; none where a word is not one, or there are too many."""
-    try:
-        return tuple(float(word) for word in words) if len(words) <= _MOST_NUMBERS else ()
-    except ValueError:
-        return ()
+    return _few_numbers(words) or str(value)[:80]
 
 
 Up = Literal["y", "z"]
@@ -836,9 +783,9 @@ _LEVEL: Final = 0.3  # least share of the cameras' tops, on average, along the a
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")
 _READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
-    _VICON: ("Camera", _vicon_camera),
-    _QUALISYS: ("camera", _qualisys_camera),
-    _MOTIVE: ("Camera", _motive_camera),
+    "Cameras": ("Camera", _vicon_camera),
+    "calibration": ("camera", _qualisys_camera),
+    "calibrationProfile": ("Camera", _motive_camera),
 }
 """Of the element that a calibration begins with: those of its cameras, and what reads one."""
 _CLOSED: Final = {
@@ -849,52 +796,26 @@ _CLOSED: Final = {
 
 
 def load_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a file, by its ending.
-
-    Args:
-        path: A camera or rig file of ours (`.toml`), Vicon's `.xcp`, Qualisys' calibration (`.xml`, `.txt`),
-            Motive's `.mcal`, OpenCV's calibration (`.yml`, `.yaml`, `.json`), or COLMAP's `cameras.txt`,
-            `images.txt` or their folder.
-
-    Returns:
-        Cameras with intrinsics [px], lenses and poses in the file's world [m].
-
-    Raises:
-        RigError: The file cannot be read, or does not describe cameras; the sentence names it.
-    """
+    """The cameras of a file, by its ending."""
     return tuple(one.camera for one in load_lab_cameras(path))
 
 
 def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]:
-    """The cameras of a calibration that see markers, in a world with z up.
-
-    Those that take pictures are left out where there are others, and named in a warning.
-
-    Args:
-        path: As for `load_cameras`.
-        up: The axis that points up in the file; when not given y where its format says so, else z.
-
-    Raises:
-        RigError: As `load_cameras`; or no camera is calibrated.
-    """
+    """The cameras of a calibration that see markers, in a world with z up."""
     found = load_lab_cameras(path)
     seeing = [one for one in found if not one.video] or list(found)
     if len(seeing) < len(found):
         named = ", ".join(one.camera.name for one in found if one.video)
-        _tell(f"{path}: video cameras see no markers and are left out: {named}")
+        _warn(f"{path}: video cameras see no markers and are left out: {named}")
     axis = up or ("y" if all(one.y_up for one in seeing) else "z")
     turn = _Y_TO_Z if axis == "y" else np.eye(4)
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
     if -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _LEVEL:
-        _tell(
+        _warn(
             f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
             "another axis up? --up says which"
         )
     return cameras
-
-
-def _tell(sentence: str) -> None:
-    warnings.warn(sentence, HandSimWarning, stacklevel=3)
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:

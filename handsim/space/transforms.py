@@ -77,10 +77,7 @@ def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
 
 
 def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
-    """Angles (T, 3) [rad] with which `euler_matrix` makes these rotations: yaw, pitch, roll.
-
-    Where the pitch is a right angle, only a sum or difference of the others counts, and the yaw is zero.
-    """
+    """Angles (T, 3) [rad] with which `euler_matrix` makes these rotations: yaw, pitch, roll."""
     flat = np.hypot(rotations[:, 0, 0], rotations[:, 1, 0])
     pitch = np.arctan2(-rotations[:, 2, 0], flat)
     locked = flat < 1e-9

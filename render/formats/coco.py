@@ -32,6 +32,7 @@ from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.records import (
     CENTER,
+    as_sensed,
     by_side,
     centered_K,
     hand_mask,
@@ -43,11 +44,11 @@ from render.formats.records import (
     shifted_K,
     to_json,
     to_order,
+    without_colors,
 )
 from render.formats.shards import (
     _LABELS,
     FolderWriter,
-    _need_colors,
     _write,
     json_list,
     one_sentence,
@@ -103,12 +104,14 @@ def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any]
 
 
 def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
-    keypoints, known = _keypoints(frame.camera, hand)
-    mask = hand_mask(frame, number)
+    flags, mask = keypoint_flags(hand, frame.camera.size), hand_mask(frame, number)
+    pixels = rounded(np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0), 5)
     record = {
         "category_id": CATEGORY["id"],
-        "keypoints": keypoints,
-        "num_keypoints": known,
+        "keypoints": [
+            value for (u, v), flag in zip(pixels, flags.tolist(), strict=True) for value in (u, v, flag)
+        ],
+        "num_keypoints": int((flags > 0).sum()),
         "bbox": rounded(hand.box, 3),
         "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
         "iscrowd": 0,
@@ -120,74 +123,56 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
     looks = frame.choices.get("people", ())
     if number < len(looks):
         angle = SkinLook(**looks[number]["skin"]).typology_angle
-        record["look"], record["skin_tone"] = (
-            looks[number],
-            {"class": tone_name(angle), "typology_angle": round(angle, 3)},
-        )
+        record["look"] = looks[number]
+        record["skin_tone"] = {"class": tone_name(angle), "typology_angle": round(angle, 3)}
     if mask is not None:
         record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
     return record
 
 
-def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
-    """COCO's 21 x (u, v, flag): 0 outside the picture, 1 hidden, 2 seen; and how many are not 0."""
-    flags = keypoint_flags(hand, camera.size)
-    pixels = np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0)
-    rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
-    return [value for (u, v), flag in rows for value in (u, v, flag)], int((flags > 0).sum())
-
-
-_CLASS: Final = 0
-
-
 def label_lines(frame: RenderedFrame) -> str:
-    """The text of a picture's labels: one line per visible hand, none where there is no hand."""
-    return "".join(f"{_line(hand, frame.camera.size)}\n" for hand in frame.hands if is_seen(hand))
+    """YOLO's text of a picture: one line per visible hand, none where there is no hand."""
+    size, lines = np.array(frame.camera.size), []
+    for hand in filter(is_seen, frame.hands):
+        corner, extent = hand.box[:2], hand.box[2:]
+        box = np.concatenate([(corner + 0.5 * extent) / size, extent / size]).tolist()
+        flags = keypoint_flags(hand, frame.camera.size)
+        points = np.where(flags[:, None] > 0, hand.keypoints / size, 0.0).tolist()
+        rows = (f"{x:.6f} {y:.6f} {flag}" for (x, y), flag in zip(points, flags.tolist(), strict=True))
+        lines.append(" ".join(["0", *(f"{value:.6f}" for value in box), *rows]) + "\n")
+    return "".join(lines)
 
 
-def data_yaml() -> str:
-    """The text of `data.yaml`; paths count from its own folder."""
-    return "\n".join(
-        (
-            "# For ultralytics: yolo pose train data=data.yaml model=yolo11n-pose.pt",
-            "train: images",
-            "# The same pictures: render others with another --seed and name their folder here.",
-            "val: images",
-            f"kpt_shape: [{NUM_KEYPOINTS}, 3]",
-            f"flip_idx: {list(range(NUM_KEYPOINTS))}",
-            "names: {0: hand}",
-            f"kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}",
-            "",
-        )
-    )
-
-
-def _line(hand: HandTruth, size: tuple[int, int]) -> str:
-    corner, extent = hand.box[:2], hand.box[2:]
-    box = np.concatenate([(corner + 0.5 * extent) / size, extent / size])
-    flags = keypoint_flags(hand, size)
-    points = np.where(flags[:, None] > 0, hand.keypoints / size, 0.0)
-    rows = (f"{x:.6f} {y:.6f} {flag}" for (x, y), flag in zip(points.tolist(), flags.tolist(), strict=True))
-    return " ".join([str(_CLASS), *(f"{value:.6f}" for value in box.tolist()), *rows])
+_DATA_YAML: Final = f"""\
+# For ultralytics: yolo pose train data=data.yaml model=yolo11n-pose.pt
+train: images
+# The same pictures: render others with another --seed and name their folder here.
+val: images
+kpt_shape: [{NUM_KEYPOINTS}, 3]
+flip_idx: {list(range(NUM_KEYPOINTS))}
+names: {{0: hand}}
+kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}
+"""
 
 
 class CocoWriter(FolderWriter):
     """`images/shard-00000/KEY.jpg`, `depth/shard-00000/KEY.png` ..., and `annotations.json` beside them."""
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        _need_colors(frame, "coco")
-        record = picture_record(frame, f"{name}/{frame.key}.jpg")
+        if as_sensed(frame).rgb is None:
+            raise without_colors(type(self).__name__.removesuffix("Writer").lower())
+        record = self._record(frame, f"{name}/{frame.key}.jpg")
         record["image"] |= self._add_pictures(folder, frame, name)
         return record
 
+    def _record(self, frame: RenderedFrame, file_name: str) -> dict[str, Any]:
+        """The picture and its hands, still without COCO's numbers."""
+        return picture_record(frame, file_name)
+
     def finish(self) -> None:
         """Write `annotations.json`."""
-
-        def pictures() -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-            return numbered(self._records())
-
         with one_sentence(self.folder, "writing the annotations"):
-            save_text(self.folder / "annotations.json", _coco_file(pictures, [CATEGORY]))
+            save_text(self.folder / "annotations.json", _coco_file(self._records, CATEGORY))
 
 
 class YoloWriter(CocoWriter):
@@ -202,21 +187,18 @@ class YoloWriter(CocoWriter):
         """Write `annotations.json` and `data.yaml`."""
         super().finish()
         with one_sentence(self.folder, "writing data.yaml"):
-            save_text(self.folder / "data.yaml", [data_yaml()])
+            save_text(self.folder / "data.yaml", [_DATA_YAML])
 
 
-def _coco_file(
-    numbered: Callable[[], Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]],
-    categories: list[dict[str, Any]],
-) -> Iterator[str]:
+def _coco_file(records: Callable[[], Iterable[dict[str, Any]]], category: dict[str, Any]) -> Iterator[str]:
     """Pieces of a COCO file; the shards are read twice, so that they need not fit into memory.
 
     Its list of licenses is empty, because pictures belong to who draws them.
     """
-    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json(categories)},\n"images":'
-    yield from json_list(image for image, _ in numbered())
+    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json([category])},\n"images":'
+    yield from json_list(image for image, _ in numbered(records()))
     yield ',\n"annotations":'
-    yield from json_list(hand for _, hands in numbered() for hand in hands)
+    yield from json_list(hand for _, hands in numbered(records()) for hand in hands)
     yield "}\n"
 
 
@@ -262,41 +244,14 @@ def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
     }
 
 
-class Cameras:
-    """Numerals of the poses that cameras have, in the order of pictures: the same pose, the same one."""
-
-    def __init__(self) -> None:
-        self._numerals: dict[str, str] = {}
-        self._records: dict[str, Any] = {}
-
-    def numeral(self, record: dict[str, Any]) -> str:
-        """What the camera of a record of `interhand_record` is called."""
+def _with_numerals(records: Iterable[dict[str, Any]], cameras: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """COCO's records of pictures; `cameras` gets a numeral and a record for each pose of a camera."""
+    for record in records:
         pose = to_json([record["camera_name"], record["camera"]])
-        numeral = self._numerals.setdefault(pose, str(len(self._numerals)))
-        self._records[numeral] = record["camera"]
-        return numeral
-
-    def table(self) -> dict[str, Any]:
-        """Content of `_camera.json`."""
-        fields = ("campos", "camrot", "focal", "princpt")
-        table = {
-            field: {numeral: camera[field] for numeral, camera in self._records.items()} for field in fields
-        }
-        return {str(CAPTURE): table}
-
-
-def interhand_numbered(
-    records: Iterable[dict[str, Any]], cameras: Cameras
-) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-    """Images and their annotations with COCO's numbers; annotations are of pictures, not of hands."""
-
-    def with_cameras() -> Iterator[dict[str, Any]]:
-        for record in records:
-            names = {"camera": cameras.numeral(record), "camera_name": record["camera_name"]}
-            annotations = [] if record["annotation"] is None else [record["annotation"]]
-            yield {"image": names | record["image"], "annotations": annotations}
-
-    return numbered(with_cameras())
+        numeral, _ = cameras.setdefault(pose, (str(len(cameras)), record["camera"]))
+        names = {"camera": numeral, "camera_name": record["camera_name"]}
+        annotations = [] if record["annotation"] is None else [record["annotation"]]
+        yield {"image": names | record["image"], "annotations": annotations}
 
 
 def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -351,33 +306,28 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 def _union(boxes: list[Doubles]) -> Doubles:
     """Smallest box (left, top, width, height) around some."""
-    if not boxes:
-        return np.zeros(4)
     corners = np.array(boxes)
     low, high = corners[:, :2].min(axis=0), (corners[:, :2] + corners[:, 2:]).max(axis=0)
     return np.concatenate([low, high - low])
 
 
-class InterhandWriter(FolderWriter):
+class InterhandWriter(CocoWriter):
     """`images/train/shard-00000/KEY.jpg`, and InterHand2.6M's JSON files in `annotations/train`."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, part=SPLIT)
 
-    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        _need_colors(frame, "interhand")
-        record = interhand_record(frame, f"{name}/{frame.key}.jpg")
-        record["image"] |= self._add_pictures(folder, frame, name)
-        return record
+    def _record(self, frame: RenderedFrame, file_name: str) -> dict[str, Any]:
+        return interhand_record(frame, file_name)
 
     def finish(self) -> None:
         """Write the files in `annotations`."""
         annotations = self.folder / "annotations"
         start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
-        cameras = Cameras()
+        cameras: dict[str, tuple[str, dict[str, Any]]] = {}
 
-        def pictures() -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-            return interhand_numbered(self._records(), cameras)
+        def pictures() -> Iterator[dict[str, Any]]:
+            return _with_numerals(self._records(), cameras)
 
         def joints() -> Iterator[str]:
             yield f'{{"{CAPTURE}":{{'
@@ -388,6 +338,8 @@ class InterhandWriter(FolderWriter):
         category = {"id": 1, "name": "hand", "supercategory": "hand"}
         with one_sentence(self.folder, "writing the annotations"):
             save_text(Path(f"{start}_joint_3d.json"), joints())
-            save_text(Path(f"{start}_data.json"), _coco_file(pictures, [category]))
-            save_text(Path(f"{start}_camera.json"), [to_json(cameras.table()) + "\n"])
+            save_text(Path(f"{start}_data.json"), _coco_file(pictures, category))
+            fields = ("campos", "camrot", "focal", "princpt")
+            table = {name: {number: one[name] for number, one in cameras.values()} for name in fields}
+            save_text(Path(f"{start}_camera.json"), [to_json({str(CAPTURE): table}) + "\n"])
             save_text(annotations / "skeleton.txt", [skeleton_lines()])

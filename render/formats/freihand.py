@@ -113,10 +113,9 @@ class FreihandWriter:
             shards = sorted(numbers, key=lambda shard: numbers[shard])
             names = (*LISTS, "verts") if self.vertices else LISTS
             for name in names:
-                entries = (
-                    entry for shard in shards for entry in load_index(self.parts / shard_name(int(shard)))
-                )
-                save_text(self.folder / f"{SET}_{name}.json", json_list(entry[name] for entry in entries))
+                folders = (self.parts / shard_name(int(shard)) for shard in shards)
+                entries = (entry[name] for folder in folders for entry in load_index(folder))
+                save_text(self.folder / f"{SET}_{name}.json", json_list(entries))
 
     def _numbers(self) -> dict[str, list[int]]:
         """First number and count of every shard that has been numbered."""

@@ -11,14 +11,14 @@ import json
 import re
 import shutil
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.outputs import atomic_write, temporary_beside
-from render.formats.records import encode_pictures, to_json, without_colors
+from render.formats.records import encode_pictures, to_json
 from render.frames import RenderedFrame
 
 INDEX: Final = "index.json"
@@ -76,45 +76,27 @@ def clear_leftovers(path: Path) -> None:
             leftover.unlink(missing_ok=True)
 
 
-class Tar:
-    """A tar file whose bytes depend on its content alone: no times, no owners."""
-
-    def __init__(self, path: Path) -> None:
-        self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)
-
-    def add(self, name: str, content: bytes) -> None:
-        """Add one file."""
-        entry = tarfile.TarInfo(name)
-        entry.size, entry.mode = len(content), 0o644
-        self._tar.addfile(entry, io.BytesIO(content))
-
-    def close(self) -> None:
-        """Write the end."""
-        self._tar.close()
-
-
 @contextmanager
-def new_tar(path: Path) -> Iterator[Tar]:
-    """A tar file that takes its name when the block ends well."""
+def new_tar(path: Path) -> Iterator[Callable[[str, bytes], None]]:
+    """What adds files by name to a tar file, which takes its own name when the block ends well.
+
+    Its bytes depend on its content alone: no times, no owners.
+    """
     clear_leftovers(path)
-    with atomic_write(path) as temporary:
-        tar = Tar(temporary)
-        try:
-            yield tar
-        finally:
-            tar.close()
+    with atomic_write(path) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
+
+        def add(name: str, content: bytes) -> None:
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o644
+            tar.addfile(entry, io.BytesIO(content))
+
+        yield add
 
 
 def save_index(folder: Path, records: list[dict[str, Any]]) -> None:
     """Write what a shard's folder holds, one record a line."""
     lines = ",\n".join(map(to_json, records))
     (folder / INDEX).write_text(f"[\n{lines}\n]\n", encoding="utf-8")
-
-
-def load_indexes(folder: Path, shards: Iterable[int]) -> Iterator[dict[str, Any]]:
-    """The records of some shards, one after another."""
-    for shard in shards:
-        yield from load_index(folder / shard_name(shard))
 
 
 def load_index(folder: Path) -> list[dict[str, Any]]:
@@ -168,7 +150,12 @@ class FolderWriter:
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew."""
         with one_sentence(self.folder, f"writing shard {shard}"), self.new_shard(shard) as temporary:
-            save_index(temporary, list(self._add_all(temporary, frames, shard_name(shard))))
+            records: dict[str, dict[str, Any]] = {}
+            for frame in frames:
+                if frame.key in records:
+                    raise HandSimError(f"two frames of a shard are called '{frame.key}'; number them apart")
+                records[frame.key] = self._add(temporary, frame, shard_name(shard))
+            save_index(temporary, list(records.values()))
 
     @contextmanager
     def new_shard(self, shard: int) -> Iterator[Path]:
@@ -192,14 +179,6 @@ class FolderWriter:
     def finish(self) -> None:
         """Nothing to merge, unless a format overrides this."""
 
-    def _add_all(self, folder: Path, frames: Iterable[RenderedFrame], name: str) -> Iterator[dict[str, Any]]:
-        keys = set()
-        for frame in frames:
-            if frame.key in keys:
-                raise HandSimError(f"two frames of a shard are called '{frame.key}'; number them apart")
-            keys.add(frame.key)
-            yield self._add(folder, frame, name)
-
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         """Write one frame into a shard's folder of that name."""
         raise NotImplementedError
@@ -217,14 +196,10 @@ class FolderWriter:
         return files
 
     def _records(self) -> Iterator[dict[str, Any]]:
-        return load_indexes(self.pictures, sorted(self.done()))
+        for shard in sorted(self.done()):
+            yield from load_index(self.pictures / shard_name(shard))
 
 
 def _write(path: Path, content: bytes) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
-
-
-def _need_colors(frame: RenderedFrame, name: str) -> None:
-    if frame.ideal.rgb is None and frame.noisy.rgb is None:
-        raise without_colors(name)

@@ -230,19 +230,19 @@ class WebdatasetWriter:
         persons: dict[str, HandShape] = {}
         numbers = set()
         path = self.folder / f"{shard_name(shard)}{TAR}"
-        with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as tar:
+        with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as add:
             for number, group in itertools.groupby(frames, key=lambda frame: frame.number):
                 if number in numbers:
                     raise HandSimError(f"the pictures of frame {number} do not follow one another")
                 numbers.add(number)
                 views = list(group)
                 for name, content in _sample(views):
-                    tar.add(f"{number:06d}.{name}", content)
+                    add(f"{number:06d}.{name}", content)
                 for hand in views[0].hands:
                     persons.setdefault(to_json({**shape_record(hand.shape), "side": None}), hand.shape)
             if len(persons) == 1:  # a clip has room for one
                 record = hand_shapes_record(*persons.values())
-                tar.add(HAND_SHAPES, to_json(record).encode())
+                add(HAND_SHAPES, to_json(record).encode())
 
     def finish(self) -> None:
         """Tars stand alone."""

@@ -17,8 +17,8 @@ from typing import Any, Final, Protocol
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.json_files import load_json, save_json
-from handsim.files.outputs import check_free
+from handsim.files.inputs import load_json
+from handsim.files.outputs import check_free, save_json
 from render.formats.coco import CocoWriter, InterhandWriter, YoloWriter
 from render.formats.freihand import FreihandWriter
 from render.formats.records import to_json, write_exr
@@ -192,12 +192,12 @@ def _merge_format(
 
 def _copy_tar(start: Path, end: Path, offset: int) -> None:
     try:
-        with tarfile.open(start, "r:") as source, new_tar(end) as target:
+        with tarfile.open(start, "r:") as source, new_tar(end) as add:
             for entry in source:
                 file = source.extractfile(entry) if entry.isfile() and entry.size <= _LARGEST else None
                 if file is None:
                     raise DatasetError(f"{start}: '{entry.name}' is not a file that handsim render writes")
-                target.add(*_renumbered(entry.name, file.read(), offset))
+                add(*_renumbered(entry.name, file.read(), offset))
     except (tarfile.TarError, ValueError, KeyError, TypeError, EOFError) as error:
         raise DatasetError(f"{start}: a damaged tar; delete it and render again") from error
 

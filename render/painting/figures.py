@@ -35,12 +35,9 @@ _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light 
 class Material:
     """How a surface reflects light: the microfacet model of glTF 2.0, without metals."""
 
-    color: Float[np.ndarray, "3"]
-    """Linear light."""
-    roughness: float
-    """From 0 (mirror) to 1 (chalk)."""
-    glow: float = 0.0
-    """Emitted light, as a share of its color."""
+    color: Float[np.ndarray, "3"]  # linear light
+    roughness: float  # from 0 (mirror) to 1 (chalk)
+    glow: float = 0.0  # emitted light, as a share of its color
     scatter: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Light that travels under the surface, for red, green and blue: cosine beyond grazing at which lamps
     still light it."""
@@ -113,8 +110,7 @@ class Appearance:
 
     skin: SkinLook
     forearm: Forearm
-    glove: GloveLook | None
-    """The marker glove on it, drawn with its markers; None for a bare hand."""
+    glove: GloveLook | None  # the marker glove on it, drawn with its markers; None for a bare hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,8 +118,7 @@ class Drawn:
     """A surface that is ready to be drawn."""
 
     triangles: Triangles
-    colors: Float32[np.ndarray, "V 4"]
-    """Factors on the material's color, linear."""
+    colors: Float32[np.ndarray, "V 4"]  # factors on the material's color, linear
     uv: Float32[np.ndarray, "V 2"] | None
     material: Callable[[], Material]
     """Returns the same material every time; only called for colors, because textures take time."""
@@ -151,7 +146,7 @@ class HandFigure:
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
         bony = look.skin.relief if look.glove is None else 0.0  # cloth levels it
-        self._skin = PosableSkin(fit.model, look.forearm, bony)
+        self.skin = PosableSkin(fit.model, look.forearm, bony)
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
@@ -160,17 +155,11 @@ class HandFigure:
         if look.glove is not None:
             self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
-    def forearm_line(
-        self, qpos: Float[np.ndarray, "27"]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """See `PosableSkin.forearm_line`."""
-        return self._skin.forearm_line(qpos)
-
     def drawn(
         self, qpos: Float[np.ndarray, "27"], number: int, upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> list[Drawn]:
         """Skin, and markers where a glove is worn."""
-        skin, first_part = self._skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
+        skin, first_part = self.skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
             skin.vertices,

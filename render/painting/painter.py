@@ -48,17 +48,12 @@ _NO_TEXELS: Final = np.empty((0, 0, 2), dtype=np.uint32)
 class _Mesh(NamedTuple):
     """One surface in the camera's axes, with its material."""
 
-    begin: int
-    """Number of its first face among those of all surfaces."""
+    begin: int  # number of its first face among those of all surfaces
     faces: Integers
-    corners: Doubles
-    """Of `rasterizer.project` (V, 3) at twice the picture's size."""
-    rows: Floats
-    """Position [m], normal, tint and texture coordinates of each vertex (V, 11)."""
-    texels: NDArray[np.uint32]
-    """Two words a texel (h, w, 2); empty where there is no texture."""
-    finish: Doubles
-    """Color, roughness, glow and scatter."""
+    corners: Doubles  # of `rasterizer.project` (V, 3) at twice the picture's size
+    rows: Floats  # position [m], normal, tint and texture coordinates of each vertex (V, 11)
+    texels: NDArray[np.uint32]  # two words a texel (h, w, 2); empty where there is no texture
+    finish: Doubles  # color, roughness, glow and scatter
 
 
 def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:

@@ -33,14 +33,10 @@ _NARROW: Final = 6  # [px] width of a triangle's box up to which each of its pix
 class Triangles:
     """A surface to draw."""
 
-    vertices: Float[np.ndarray, "V 3"]
-    """In the world [m]."""
-    faces: Int[np.ndarray, "F 3"]
-    """Counter-clockwise from outside."""
-    normals: Float[np.ndarray, "V 3"]
-    """Unit normals in the world."""
-    parts: UInt8[np.ndarray, "F"]
-    """See `render.frames.Pictures`, as the next two."""
+    vertices: Float[np.ndarray, "V 3"]  # in the world [m]
+    faces: Int[np.ndarray, "F 3"]  # counter-clockwise from outside
+    normals: Float[np.ndarray, "V 3"]  # unit normals in the world
+    parts: UInt8[np.ndarray, "F"]  # see `render.frames.Pictures`, as the next two
     instances: UInt8[np.ndarray, "F"]
     markers: UInt8[np.ndarray, "F"]
 
@@ -263,12 +259,10 @@ class _Face:
     size: tuple[int, int]
     focal: float
     center: tuple[float, float]
-    rotation: Doubles
-    """Rotation (3, 3): the face's axes in the camera's."""
+    rotation: Doubles  # rotation (3, 3): the face's axes in the camera's
     part: tuple[slice, slice]
     """Rows and columns of the lens's picture that hold all of this face's pixels."""
-    mask: Bool[np.ndarray, "h w"]
-    """Which of the part's pixels are this face's."""
+    mask: Bool[np.ndarray, "h w"]  # which of the part's pixels are this face's
     pixels: Float32[np.ndarray, "h w 2"]
     """Their pixels in the face, counted from the center of its first pixel [px]."""
     ahead: Float32[np.ndarray, "h w"]

@@ -40,10 +40,8 @@ class ShadowMap(NamedTuple):
 
     to_map: Float[np.ndarray, "3 4"]
     """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
-    nearest: Float32[np.ndarray, "N N"]
-    """Nearness [m], minus infinity where nothing is."""
-    bias: float
-    """How much nearer a surface must be to cast a shadow [m]: about a texel."""
+    nearest: Float32[np.ndarray, "N N"]  # nearness [m], minus infinity where nothing is
+    bias: float  # how much nearer a surface must be to cast a shadow [m]: about a texel
 
 
 def shadow_map(

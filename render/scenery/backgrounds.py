@@ -146,12 +146,10 @@ _SIDE: Final = np.float32(0.6)  # light on an object's side, where its top has 1
 class Backdrop:
     """A plane behind all of the hands that is in the picture; it catches their shadows."""
 
-    gap: float
-    """Its distance from the nearest point of them [m]."""
+    gap: float  # its distance from the nearest point of them [m]
     recedes: tuple[float, float] = (0.0, 0.0)
     """By how much it recedes to the right and downwards, a length for a length."""
-    softness: float = 0.1
-    """Tangent of half the angle under which it sees the lamp."""
+    softness: float = 0.1  # tangent of half the angle under which it sees the lamp
 
 
 def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
@@ -209,10 +207,8 @@ class Background:
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Linear colors; not used by rooms and photographs."""
     seed: int
-    blur: float = 0.0
-    """Standard deviation of its blur, in picture heights."""
-    photo: str | None = None
-    """The photograph's file."""
+    blur: float = 0.0  # standard deviation of its blur, in picture heights
+    photo: str | None = None  # the photograph's file
     backdrop: Backdrop | None = None
     """What the hands' shadows fall on; None where the background is far away."""
 
@@ -393,25 +389,19 @@ _SHORTEST: Final = 1e-6  # component of a ray, so that it meets each pair of wal
 class Enclosure:
     """A box that holds everything, in the world's axes, z up."""
 
-    low: Corner
-    """[m]."""
+    low: Corner  # [m]
     high: Corner
-    free: tuple[Corner, Corner]
-    """Low and high corner of the box that hands and cameras stay in [m]."""
+    free: tuple[Corner, Corner]  # low and high corner of the box that hands and cameras stay in [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
     """What one camera sees behind hands and objects."""
 
-    rgb: UInt8[np.ndarray, "H W 3"]
-    """sRGB; 0 where the lens sees nothing."""
-    depth: Float32[np.ndarray, "H W"]
-    """Along the camera's axis [m]; 0 for what is not ahead."""
-    axes: Int8[np.ndarray, "H W"]
-    """Axis of the world that the surface's normal has."""
-    signs: Int8[np.ndarray, "H W"]
-    """Whether it points along that axis (1) or against it (-1)."""
+    rgb: UInt8[np.ndarray, "H W 3"]  # sRGB; 0 where the lens sees nothing
+    depth: Float32[np.ndarray, "H W"]  # along the camera's axis [m]; 0 for what is not ahead
+    axes: Int8[np.ndarray, "H W"]  # axis of the world that the surface's normal has
+    signs: Int8[np.ndarray, "H W"]  # whether it points along that axis (1) or against it (-1)
 
     def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
         """Pictures of hands and objects with depth and normals behind them, too."""

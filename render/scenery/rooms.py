@@ -31,12 +31,9 @@ class _Walls(NamedTuple):
     """What is painted on the six sides: from the room's origin and from its far corner, for x, y and z."""
 
     patterns: Integers
-    pitches: Doubles
-    """Of stripes, tiles and boards (6,) [m]."""
-    colors: Doubles
-    """Two of each (6, 2, 3), linear."""
-    boards: Doubles
-    """Tones of boards (512,)."""
+    pitches: Doubles  # of stripes, tiles and boards (6,) [m]
+    colors: Doubles  # two of each (6, 2, 3), linear
+    boards: Doubles  # tones of boards (512,)
     frames: Doubles
     """Pictures and windows (6, 3, 11): left, low, width, height, colors of frame and glass, slope; width 0:
     none."""
@@ -45,25 +42,19 @@ class _Walls(NamedTuple):
 class RoomLight(NamedTuple):
     """What N rays meet in a room."""
 
-    light: Float32[np.ndarray, "N 3"]
-    """Linear."""
-    distances: Float32[np.ndarray, "N"]
-    """[m]."""
-    axes: Int8[np.ndarray, "N"]
-    """Axis of the surface's normal, which faces the ray."""
+    light: Float32[np.ndarray, "N 3"]  # linear
+    distances: Float32[np.ndarray, "N"]  # [m]
+    axes: Int8[np.ndarray, "N"]  # axis of the surface's normal, which faces the ray
 
 
 class _Boxes(NamedTuple):
     """Furniture: B boxes."""
 
-    corners: Doubles
-    """Low and high (B, 2, 3) [m]."""
-    colors: Doubles
-    """Linear (B, 2, 3)."""
+    corners: Doubles  # low and high (B, 2, 3) [m]
+    colors: Doubles  # linear (B, 2, 3)
     bands: Doubles
     """How many drawers or shelves, and what share of each has the second color (B, 2)."""
-    shades: Doubles
-    """Of the faces along x, y and z (B, 3)."""
+    shades: Doubles  # of the faces along x, y and z (B, 3)
 
 
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
@@ -127,15 +118,11 @@ def _edges(picture: Floats) -> Flags:
 class _Scene(NamedTuple):
     """A room and who looks into it."""
 
-    room: Doubles
-    """Far corner [m]; the other one is at the origin, z up."""
+    room: Doubles  # far corner [m]; the other one is at the origin, z up
     eye: Doubles
-    focal: float
-    """Focal length [picture heights]."""
-    axes: Doubles
-    """The camera's axes (3, 3), a row each: right, down, ahead."""
-    lamp: Doubles
-    """Lamps and windows leave some parts darker than others."""
+    focal: float  # focal length [picture heights]
+    axes: Doubles  # the camera's axes (3, 3), a row each: right, down, ahead
+    lamp: Doubles  # lamps and windows leave some parts darker than others
     strength: float
     walls: _Walls
     boxes: _Boxes

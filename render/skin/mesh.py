@@ -34,7 +34,7 @@ from handsim.hand.skin import (
 )
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
-from render.fields import bump, smooth
+from render.fields import along_segment, bump, smooth
 from render.frames import FOREARM, Bytes, Doubles, Floats, Integers
 from render.skin.look import ELBOW, Forearm, bent_rings, forearm_rings
 
@@ -52,24 +52,19 @@ _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
 class Atlas(NamedTuple):
     """Numbers only; vertices are `HandSurface`'s, then the forearm's rings, then the end's middle."""
 
-    used: Integers
-    """Vertices (U,) of the base surface that are drawn: those from the wrist's ring on."""
+    used: Integers  # vertices (U,) of the base surface that are drawn: those from the wrist's ring on
     wrist: Integers
     """The wrist's ring (R,), indices of the drawn vertices, from the index side over the back."""
     faces: Integers
     """Triangles (F, 3) of the drawn vertices, closed, counter-clockwise from outside on a right hand."""
     corners: Integers
     """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
-    corner_faces: Integers
-    """The same triangles (F, 3) as indices of `corners`."""
+    corner_faces: Integers  # the same triangles (F, 3) as indices of `corners`
     coarse_faces: Integers
     """A quarter as many triangles (G, 3) of the same corners: the surface to a few tenths of a millimeter."""
-    uv: Floats
-    """Texture coordinates (D, 2), the origin at the bottom left."""
-    tiles: Integers
-    """Drawn vertices (K, 5, 5) of each tile's grid."""
-    size: tuple[int, int]
-    """Width and height of the texture [texels]."""
+    uv: Floats  # texture coordinates (D, 2), the origin at the bottom left
+    tiles: Integers  # drawn vertices (K, 5, 5) of each tile's grid
+    size: tuple[int, int]  # width and height of the texture [texels]
 
     @property
     def num_hand(self) -> int:
@@ -188,14 +183,10 @@ _FINGERS: Final = ("index", "middle", "ring", "little")
 class _Hill(NamedTuple):
     """A shape of the skin."""
 
-    joint: int
-    """Whose angle decides the height; -1 for a shape that is always there."""
-    start: float
-    """Angle without height [deg]."""
-    full: float
-    """Angle with full height [deg]."""
-    heights: Doubles
-    """Full height at each vertex (U,) along the normal [m]."""
+    joint: int  # whose angle decides the height; -1 for a shape that is always there
+    start: float  # angle without height [deg]
+    full: float  # angle with full height [deg]
+    heights: Doubles  # full height at each vertex (U,) along the normal [m]
 
 
 class Flexion:
@@ -242,21 +233,13 @@ class _Skin(NamedTuple):
 
     points: Doubles
     normals: Doubles
-    frames: Doubles
-    """Transforms of the bones (16, 4, 4)."""
-    scale: float
-    """Of the hand against the reference."""
+    frames: Doubles  # transforms of the bones (16, 4, 4)
+    scale: float  # of the hand against the reference
 
     def local(self, bone: int) -> tuple[Doubles, Doubles]:
         """Points (U, 3) [m] in a bone's frame, and how far they face its back, -1 to 1 (U,)."""
         frame = self.frames[bone]
         return (self.points - frame[:3, 3]) @ frame[:3, :3], self.normals @ frame[:3, 2]
-
-    def beside(self, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
-        """How far along a segment of the wrist's x and y [m] points are, 0 to 1, and how far from it [m]."""
-        way = end - start
-        along = np.clip((self.points[:, :2] - start) @ way / (way @ way), 0.0, 1.0)
-        return along, np.linalg.norm(self.points[:, :2] - start - along[:, None] * way, axis=1)
 
     def knob(
         self, bone: int, height: float, along: float, aside: float, *, at: tuple[float, float] = (0.0, 0.0)
@@ -296,7 +279,7 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
     yield _Hill(_joint(f"{digit}_DIP_flexion"), 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
-    along, aside = skin.beside(root, knuckle)
+    along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
     yield _Hill(bent, *straight, skin.scale * ridge)
     place, facing = skin.local(first)
@@ -315,7 +298,7 @@ def _valleys(skin: _Skin) -> Iterator[_Hill]:
         first, second = 1 + 3 * number, 4 + 3 * number
         here = 0.5 * (skin.frames[first, :2, 3] + skin.frames[second, :2, 3])
         parted = here + 0.45 * (0.5 * (skin.frames[first + 1, :2, 3] + skin.frames[second + 1, :2, 3]) - here)
-        along, aside = skin.beside(here, parted)
+        along, aside = along_segment(skin.points[:, :2], here, parted)
         hollow = -0.0042 * bump(aside, skin.scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
         hollow *= 1.0 - 0.4 * along
         yield _Hill(_joint(f"{_FINGERS[number]}_MCP_flexion"), 10.0, 85.0, skin.scale * hollow)
@@ -357,16 +340,12 @@ class DrawnSkin:
 
     vertices: Float32[np.ndarray, "D 3"]
     """In the world [m]; vertices on borders of texture tiles are repeated for each tile."""
-    normals: Float32[np.ndarray, "D 3"]
-    """Outward unit normals."""
-    uv: Float32[np.ndarray, "D 2"]
-    """Texture coordinates, the origin at the bottom left."""
+    normals: Float32[np.ndarray, "D 3"]  # outward unit normals
+    uv: Float32[np.ndarray, "D 2"]  # texture coordinates, the origin at the bottom left
     shade: Float32[np.ndarray, "D"]
     """Share of the ambient light that the hand itself does not block, 0 to 1."""
-    faces: Int[np.ndarray, "F 3"]
-    """Triangles, counter-clockwise from outside."""
-    parts: UInt8[np.ndarray, "F"]
-    """Bone of each triangle, an index of `topology.BONES` or `FOREARM`."""
+    faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
+    parts: UInt8[np.ndarray, "F"]  # bone of each triangle, an index of `topology.BONES` or `FOREARM`
     coarse_faces: Int[np.ndarray, "G 3"]
     """Fewer triangles of the same vertices, nearly the same surface."""
 

@@ -80,8 +80,8 @@ def c3d(folder: Path) -> list[Path]:
 
 def csv(folder: Path) -> list[Path]:
     """Two of Motive, with labels of rows and as we write it, one of Vicon among others; two European."""
+    from tests.gloves.captures.test_formats import DEVICES, nexus
     from tests.gloves.captures.test_text import rewritten
-    from tests.gloves.captures.test_vicon_csv import DEVICES, nexus
 
     (folder / "take.csv").write_text(MOTIVE)
     write_capture(folder / "ours.csv", capture())
@@ -93,7 +93,7 @@ def csv(folder: Path) -> list[Path]:
 
 
 def tsv(folder: Path) -> list[Path]:
-    from tests.gloves.captures.test_qtm_tsv import qtm
+    from tests.gloves.captures.test_formats import qtm
 
     (folder / "take.tsv").write_text(qtm(version=True, events=("Start",)))
     (folder / "bare.tsv").write_text(qtm(columns=False, leading=False))
@@ -133,7 +133,7 @@ def camera_files(folder: Path) -> list[Path]:
 
 def calibrations(folder: Path) -> list[Path]:
     """Of camera systems: Vicon's, Qualisys', Motive's, and OpenCV's of many cameras."""
-    from tests.handsim.space.rig_formats.known_rig import written
+    from tests.handsim.space.known_rig import written
 
     return list(written(folder).values())
 

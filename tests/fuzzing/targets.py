@@ -19,7 +19,8 @@ from gloves.layout import load_layout
 from gloves.takes.corrections import applied_corrections, load_corrections
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, HandSimWarning
-from handsim.files.json_files import claim, load_json
+from handsim.files.inputs import load_json
+from handsim.files.outputs import claim
 from handsim.space.objects import load_object
 from handsim.space.rig import CameraRig, load_rig
 from handsim.space.rig_formats import import_cameras, load_cameras

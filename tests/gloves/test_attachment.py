@@ -17,7 +17,7 @@ from handsim.errors import LayoutError
 from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.transforms import MIRROR
-from tests.handsim.hand.skin.blending import blend_skin
+from tests.handsim.hand.blending import blend_skin
 
 MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
 

@@ -11,10 +11,16 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from handsim.errors import CaptureError
-from tests.gloves.captures.test_motive_csv import LABELED, QUOTED, UNLABELED, motive
-from tests.gloves.captures.test_qtm_tsv import qtm
-from tests.gloves.captures.test_trc import trc
-from tests.gloves.captures.test_vicon_csv import DEVICES, nexus
+from tests.gloves.captures.test_formats import (
+    DEVICES,
+    LABELED,
+    QUOTED,
+    UNLABELED,
+    motive,
+    nexus,
+    qtm,
+    trc,
+)
 
 ROWS = [f"{row}\t{row / 119.88:.6f}\t{row}.25\t-0.05\t3.00\t\t\t" for row in range(4)]
 PLAIN = {

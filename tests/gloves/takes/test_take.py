@@ -10,15 +10,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from gloves.captures.formats import read_capture
 from gloves.fit import attach, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.archives import SCHEMA
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
-from gloves.takes.take import INITIALIZED, LOST, STATUSES, SUFFIX, TRACKED, RigidBody, Take, load_take
+from gloves.takes.take import (
+    INITIALIZED,
+    LOST,
+    MOTION_FORMATS,
+    STATUSES,
+    SUFFIX,
+    TRACKED,
+    RigidBody,
+    Take,
+    load_take,
+)
 from handsim.errors import ArgumentError, CaptureError
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, is_steady, join_qpos
 from handsim.hand.shape import sample_shape
+from handsim.space.transforms import random_quaternions
 
 FRAMES, COLUMNS, MARKERS = 9, 47, 19
 PEN = RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3))
@@ -441,3 +456,91 @@ def test_files_hold_the_joint_positions(take, tmp_path):
         np.testing.assert_allclose(keypoints[there, index], expected)
         assert np.isnan(keypoints[~there, index]).all()
     assert INITIALIZED == STATUSES.index("found")
+
+
+NUM_FRAMES = 13
+HANDS = tuple(nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left"))
+WAND = RigidBody("wand", (), np.empty((0, 3)))
+
+
+@pytest.fixture
+def moving(rng) -> Take:
+    qpos = join_qpos(0.5 * rng.random((2 * NUM_FRAMES, 20)), position=rng.normal(size=(2 * NUM_FRAMES, 3)))
+    qpos[:, 3:7] = random_quaternions(2 * NUM_FRAMES, rng=rng)
+    qpos = qpos.reshape(NUM_FRAMES, 2, 27)
+    qpos[[0, 1, 5, 6], 1] = np.nan
+    poses = np.concatenate(
+        [rng.normal(size=(NUM_FRAMES, 3)), random_quaternions(NUM_FRAMES, rng=rng)], axis=1
+    )
+    return Take.of_poses(HANDS, qpos, rate=60.0, bodies=[WAND], body_poses=poses[:, None])
+
+
+def present(moving: Take) -> np.ndarray:
+    return moving.status != LOST
+
+
+def test_the_old_rate_changes_nothing(moving):
+    again = moving.poses_alone(moving.rate)
+    np.testing.assert_array_equal(present(moving), present(again))
+    np.testing.assert_allclose(moving.qpos[..., 7:], again.qpos[..., 7:], atol=1e-12)
+    for ours, others in ((moving.qpos, again.qpos), (moving.body_poses, again.body_poses)):
+        np.testing.assert_allclose(ours[..., :3], others[..., :3], atol=1e-12)
+        same = np.abs((ours[..., 3:7] * others[..., 3:7]).sum(axis=-1))
+        np.testing.assert_allclose(same[np.isfinite(same)], 1.0)
+
+
+def test_frames_beside_a_missing_one_are_missing(moving):
+    twice, old = present(moving.poses_alone(2 * moving.rate))[:, 1], present(moving)[:, 1]
+    assert len(twice) == 2 * len(old) - 1
+    np.testing.assert_array_equal(twice[::2], old)
+    np.testing.assert_array_equal(twice[1::2], old[1:] & old[:-1])
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.95))
+def test_between_frames_everything_is_straight(seed, share):
+    rng = np.random.default_rng(seed)
+    qpos = join_qpos(rng.normal(size=(2, 20)), position=rng.normal(size=(2, 3)))
+    qpos[:, 3:7] = random_quaternions(2, rng=rng)
+    moving = Take.of_poses(HANDS[:1], qpos[:, None], rate=20.0)
+    middle = moving.poses_alone(1.0 / (0.05 * share)).qpos[1, 0]
+    straight = qpos[0] + share * (qpos[1] - qpos[0])
+    np.testing.assert_allclose(middle[[*range(3), *range(7, 27)]], straight[[*range(3), *range(7, 27)]])
+    first, last, found = (Rotation.from_quat(q[3:7], scalar_first=True) for q in (*qpos, middle))
+    whole = (first.inv() * last).magnitude()
+    assert (first.inv() * found).magnitude() == pytest.approx(share * whole, abs=1e-7)
+    assert (found.inv() * last).magnitude() == pytest.approx((1 - share) * whole, abs=1e-7)
+
+
+def test_a_hole_in_a_stream_stays_one_in_formats_without_times(rng, tmp_path):
+    times = np.concatenate([np.arange(10) / 100, 1.0 + np.arange(10) / 100])
+    qpos = join_qpos(rng.normal(size=(20, 20)), position=np.ones(3))
+    moving = Take.of_poses(HANDS[:1], qpos[:, None], rate=100.0, times=times)
+    assert not is_steady(moving.times, moving.rate)
+    moving.export(tmp_path / "hands.trc")
+    seen = np.isfinite(read_capture(tmp_path / "hands.trc").positions[:, 0, 0])
+    assert seen.tolist() == [True] * 10 + [False] * 90 + [True] * 10
+    moving.export(tmp_path / "hands.csv")
+    assert len((tmp_path / "hands.csv").read_text().splitlines()) == 21
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf, 1e12])
+def test_rates_that_cannot_be(moving, rate):
+    with pytest.raises(ArgumentError, match="expected"):
+        moving.poses_alone(rate)
+
+
+def test_what_has_no_pose_is_left_out(moving):
+    qpos, poses = moving.qpos.copy(), np.full_like(moving.body_poses, np.nan)
+    qpos[:, 0] = np.nan
+    alone = Take.of_poses(HANDS, qpos, rate=60.0, bodies=[WAND], body_poses=poses).poses_alone()
+    assert alone.sides == ("left",) and alone.bodies == () and alone.body_poses.shape == (NUM_FRAMES, 0, 7)
+    nobody = dataclasses.replace(moving, qpos=np.full_like(qpos, np.nan), status=np.zeros_like(moving.status))
+    with pytest.raises(ArgumentError, match="no hand has a pose"):
+        nobody.export("hands.bvh")
+
+
+def test_other_endings_are_refused_with_the_valid_ones(moving, tmp_path):
+    with pytest.raises(ArgumentError) as caught:
+        moving.export(tmp_path / "hands.fbx")
+    assert all(ending in str(caught.value) for ending in MOTION_FORMATS)
+    assert not list(tmp_path.iterdir())

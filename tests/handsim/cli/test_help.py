@@ -8,8 +8,7 @@ import sys
 
 import pytest
 
-from handsim.cli.command_table import COMMANDS, load
-from handsim.cli.main import main
+from handsim.cli.main import COMMANDS, load, main
 
 
 def helps() -> list[object]:

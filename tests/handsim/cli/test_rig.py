@@ -9,7 +9,7 @@ from handsim.cli.main import main
 from handsim.errors import HandSimWarning
 from handsim.space.rig import list_rigs, load_rig
 from handsim.space.rig_formats import import_cameras
-from tests.handsim.space.rig_formats.known_rig import MCAL, PIXELS, POINT, XCP, written
+from tests.handsim.space.known_rig import MCAL, PIXELS, POINT, XCP, written
 
 
 def test_every_shipped_rig_is_listed_with_what_it_is(capsys):

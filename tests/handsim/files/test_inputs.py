@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import io
 import os
+import tomllib
 import zipfile
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.errors import CaptureError, LayoutError
 from handsim.files.arrays import read_npz
-from handsim.files.inputs import read_bytes
+from handsim.files.inputs import quoted, read_bytes
 
 
 @pytest.mark.parametrize("name", ["take.trc", "take.truth.npz", "glove.toml"])
@@ -92,3 +95,12 @@ def test_more_cells_than_a_text_file_can_hold_are_refused(tmp_path):
     path.write_text(header + "1\n" * 20_000)
     with pytest.raises(CaptureError, match="20000 rows of 60002 columns are more than"):
         read_capture(path)
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"])))
+def test_any_text_comes_back(text):
+    assert tomllib.loads(f"name = {quoted(text)}")["name"] == text
+
+
+def test_the_delete_character_is_escaped():
+    assert quoted("a\x7fb") == '"a\\u007Fb"'

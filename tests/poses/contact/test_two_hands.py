@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
-from handsim.files.json_files import package_data
+from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape

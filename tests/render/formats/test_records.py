@@ -237,7 +237,7 @@ def srgb(light: np.ndarray) -> np.ndarray:
 
 def test_every_level_of_srgb_comes_back_from_half() -> None:
     levels = np.arange(256, dtype=np.uint8)
-    halves = linear_of(levels)[:, 0].astype(np.float16).astype(np.float64)
+    halves = linear_of(levels).ravel().astype(np.float16).astype(np.float64)
     np.testing.assert_array_equal(np.rint(255.0 * srgb(halves)), levels)
 
 

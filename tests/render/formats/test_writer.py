@@ -15,7 +15,7 @@ from pycocotools.coco import COCO
 
 from handsim.cli.main import main
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.json_files import save_json
+from handsim.files.outputs import save_json
 from handsim.hand.model import HandModel
 from handsim.space.camera import look_at
 from render.formats.shards import BESIDE

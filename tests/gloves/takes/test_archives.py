@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
+import warnings
 
 import numpy as np
 import pytest
@@ -18,9 +20,12 @@ from gloves.takes.archives import (
     growing_path,
     is_growing,
 )
-from handsim.errors import CaptureError
-from handsim.files import arrays
+from gloves.takes.take import Take, load_take
+from handsim.errors import CaptureError, HandSimError
+from handsim.files import arrays as array_files
 from handsim.files.arrays import read_npz, write_npz
+from handsim.hand.shape import HAND_DTYPE
+from train.simulation.takes import simulate_take
 
 COLUMNS = (
     Column("times", "<f8", ("T",)),
@@ -185,7 +190,7 @@ def test_a_crowded_frame_makes_nothing_larger(rng, tmp_path):
 
 def test_hours_in_which_nothing_moves_are_read(tmp_path, monkeypatch):
     """What compresses far better than the reader allows is written without compression."""
-    monkeypatch.setattr(arrays, "_ALWAYS", 1 << 16)
+    monkeypatch.setattr(array_files, "_ALWAYS", 1 << 16)
     columns = (Column("qpos", "<f8", ("T", 50)),)
     with GrowingArchive(tmp_path / "x.part", {}, {}, columns) as archive:
         for _ in range(2000):
@@ -212,3 +217,61 @@ def test_what_cannot_be_read_back_is_not_written(rng, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="read back"):
         finish_archive(GrownArchive(tmp_path / "x.part"), tmp_path / "x.npz", {})
     assert [path.name for path in tmp_path.iterdir()] == ["x.part"]
+
+
+VALUES = (np.nan, np.inf, 0.0, 1e-200, 1e200, -1.0, 100.0)
+FRAMES = ("qpos", "body_poses", "points", "times", "body_markers", "attachment_normals")
+SHAPES = [name for name in HAND_DTYPE.names if name != "left"]
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    return simulate_take("hand-controller", num_frames=5)
+
+
+def refused_or_exported(folder, arrays) -> None:
+    np.savez(folder / "altered.npz", **arrays)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with contextlib.suppress(HandSimError):
+            take = load_take(folder / "altered.npz")
+            for ending in (".glb", ".bvh", ".mot", ".openxr.json"):
+                take.export(folder / f"altered{ending}")
+
+
+@pytest.fixture
+def arrays(take, tmp_path):
+    take.save(tmp_path / "take.npz")
+    return dict(np.load(tmp_path / "take.npz"))
+
+
+@pytest.mark.parametrize("value", VALUES)
+@pytest.mark.parametrize("name", SHAPES)
+def test_hands(arrays, tmp_path, name, value):
+    arrays["hands"][name][0] = value
+    refused_or_exported(tmp_path, arrays)
+
+
+@pytest.mark.parametrize("value", VALUES)
+@pytest.mark.parametrize("name", FRAMES)
+def test_frames(arrays, tmp_path, name, value):
+    arrays[name][-1] = value
+    refused_or_exported(tmp_path, arrays)
+
+
+@pytest.mark.parametrize("rate", [1e-300, 1e-3, 1e9, 1e300])
+def test_rates(arrays, tmp_path, rate):
+    header = json.loads(str(arrays["header"])) | {"rate": rate}
+    arrays["header"] = np.array(json.dumps(header))
+    refused_or_exported(tmp_path, arrays)
+
+
+@pytest.mark.parametrize("name", ["qpos", "body_poses"])
+def test_orientations_have_unit_length(arrays, tmp_path, name):
+    arrays[name][..., 3:7] *= 1.000001  # as rounded
+    np.savez(tmp_path / "rounded.npz", **arrays)
+    load_take(tmp_path / "rounded.npz")
+    arrays[name][..., 3:7] *= 1e-200
+    np.savez(tmp_path / "tiny.npz", **arrays)
+    with pytest.raises(CaptureError, match=r"tiny\.npz: not a take, or a damaged one"):
+        load_take(tmp_path / "tiny.npz")

@@ -1,5 +1,8 @@
+"""Kernels work in a read-only installation without a home."""
+
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import types
@@ -8,7 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from handsim._siblings import SIBLINGS, ShadowedPackageWarning, shadowed_siblings, warn_if_shadowed
+from handsim import _imports
+from handsim._imports import (
+    SIBLINGS,
+    VARIABLE,
+    ShadowedPackageWarning,
+    ensure_kernel_cache,
+    kernel_cache,
+    shadowed_siblings,
+    warn_if_shadowed,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -71,3 +83,50 @@ def test_a_module_without_a_spec_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(sys.modules, "gloves", types.ModuleType("gloves"))
     with pytest.warns(ShadowedPackageWarning, match="needs its own package 'gloves'"):
         warn_if_shadowed()
+
+
+@pytest.fixture
+def nowhere(tmp_path, monkeypatch):
+    """Neither the installation nor the user's cache can be written; the temporary folder is another."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr(_imports, "_is_writable", lambda folder: False)
+    monkeypatch.setattr(_imports.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(_imports.tempfile, "tempdir", str(tmp_path))
+    yield tmp_path
+    os.environ.pop(VARIABLE, None)
+
+
+def test_a_usual_installation_keeps_numbas_choice(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    ensure_kernel_cache()
+    assert VARIABLE not in os.environ
+
+
+def test_a_temporary_folder_is_the_last_resort(nowhere):
+    ensure_kernel_cache()
+    folder = Path(os.environ[VARIABLE])
+    assert folder.parent == nowhere and folder.stat().st_mode & 0o777 == 0o700
+    assert kernel_cache() == (folder, False), "which the doctor tells"
+
+
+def test_a_folder_that_others_can_write_is_not_trusted(nowhere):
+    """numba unpickles what it finds there."""
+    bait = nowhere / f"handsim-kernels-{os.getuid()}"
+    bait.mkdir()
+    bait.chmod(0o777)
+    ensure_kernel_cache()
+    assert os.environ[VARIABLE] != str(bait)
+
+
+def test_a_kernel_compiles_where_only_the_temporary_folder_is(tmp_path):
+    program = (
+        "import os; from handsim import _imports as k; k._is_writable = lambda folder: False; "
+        "k.ensure_kernel_cache(); import numpy as np; from handsim.kernels import __name__ as n; "
+        "print(os.environ[k.VARIABLE])"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment.pop(VARIABLE, None)
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip().startswith(str(tmp_path))
