@@ -17,9 +17,8 @@ from handsim.kernels import align_rigid, kernel, squared_distance, write_quatern
 FEWEST: Final = 3
 """Markers that determine a pose."""
 _NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, over the tight gate
-_LEAST_TRIANGLE_HEIGHT: Final = (
-    0.1  # height of a triangle over its longest side, below which it determines no rotation
-)
+# Height of a triangle over its longest side, below which it determines no rotation.
+_LEAST_TRIANGLE_HEIGHT: Final = 0.1
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

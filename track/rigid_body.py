@@ -57,6 +57,16 @@ _CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
 _MOST_SEARCHED_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
 _FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
+SUFFIX: Final = ".toml"
+_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
+_BODY_KEYS: Final = ("name", "description", "marker")
+_MARKER_KEYS: Final = ("name", "place_mm")
+_MOST_LEARNED_MARKERS: Final = 20
+_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
+_TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
+_AVERAGING_ROUNDS: Final = 3  # of averaging the markers over all frames
+_LEAST_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
+_LEAST_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -370,12 +380,8 @@ def _frames_to_confirm(count: int, markers: int) -> float:
     return 2 if count == FEWEST + 1 < markers else 1
 
 
-SUFFIX: Final = ".toml"
 AnyBody = RigidTemplate | str | Path
 """A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
-_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
-_BODY_KEYS: Final = ("name", "description", "marker")
-_MARKER_KEYS: Final = ("name", "place_mm")
 
 
 class BodyError(HandSimError):
@@ -464,14 +470,6 @@ def _printable(what: str, name: str) -> str:
     if not name or name != name.strip() or not name.isprintable():
         raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
     return name
-
-
-_MOST_LEARNED_MARKERS: Final = 20
-_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
-_TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
-_AVERAGING_ROUNDS: Final = 3  # of averaging the markers over all frames
-_LEAST_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
-_LEAST_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
 
 
 def learn_body(capture: Capture, name: str) -> RigidTemplate:

@@ -44,14 +44,12 @@ _CUTS_AT_FIRST: Final = 3  # tried together; mostly one of them is enough
 _LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # number of the call in which a search ends
 _EXCHANGE_DISTANCE: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
 _FITS_AT_A_TIME: Final = 3  # labeled clouds that are fitted at a time, the most confident ones
-_FIRST_FIT_STEPS: Final = (
-    6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
-)
+# From each starting pose of a first fit: enough to tell a hand from its mirror image.
+_FIRST_FIT_STEPS: Final = 6
 _REFIT_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
-_LEAST_KEPT_LABELS: Final = (
-    0.75  # share of the labels that a robust fit keeps of a hand; a mirrored one loses more
-)
+# Share of the labels that a robust fit keeps of a hand; a mirrored one loses more.
+_LEAST_KEPT_LABELS: Final = 0.75
 _POSE_WEIGHT: Final = 0.25  # log-odds of a pose for each squared deviation beyond the usual
 _MOST_POSE_PENALTY: Final = 20.0  # log-odds, because people do unusual things
 _REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
@@ -66,6 +64,9 @@ _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from whi
 _GOOD_RMS: Final = 0.003  # [m] of that hand at most; a wrong label may bend the hand that it should have been
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
+_CLOUD_RADIUS: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
+# Share of a capture's frames with a hand, from which on the others hold one too.
+_USUAL_HAND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +174,7 @@ class HandInitializer:
         if len(hands) != 2:
             return hands
         one, two = hands
-        first = (
-            self._first_fit(two.index, points, one.labels),
-            self._first_fit(one.index, points, two.labels),
-        )
+        first = self._fit(two.index, points, one.labels), self._fit(one.index, points, two.labels)
         if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
             return hands
         return _likelier([self._trim(fit, points) for fit in first], hands)
@@ -254,7 +252,7 @@ class HandInitializer:
     ) -> InitializedHand | None:
         """The best hand so far, or one of these clouds of a group with a better score."""
         for labels in self._labeled(points, clouds)[:_FITS_AT_A_TIME]:
-            fits = [self._first_fit(index, points, labels) for index in hands]
+            fits = [self._fit(index, points, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
@@ -294,17 +292,6 @@ class HandInitializer:
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
-    def _first_fit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64]
-    ) -> InitializedHand | None:
-        """A hand fitted to all labeled points; None where they are too few for one."""
-        if (labels >= 0).sum() < self._least(index):
-            return None
-        state = self._states[index]
-        targets = targets_of(points, labels, state.num_markers)
-        fit = state.solver.solve(targets[None], iterations=_FIRST_FIT_STEPS)
-        return self._scored(index, fit, labels)
-
     def _improve(
         self, first: InitializedHand, points: NDArray[np.float64], group: NDArray[np.int64]
     ) -> InitializedHand | None:
@@ -323,7 +310,7 @@ class HandInitializer:
             labels[group], _ = match_points(log_odds)
             if (labels == hand.labels).all():
                 break
-            hand = self._trim(self._refit(index, points, labels, hand.fit), points)
+            hand = self._trim(self._fit(index, points, labels, hand.fit), points)
         return hand
 
     def _divided(
@@ -360,7 +347,7 @@ class HandInitializer:
             first[ours], second[theirs] = -1, -1
             first[theirs], second[ours] = two.labels[theirs], one.labels[ours]
             changed = [
-                self._trim(self._refit(hand.index, points, labels, hand.fit), points)
+                self._trim(self._fit(hand.index, points, labels, hand.fit), points)
                 for hand, labels in ((one, first), (two, second))
             ]
             hands = _likelier(changed, hands)
@@ -375,7 +362,7 @@ class HandInitializer:
             squares = (hand.fit.residuals[0, hand.labels[labeled]] ** 2).sum(axis=1)
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
-            hand = self._refit(hand.index, points, labels, hand.fit)
+            hand = self._fit(hand.index, points, labels, hand.fit)
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
@@ -398,29 +385,26 @@ class HandInitializer:
         kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
         if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
-        return self._refit(first.index, points, np.where(kept, first.labels, -1), fit)
+        return self._fit(first.index, points, np.where(kept, first.labels, -1), fit)
 
-    def _refit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit
+    def _fit(
+        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
-        """A hand fitted to labeled points from a near pose; None where they are too few."""
-        if (labels >= 0).sum() < self._least(index):
-            return None
-        state = self._states[index]
-        targets = targets_of(points, labels, state.num_markers)
-        return self._scored(
-            index, state.solver.solve(targets[None], near.qpos, iterations=_REFIT_STEPS), labels
-        )
+        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few.
 
-    def _scored(self, index: int, fit: PoseFit, labels: NDArray[np.int64]) -> InitializedHand:
-        """A fit with its score; a hand that was seen lately must fit as well as then."""
-        known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
-        spread = self._spreads[index] if known else None
-        count, rms = int((labels >= 0).sum()), float(fit.rms[0])
+        Its score counts how unusual the pose is; a hand that was seen lately must fit as well as then.
+        """
+        count, state = int((labels >= 0).sum()), self._states[index]
+        if count < self._least(index):
+            return None
+        targets = targets_of(points, labels, state.num_markers)[None]
+        start, steps = (None, _FIRST_FIT_STEPS) if near is None else (near.qpos, _REFIT_STEPS)
+        fit = state.solver.solve(targets, start, iterations=steps)
+        spread = self._spreads[index] if self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS else None
         offset = fit.qpos[0, 7:] - self._prior.angles
         unusual = float(offset @ self._prior.precision @ offset) - NUM_JOINTS
         penalty = min(max(_POSE_WEIGHT * unusual, 0.0), _MOST_POSE_PENALTY)
-        return InitializedHand(index, fit, labels, self.score(count, rms, spread) - penalty)
+        return InitializedHand(index, fit, labels, self.score(count, float(fit.rms[0]), spread) - penalty)
 
 
 def _likelier(
@@ -444,12 +428,6 @@ def _link_distance(hand: GloveFit) -> float:
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
     return float(np.quantile(longest_links(markers), _LINKED_GESTURES))
-
-
-_CLOUD_RADIUS: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
-_USUAL_HAND_SHARE: Final = (
-    0.5  # share of a capture's frames with a hand, from which on the others hold one too
-)
 
 
 class FrameLabels(NamedTuple):

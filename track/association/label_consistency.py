@@ -36,6 +36,19 @@ _FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker beside 
 _RESTART_RMS: Final = 0.004  # [m] beyond which a fit is tried again from shapes instead of the prediction
 _RESTART_STEPS: Final = 8  # from each starting pose; the fit goes on from there
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
+# [m] from a missing marker, within which the labeler is shown points without a label.
+_CLOUD_RADIUS: Final = 0.06
+# [m] the same of a marker whose digit has no label: it may be bent or straight.
+_DIGIT_CLOUD_RADIUS: Final = 0.13
+_FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
+_REVIEW_WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
+_DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
+_REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
+# Share of a point's distance that is left without a bias, to doubt the bias.
+_DOUBTED_BIAS_SHARE: Final = 0.85
+_MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps the label that it has
+_REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds added by each earlier review with the same labels
+_MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes
 
 
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
@@ -184,24 +197,6 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
         return frame, track
     frame, estimate = fit_labels(frame, track.hand, track.state, track.prediction)
     return frame, track._replace(estimate=estimate)
-
-
-_CLOUD_RADIUS: Final = (
-    0.06  # [m] from a missing marker, within which the labeler is shown points without a label
-)
-_DIGIT_CLOUD_RADIUS: Final = (
-    0.13  # [m] the same of a marker whose digit has no label: it may be bent or straight
-)
-_FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
-_REVIEW_WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
-_DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
-_REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
-_DOUBTED_BIAS_SHARE: Final = (
-    0.85  # share of a point's distance that is left without a bias, to doubt the bias
-)
-_MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps the label that it has
-_REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds added by each earlier review with the same labels
-_MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes
 
 
 class _Proposal(NamedTuple):

@@ -62,6 +62,30 @@ _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: 
 RELINEARIZE: Final = 0.005
 """Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
+PAD_COMPRESSION: Final = 0.001
+"""Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
+_MOST_TOUCH_GAP: Final = 0.012  # [m] between the two pads of a touch
+_MOST_TOUCH_SPEED: Final = 0.02  # [m/s] of the finger relative to the thumb
+_SHORTEST_HOLD: Final = 0.06  # [s] that a touch lasts
+_MOST_TOUCHES_PER_FINGER: Final = 10
+_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, over which speed is measured
+_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap, at which a touch has a quarter of its weight
+_PAD_DEPTH: Final = 0.006  # [m] below the skin: about the middle of a pad
+_SLIDE_ROUNDS: Final = 3
+_GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
+_FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
+_MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
+Progress = Callable[[int, float, float], None]
+"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
+_DAMPING_RAISE, _DAMPING_CUT, _LEAST_RAISED_DAMPING = (
+    10.0,
+    0.2,
+    1e-6,
+)  # factors of the damping after a failed step and a good one
+_MOST_DAMPING_TRIALS: Final = 8
+SMALL_GAIN: Final = 1e-4
+"""Share of the energy; a step that gains less is the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,21 +400,6 @@ def _part(corners: Corners, first: int, last: int) -> Corners:
     return Corners(corners.points[first:last], corners.normals[first:last])
 
 
-PAD_COMPRESSION: Final = 0.001
-"""Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
-_MOST_TOUCH_GAP: Final = 0.012  # [m] between the two pads of a touch
-_MOST_TOUCH_SPEED: Final = 0.02  # [m/s] of the finger relative to the thumb
-_SHORTEST_HOLD: Final = 0.06  # [s] that a touch lasts
-_MOST_TOUCHES_PER_FINGER: Final = 10
-_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, over which speed is measured
-_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap, at which a touch has a quarter of its weight
-_PAD_DEPTH: Final = 0.006  # [m] below the skin: about the middle of a pad
-_SLIDE_ROUNDS: Final = 3
-_GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
-_FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
-_MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
-
-
 class Contacts(NamedTuple):
     """K contacts of the thumb, each in one frame, with a point on either pad."""
 
@@ -600,19 +609,6 @@ def _blend_transforms(
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     blends: NDArray[np.float64] = np.einsum("kl,klij->kij", skin_weights(coordinates), motion)
     return blends
-
-
-Progress = Callable[[int, float, float], None]
-"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
-_DAMPING_RAISE, _DAMPING_CUT, _LEAST_RAISED_DAMPING = (
-    10.0,
-    0.2,
-    1e-6,
-)  # factors of the damping after a failed step and a good one
-_MOST_DAMPING_TRIALS: Final = 8
-SMALL_GAIN: Final = 1e-4
-"""Share of the energy; a step that gains less is the last one."""
 
 
 def levenberg_marquardt(

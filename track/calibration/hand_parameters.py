@@ -35,6 +35,9 @@ _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
+_MOST_PROJECTION_STEPS: Final = 40
+_OUTSIDE_COORDINATE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
+_PROJECTION_TOLERANCE: Final = 1e-8  # [m] from the target, at which a projection ends
 
 
 def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape:
@@ -121,11 +124,6 @@ def skinning_terms(
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
     by_bone += motion[:, None, ..., 3]
     return rotations, by_bone
-
-
-_MOST_PROJECTION_STEPS: Final = 40
-_OUTSIDE_COORDINATE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
-_PROJECTION_TOLERANCE: Final = 1e-8  # [m] from the target, at which a projection ends
 
 
 class SkinTopology(NamedTuple):

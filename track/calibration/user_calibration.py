@@ -62,6 +62,19 @@ _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
 _BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
 _SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
+NUM_FRAMES: Final = 240
+"""Frames that a calibration is solved on."""
+FEWEST_FRAMES: Final = 100
+"""Usable frames without which a capture is refused."""
+_INITIAL_FRAMES: Final = 800
+_FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
+_LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
+_MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
+_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
+_LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
+_CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
+_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +213,8 @@ def calibrate_hand(
     markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     complete = complete_digits(markers, right.attachment)
-    track = initial_poses(markers, right, usable)
+    # Poses of frames spread over the capture, on the hand that the calibration begins with.
+    track = solve_frames(markers, right, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
     problem, estimate = _initial_problem(markers, right, track)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
     rough = user_hand(right, problem, estimate)
@@ -209,7 +223,10 @@ def calibrate_hand(
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
     estimate, fit = _solve_with_spreads(problem, estimate, steps, progress)
     done = user_hand(right, problem, estimate)
-    before = _gaps_before(right, markers, touches, usable)
+    before = np.empty(0)
+    if touches:
+        touching = usable[[frame for frame, _ in touches]]
+        before = contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
     final = solve_frames(markers, done, usable, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
@@ -320,26 +337,6 @@ def _touches(
     )
 
 
-def _gaps_before(
-    right: GloveFit, markers: NDArray[np.float64], touches: list[tuple[int, str]], frames: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Gaps of the touches (K,) [m] on the hand that the calibration began with."""
-    if not touches:
-        return np.empty(0)
-    touching = frames[[frame for frame, _ in touches]]
-    return contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
-
-
-NUM_FRAMES: Final = 240
-"""Frames that a calibration is solved on."""
-FEWEST_FRAMES: Final = 100
-"""Usable frames without which a capture is refused."""
-_INITIAL_FRAMES: Final = 800
-_FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
-_LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
-_MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
-
-
 class PoseTrack(NamedTuple):
     """Poses of K frames of a capture."""
 
@@ -380,22 +377,9 @@ def solve_frames(
     frames: NDArray[np.int64],
     initial: NDArray[np.float64] | None = None,
 ) -> PoseTrack:
-    """Solve the poses of some frames.
-
-    Args:
-        markers: All markers of the capture [m]; NaN where missing.
-        frames: Numbers of the frames (K,).
-        initial: Poses to start from (K, 27).
-    """
+    """Solve the poses of frames by their numbers, from initial poses (K, 27) if there are any."""
     solved = PoseSolver(hand).solve(markers[frames], initial)
     return PoseTrack(frames, solved.qpos, solved.rms, solved.residuals)
-
-
-def initial_poses(
-    markers: Float[np.ndarray, "T M 3"], hand: GloveFit, usable: NDArray[np.int64]
-) -> PoseTrack:
-    """Poses of frames spread over the capture, on the hand that a calibration begins with."""
-    return solve_frames(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
 
 
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
@@ -425,13 +409,6 @@ def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) ->
         chosen.append(int(distance.argmax()))
     picked: NDArray[np.int64] = candidates[np.sort(chosen)]
     return picked
-
-
-_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
-_LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
-_CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
-_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
-_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -536,13 +513,7 @@ def standard_errors(
 def contact_gaps(
     model: HandModel, touches: list[tuple[int, str]], qpos: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Gaps between thumb and finger (K,) [m] of touches on a hand.
-
-    Args:
-        model: A right hand.
-        touches: Frame and finger of each.
-        qpos: Poses of these frames (K, 27).
-    """
+    """Gaps between thumb and finger (K,) [m] of touches on a right hand, in the poses (K, 27) of each."""
     bones = model.forward_kinematics(qpos)
     contacts = initialize_contacts(model, touches, bones)
     faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])

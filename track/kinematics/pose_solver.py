@@ -58,9 +58,8 @@ _THUMB: Final = (
     (20, 25, 45, 60),
     (-20, 35, 50, 40),
 )
-_ALIGNMENT_ROUNDS: Final = (
-    3  # of choosing digits and aligning again; the choice no longer changes after these
-)
+# Of choosing digits and aligning again; the choice no longer changes after these.
+_ALIGNMENT_ROUNDS: Final = 3
 _LEAST_SHAPE_SPREAD: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
 _ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
 _STEPS_AT_WIDE_SCALES: Final = 8  # at most at each widened scale
