@@ -51,8 +51,7 @@ from train.labelers.networks import (
 from train.labelers.pose_prior import learn_pose_prior
 from train.labelers.protocol import MOST_THREADS, Labeling, torch_threads
 from train.labelers.storage import save_network
-from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
-from train.reports.run_page import write_run_page
+from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_page
 from train.settings import CNNConfig, Kind, TrainSettings, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"

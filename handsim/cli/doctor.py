@@ -60,7 +60,7 @@ def doctor() -> int:
     Returns:
         0 when everything that the commands need is there, else 1.
     """
-    from handsim.app.progress import named_steps
+    from handsim.app.messages import named_steps
 
     with named_steps("drawing a picture and looking for a GPU"):
         findings = examine()

@@ -11,8 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together

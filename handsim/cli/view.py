@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from handsim.app.messages import LiveStatus, print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import LiveStatus, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
