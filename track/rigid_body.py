@@ -26,9 +26,8 @@ from handsim.errors import ArgumentError, CalibrationError, HandSimError, choice
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import SIDES
-from handsim.kernels import move, velocity_of
+from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.transforms import quaternion_matrix
 from track.constellation import (
     FEWEST,
     assign_remaining,
@@ -364,7 +363,8 @@ class BodyTracker:
         labels[assignment[seen]] = seen
         self._last_ids[:] = -1
         self._last_ids[seen] = ids[assignment[seen]]
-        transform[:3, :3], transform[:3, 3] = quaternion_matrix(pose[3:]), pose[:3]
+        write_quaternion_matrix(transform, *pose[3:])
+        transform[:3, 3] = pose[:3]
         return BodyFrame(self._status, transform, labels, rms)
 
 

@@ -186,7 +186,7 @@ def fitted(hand, points, hypothesis, start=MEAN, cutoff=np.inf):
     """Cost, complexity and hinges."""
     work, angles, variance = workspace(19), np.array(start), np.full(19, SPREAD**2)
     compute_markers(hand, RESTING, work)
-    own = DigitPoints(arrays, INDEX, MARKERS, points, variance, MEAN, PRECISION)
+    own = DigitPoints(hand, INDEX, MARKERS, points, variance, MEAN, PRECISION)
     cost, complexity = fit_hypothesis(own, np.array(hypothesis), cutoff, angles, work)
     return cost, complexity, angles
 
