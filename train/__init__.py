@@ -36,10 +36,13 @@ if TYPE_CHECKING:
     from train.labelers.storage import load_labeler as load_labeler
     from train.loop import train_labeler as train_labeler
     from train.settings import CNNConfig as CNNConfig
+    from train.settings import EvaluateSettings as EvaluateSettings
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
+    from train.simulation.takes import SimulateSettings as SimulateSettings
     from train.simulation.takes import simulate_take as simulate_take
+    from train.simulation.training_frames import GenerateSettings as GenerateSettings
 
 __getattr__, __dir__ = lazy_exports(__name__)
 

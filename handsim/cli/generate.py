@@ -41,16 +41,8 @@ def generate(
             docs/cluster.md.
     """
     place = place_of(out)
-    with (
-        progress_bar("frames") as bar,
-        chosen_workers(cluster, workers, bar.say) as chosen,
-    ):
-        manifest = make_dataset(
-            settings,
-            place,
-            workers=chosen,
-            progress=bar,
-        )
+    with progress_bar("frames") as bar, chosen_workers(cluster, workers, bar.say) as chosen:
+        manifest = make_dataset(settings, place, workers=chosen, progress=bar)
     print_line(f"{manifest.num_frames} frames of {settings.glove} in {place}")
     if isinstance(place, Path):
         print_line(f"report in {_report(settings, place)}")

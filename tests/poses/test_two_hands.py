@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.errors import ArgumentError
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, build_spec, join_qpos
@@ -231,26 +230,3 @@ def test_the_data_file_names_what_exists():
                 variant[role][state] for role in ("still", "moving") for state in ("open", "closed")
             } <= known
     assert not set(gesture_names()) & set(package_data("poses", "interactions")["hands"])
-
-
-def test_bad_input_is_told(rng):
-    right, left = hands()
-    for duration in (0.0, -1.0, np.nan):
-        with pytest.raises(ArgumentError, match=r"the duration is .* s, expected a positive number"):
-            sample_two_hand_motion(right, left, duration, rng=rng)
-    with pytest.raises(
-        ArgumentError, match=r"unknown interaction 'clab' .*did you mean 'cla.*valid names: clasp"
-    ):
-        sample_two_hand_motion(right, left, 1.0, interactions=["clab"], rng=rng)
-    with pytest.raises(ArgumentError, match="no interactions were named; valid names: clasp, clap"):
-        sample_two_hand_motion(right, left, 1.0, interactions=[], rng=rng)
-    for sample in (
-        lambda *two: sample_two_hand_motion(*two, 1.0, rng=rng),
-        lambda *two: sample_two_hand_poses(*two, 5, rng=rng),
-    ):
-        with pytest.raises(
-            ArgumentError, match="the hands are a right and a right one, expected a right and a left"
-        ):
-            sample(right, right)
-    with pytest.raises(ArgumentError, match="the count of poses is 0, expected a positive number"):
-        sample_two_hand_poses(right, left, 0, rng=rng)
