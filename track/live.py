@@ -18,11 +18,10 @@ from gloves.takes.take import Take
 from handsim.app.messages import LiveStatus
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
-from track.frames import FARTHEST, TrackedFrame
+from track.frames import FARTHEST, StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.settings import TrackerSetup
 from track.sinks import SinkGroup
-from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands

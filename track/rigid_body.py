@@ -41,7 +41,7 @@ from track.constellation import (
     write_labels,
     write_transform,
 )
-from track.streams.frame_source import StreamedFrame, capture_frames
+from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""

@@ -16,7 +16,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.space.rig import CameraRig, as_rig
 from track.glove_advice.improvement import Improvement, Worth
 from track.glove_advice.trials import CAPTURES, Trial, try_layout, verdict
-from track.inputs import AnyGlove
+from track.user import AnyGlove
 from train.labelers.layout_labeler import learned_labeler
 
 _FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one

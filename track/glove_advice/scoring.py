@@ -18,7 +18,7 @@ from track.glove_advice.advice import advice
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_motion, observe_poses
 from track.glove_advice.trials import CAPTURES, try_layout
-from track.inputs import AnyGlove, AnyLabeler
+from track.user import AnyGlove, AnyLabeler
 from train.labelers.layout_labeler import learned_labeler
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take

@@ -21,9 +21,9 @@ from handsim.hand.shape import Side
 from handsim.space.rig import CameraRig
 from track.captures import label_capture, track_capture
 from track.config import BOTH
+from track.frames import checked_frames
 from track.hand_size import measured_user, sample_frames
 from track.settings import USUAL_SIZE
-from track.streams.frame_source import checked_frames
 from track.user import nominal_user
 from train.evaluation import LabelCounts
 from train.labelers.protocol import Labeler

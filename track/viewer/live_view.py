@@ -10,8 +10,7 @@ import numpy as np
 
 from gloves.takes.take import label_names
 from handsim.hand.shape import NUM_QPOS
-from track.frames import TrackedFrame
-from track.streams.frame_source import StreamedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 from track.viewer.frame_view import FrameView
 from track.viewer.recordings import Recording, ShownFrame, shown_body
