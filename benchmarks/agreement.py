@@ -22,7 +22,7 @@ from handsim.hand.shape import EVERYBODY
 from handsim.space.rig import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import HIGH, LOW, sample_valid_angles
-from train.simulation.scenes import sample_hands
+from train.simulation.training_frames import sample_hands
 
 CHECKED = 20  # frames per hand that MuJoCo repeats
 

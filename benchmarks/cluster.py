@@ -34,7 +34,7 @@ from render.config import RenderConfig
 from render.session import render_take
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 
@@ -127,7 +127,7 @@ def running(folder: Path, workers: int) -> Iterator[DaskProcesses]:
 
 
 def frames(count: int, out: Path, workers: int | Executor) -> None:
-    make_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=workers)
+    make_dataset(GenerateSettings(num_frames=count, seed=3), out, workers=workers)
 
 
 def pictures(take: Path, out: Path, workers: int | Executor) -> None:

@@ -27,7 +27,7 @@ from train.labelers.networks import labeler_of
 from train.loop import TrainingState, start_fabric
 from train.settings import KINDS, TrainSettings, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 GLOVE = "dense19"
 EVERY = {"set": 40_000, "cnn": 20_000}  # samples between two looks
@@ -69,7 +69,7 @@ def race(
 ) -> dict[str, dict[str, float]]:
     """Minutes from the start until the paper's best network was beaten, by test set and kind of test."""
     start, measuring = time.perf_counter(), 0.0
-    make_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
+    make_dataset(GenerateSettings(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
     recipe = config.batch_recipe(len(names))

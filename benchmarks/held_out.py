@@ -10,8 +10,7 @@ from jaxtyping import Float
 from gloves.layout import load_layout
 from handsim.space.rig import as_rig
 from train.data.shards import row_dtype
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, simulate_frames
+from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
 _SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 
@@ -24,12 +23,13 @@ def held_out_markers(glove: str, num_frames: int, *, seed: int) -> Float[np.ndar
         num_frames: Number of frames T; another person every 128 frames.
         seed: Seed of the people and poses.
     """
-    config = DatasetConfig(glove=glove, num_frames=num_frames, seed=seed)
+    config = GenerateSettings(glove=glove, num_frames=num_frames, seed=seed)
     layout, rig = load_layout(glove), as_rig(config.rig)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY,)))
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
+    source = FrameSource(config, layout, rig)
     for first in range(0, num_frames, config.frames_per_hand):
         block = rows[first : first + config.frames_per_hand]
-        simulate_frames(block, sample_hands(config.population, rng=rng), layout, rig, config, rng=rng)
+        simulate_frames(block, sample_hands(config.population, rng=rng), source, rng=rng)
     markers: Float[np.ndarray, "T M 3"] = rows["markers"].astype(np.float64)
     return markers

@@ -48,7 +48,7 @@ def fit_error(hand: GloveFit, markers: np.ndarray) -> float:
 
 def angle_error(take: Take, truth: Take, side: Side) -> float:
     """RMS over frames and joints [deg]."""
-    found, true = (one.qpos[:, one.hand(side), 7:] for one in (take, truth))
+    found, true = (one.qpos[:, one.hand_index(side), 7:] for one in (take, truth))
     return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
 
 
@@ -62,7 +62,7 @@ def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
     rows = []
     for done, worn in zip(user.calibrations, user, strict=True):
         side = worn.side
-        true = truth.hands[truth.hand(side)]
+        true = truth.hands[truth.hand_index(side)]
         fresh = truth.observed(side)[count:]
         assert done.held_out is not None
         kept = done.held_out.after if done.is_better else done.held_out.before

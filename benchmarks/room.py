@@ -39,13 +39,12 @@ from train.simulation.room import (
     sample_light_sources,
     stray_reflections,
 )
-from train.simulation.scenes import sample_hands
 from train.simulation.takes import sample_scene, simulate_take
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings, sample_hands
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
-PEOPLE = DatasetConfig()
+PEOPLE = GenerateSettings()
 
 
 class Stopwatch:

@@ -29,7 +29,7 @@ from train.data.batches import Corruption, corrupt
 from train.labelers.storage import load_labeler
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 SHARD = 1.0  # [s] that a shard sleeps
 EACH = 8  # shards of each worker
@@ -79,7 +79,7 @@ def cost(make: Callable[[Path], int], out: Path) -> Cost:
 
 
 def frames(out: Path, count: int) -> int:
-    make_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=count, seed=1), out, workers=1)
     return count
 
 

@@ -71,7 +71,7 @@ from train.settings import CNNConfig, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
@@ -288,7 +288,7 @@ def commands(speeds: Speeds) -> None:
 def training(speeds: Speeds) -> None:
     config = usual_settings("cnn")
     with tempfile.TemporaryDirectory() as folder:
-        make_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
+        make_dataset(GenerateSettings(num_frames=2000), Path(folder) / "set")
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
         rng, recipe = np.random.default_rng(0), config.batch_recipe(rows["markers"].shape[1])
@@ -365,7 +365,7 @@ def generation(speeds: Speeds) -> None:
         ("frames_mix_one", "the default mix", SceneMix(), 1),
     ):
         with tempfile.TemporaryDirectory() as folder:
-            config = DatasetConfig(num_frames=speeds.some(100_000, 3000), scenes=scenes)
+            config = GenerateSettings(num_frames=speeds.some(100_000, 3000), scenes=scenes)
             seconds = timed(lambda: make_dataset(config, Path(folder) / "set", workers=workers))  # noqa: B023
         speeds.rate(key, f"training frames of {name}, workers: {workers}", config.num_frames / seconds)
 

@@ -71,8 +71,7 @@ class Attachment:
     @property
     def main_bones(self) -> Int[np.ndarray, "M"]:
         """The bone that carries most of each marker."""
-        main: np.ndarray = self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)]
-        return main
+        return np.asarray(self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)])
 
     def centers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
@@ -97,8 +96,7 @@ class Attachment:
         weights = np.zeros(local.shape[:2])
         np.add.at(weights, (np.arange(len(rest))[:, None], self.bone_indices), self.bone_weights)
         bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
-        carried: NDArray[np.float64] = (weights[..., None] * local).reshape(len(rest), -1) @ bones
-        return carried
+        return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
 
     def sites(self, model: HandModel) -> tuple[Site, ...]:
         """The markers as MuJoCo sites, each on the bone that carries most of it."""
@@ -138,12 +136,9 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
 def vary_layout(
     layout: MarkerLayout, *, along: float, around: float, rng: np.random.Generator
 ) -> MarkerLayout:
-    """The same glove with its markers moved at random, as if put on less carefully.
+    """The same glove with its markers moved at random along [bone lengths] and around [rad] the bones.
 
-    Args:
-        layout: The glove as designed.
-        along: Standard deviation along the bones [bone lengths]; for the palm also across, at half of it.
-        around: Standard deviation around the bones [rad].
+    Both are standard deviations; on the palm markers move across too, at half of `along`.
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
@@ -165,9 +160,6 @@ def wear(
     """The glove put on with its markers slipped a little (`vary_layout`).
 
     It is drawn again if a marker is off the hand; after twenty draws it is put on as designed.
-
-    Raises:
-        LayoutError: A marker meets no skin even as designed.
     """
     for _ in range(_MOST_FITTINGS):
         try:
@@ -372,15 +364,7 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
 
 
 def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes, with its glove put on as designed.
-
-    Args:
-        size: XS, S, M, L or XL: 0.165 to 0.210 [m] of hand length.
-
-    Raises:
-        ArgumentError: There is no such size or side.
-        LayoutError: A marker meets no skin, and the message names it; or the glove is for the other hand.
-    """
+    """A hand of one of the five sizes XS to XL, with its glove put on as designed."""
     worn, model = load_layout(layout), HandModel.named(size, side=side)
     worn.check_side(side)
     return attach(worn, model)
@@ -406,58 +390,12 @@ _SPACING: Final = 4e-3  # [m] between the skin's vertices, about
 def place_marker(
     layout: MarkerLayout, index: int, model: HandModel, point: Float[np.ndarray, "3"]
 ) -> MarkerLayout:
-    """The layout with one marker moved to the place on the skin that is nearest to a point.
+    """The layout with one marker moved to the place on the skin that is nearest to a point, or an error.
 
-    The marker stays on its bone where that reaches the point, or else goes to the one that carries the skin
-    there. On the palm it lies straight above or below its place in the palm's plane.
-
-    Args:
-        index: The marker to move.
-        model: The hand that the point is meant on.
-        point: Where the marker's center shall be, in the wrist's frame of the flat hand [m]. A marker on a
-            stalk keeps its height, and comes to stand where the stalk points at this.
-
-    Raises:
-        LayoutError: No marker can be put there.
+    The point [m] is in the wrist's frame of the flat hand. The marker stays on its bone where that reaches
+    the point, or else goes to the one that carries the skin there. On the palm it lies straight above or
+    below its place in the palm's plane. A marker on a stalk keeps its height; the stalk points at the point.
     """
-    height = layout.markers[index].height
-    placed = _place_on_skin(_with_height(layout, index, 0.0), index, model, point)
-    return placed if height == 0.0 else _stand_up(placed, index, height, model, point)
-
-
-def _stand_up(
-    layout: MarkerLayout, index: int, height: float, model: HandModel, point: NDArray[np.float64]
-) -> MarkerLayout:
-    """A marker that lies near its place, put on its stalk and moved until the stalk points at a point."""
-    foot = attach_markers(layout, model).points[index]
-    best, least = layout, math.inf
-    for _ in range(_STEPS):
-        standing = _with_height(layout, index, height)
-        worn = attach_markers(standing, model)
-        missed = point - worn.points[index]
-        missed -= (missed @ worn.normals[index]) * worn.normals[index]
-        distance = float(np.linalg.norm(missed))
-        if distance < least:
-            best, least = standing, distance
-        if least < _POINTED:
-            break
-        # On skin as curved as a finger's tip the end of the stalk moves more than its foot.
-        foot = foot + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
-        layout = _place_on_skin(layout, index, model, foot)
-    return best
-
-
-def _with_height(layout: MarkerLayout, index: int, height: float) -> MarkerLayout:
-    marker = dataclasses.replace(layout.markers[index], height=height)
-    return dataclasses.replace(
-        layout, markers=(*layout.markers[:index], marker, *layout.markers[index + 1 :])
-    )
-
-
-def _place_on_skin(
-    layout: MarkerLayout, index: int, model: HandModel, point: NDArray[np.float64]
-) -> MarkerLayout:
-    """The layout with a marker without a stalk on the skin that is nearest to a point."""
     surface = model.surface
     nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
     normal = vertex_normals(surface.vertices, surface.faces)[nearest]
@@ -468,7 +406,7 @@ def _place_on_skin(
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
     for bone in dict.fromkeys(bones):
-        candidate, missed = _place_on(layout, index, bone, model, center)
+        candidate, missed = _place_on(layout, index, bone, model, center, point)
         if missed < least:
             best, least = candidate, missed
         if least < _REACHED:
@@ -479,30 +417,39 @@ def _place_on_skin(
 
 
 def _place_on(
-    layout: MarkerLayout, index: int, bone: int, model: HandModel, center: NDArray[np.float64]
+    layout: MarkerLayout,
+    index: int,
+    bone: int,
+    model: HandModel,
+    center: NDArray[np.float64],
+    point: NDArray[np.float64],
 ) -> tuple[MarkerLayout, float]:
-    """The layout with a marker's center on one bone as near to a place as can be, and how far it misses [m].
+    """The layout with a marker on one bone, as near to a center or as much towards a point as can be.
 
-    The layout is the given one, and the distance infinite, where the bone's rays meet no skin.
+    And how far it misses [m]: infinitely where the bone's rays meet no skin.
     """
-    wanted, start = center, model.rest_transforms[bone]
+    height, wanted, start = layout.markers[index].height, center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
     for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
-        moved = _place(layout.markers[index], bone, model, wanted)
+        moved = dataclasses.replace(_place(layout.markers[index], bone, model, wanted), height=height)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
         try:
-            missed = center - attach_markers(candidate, model).points[index]
+            worn = attach_markers(candidate, model)
         except LayoutError:  # beside the skin, as beyond a finger's tip
             wanted = wanted + 0.1 * (middle - wanted)
             continue
+        missed = (point if height else center) - worn.points[index]
+        if height:
+            missed -= (missed @ worn.normals[index]) * worn.normals[index]
         distance = float(np.linalg.norm(missed))
         if distance < least:
             least, best = distance, candidate
-        if least < _NEAR:
+        if least < (_POINTED if height else _NEAR):
             break
-        wanted = wanted + missed
+        # On skin as curved as a finger's tip the end of a stalk moves more than its foot.
+        wanted = wanted + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
     return best, least
 
 

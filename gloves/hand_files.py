@@ -66,11 +66,7 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
 
 
 def write_skin(path: Path, model: HandModel) -> None:
-    """Write the skin in the flat pose [m], in the wrist's frame, as .glb, .obj, .ply or .stl.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the skin in the flat pose [m], in the wrist's frame, as .glb, .obj, .ply or .stl."""
     import trimesh
 
     surface = model.surface

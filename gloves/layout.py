@@ -268,12 +268,7 @@ def shipped_layout(name: str) -> ShippedLayout:
 
 
 def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
-    """A layout from what `dataclasses.asdict` made of it, as takes and training sets keep it.
-
-    Raises:
-        LayoutError: The values do not make a layout.
-        KeyError, TypeError: Keys are missing or unknown.
-    """
+    """A layout from what `dataclasses.asdict` made of it, as takes and training sets keep it."""
     markers = tuple(MarkerPlace(**marker) for marker in stored["markers"])
     return MarkerLayout(**{**stored, "markers": markers})
 
@@ -313,11 +308,7 @@ def _marker_lines(marker: MarkerPlace) -> list[str]:
 
 
 def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
-    """The layout of a file's table.
-
-    Raises:
-        HandSimError: A value is missing, unknown or out of range.
-    """
+    """The layout of a file's table."""
     check_keys(table, "the file", _LAYOUT_KEYS, optional=("description", "source", "sides", "marker"))
     text_of(table, "description", default="")
     text_of(table, "source", default="")
@@ -353,9 +344,7 @@ _DECIMALS: Final = 1e-8
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
     """The text of a layout file with the same markers in the same order where `layout` has them.
 
-    Returns:
-        The text, and whether it is the given one with changed places. Where that one is written in a way
-        that cannot be changed line by line, the text is a new one without comments.
+    And whether comments stay: a text that cannot be changed line by line is written anew, without them.
     """
     lines = text.splitlines()
     starts = [number for number, line in enumerate(lines) if _TABLE.match(line)]

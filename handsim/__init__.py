@@ -14,8 +14,8 @@ from handsim.errors import HandSimWarning as HandSimWarning
 
 if TYPE_CHECKING:
     from handsim.hand.model import HandModel as HandModel
+    from handsim.hand.model import HandMotion as HandMotion
     from handsim.hand.model import join_qpos as join_qpos
-    from handsim.hand.motion import HandMotion as HandMotion
     from handsim.hand.shape import HandShape as HandShape
     from handsim.hand.shape import Population as Population
     from handsim.hand.shape import sample_shape as sample_shape

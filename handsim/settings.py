@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim._checks import check_choice, check_count, check_number, check_type, shown_value
 from handsim._plugins import plugin_name
@@ -50,8 +51,8 @@ class Settings:
 
     Each field is checked by its annotation when an object is made: numbers by their `Limits`, names by their
     `Literal`, other types by what they are, `Expected` telling errors what to say. A group of settings may be
-    given as a mapping of the fields that differ from its default, a tuple as a list or as its only item, a
-    path as a string.
+    given as a mapping of the fields that differ from its default (a `Mixture` as its shares), a tuple as a
+    list or as its only item, a path as a string.
 
     Raises:
         ArgumentError: A field has another type, is out of range, or is none of the valid names.
@@ -100,6 +101,25 @@ class Settings:
         """The settings as JSON, objects by their names."""
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         return {field.name: _json_of(getattr(self, field.name)) for field in fields}
+
+
+class Mixture(Settings):
+    """Base of shares of kinds, which are normalized; a share that a mapping does not name is 0."""
+
+    __slots__ = ()
+
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """The fields in order, their sum being 1."""
+        shares = np.array(dataclasses.astuple(self), dtype=np.float64)  # type: ignore[call-overload]
+        return np.asarray(shares / shares.sum())
+
+    def check(self) -> None:
+        """Refuse shares that are negative, or all 0."""
+        shares: dict[str, float] = dataclasses.asdict(self)  # type: ignore[call-overload]
+        for name, share in shares.items():
+            check_number(name, share, 0.0)
+        check_number(f"the sum of {', '.join(shares)}", sum(shares.values()), 0.0, above=True)
 
 
 def _json_of(value: Any) -> Any:
@@ -212,10 +232,12 @@ def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) ->
 
 
 def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
-    """A group of settings from the fields that differ from its default."""
+    """A group of settings from the fields that differ from its default; a mixture from all its shares."""
     known = [one.name for one in dataclasses.fields(kind) if one.init]
     for change in changes:
         check_choice(change, known, noun=f"setting of {name}")
+    if issubclass(kind, Mixture):
+        return kind(**(dict.fromkeys(known, 0.0) | dict(changes)))
     usual = None
     if field is not None and field.default_factory is not dataclasses.MISSING:
         usual = field.default_factory()

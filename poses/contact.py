@@ -275,12 +275,8 @@ def close_fingers(
 ) -> Float[np.ndarray, "T 20"]:
     """Joint angles [rad] of fingers that close from one pose towards another until they meet a hand.
 
-    Args:
-        opened: Poses with open fingers.
-        closed: Joint angles [rad] of the fingers if nothing blocks them.
-        strength: Share of the path that each digit closes then.
-        other: The hand that blocks the fingers, besides their own, in its poses.
-        window: Frames over which the paths are smoothed; 1 leaves each frame alone.
+    Each digit closes by its share of the path that is free of its own hand and the other. Paths are smoothed
+    over a window of frames; 1 leaves each frame alone.
     """
     busy = np.flatnonzero(strength.max(axis=1) > 0.0)
     angles = opened[:, 7:].copy()
@@ -317,8 +313,7 @@ def smooth_above(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
         return values
     kernel = np.hanning(window + 2)[1:-1]
     highest = maximum_filter1d(values, window, mode="nearest")
-    smooth: NDArray[np.float64] = convolve1d(highest, kernel / kernel.sum(), mode="nearest")
-    return smooth
+    return np.asarray(convolve1d(highest, kernel / kernel.sum(), mode="nearest"))
 
 
 def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
@@ -406,13 +401,7 @@ def path_between(
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one pose to another by way of one where the hands are apart; None when not valid.
-
-    Args:
-        start: Where the path begins, one frame.
-        end: Where it ends, one frame.
-        pause: Shortest and longest rest where the hands are apart [s].
-    """
+    """Frames from one pose to another by way of a rest [s] with hands apart; None when not valid."""
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
     )

@@ -30,7 +30,14 @@ from handsim.hand.shape import (
     shape_from_measures,
 )
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions, vector_quaternions
+from handsim.space.transforms import (
+    MIRROR,
+    pose_matrices,
+    quaternion_matrix,
+    rotation_quaternions,
+    transform_poses,
+    vector_quaternions,
+)
 from poses.shapes import HIGH, LOW, gesture, is_valid
 
 MAX_OBJECT_PENETRATION: Final = 0.0015
@@ -74,14 +81,14 @@ class GraspScene:
         data = mujoco.MjData(self.mj_model)
         data.eq_active[:] = 0
         data.qpos[:NUM_JOINTS] = angles
-        data.qpos[NUM_JOINTS:] = pose_to_qpos(T_wrist_object)
+        data.qpos[NUM_JOINTS:] = transform_poses(T_wrist_object[None])[0]
         data.ctrl[:] = angles
         mujoco.mj_forward(self.mj_model, data)
         return data
 
     def object_pose(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """`T_wrist_object` of a state."""
-        return qpos_to_pose(data.qpos[NUM_JOINTS:])
+        return np.asarray(pose_matrices(data.qpos[None, NUM_JOINTS:])[0])
 
     def distances(self, data: mujoco.MjData, geoms: Sequence[int] | None = None) -> NDArray[np.float64]:
         """Distance [m] of some of the hand's capsules, or all, to the object (K,), negative inside it."""
@@ -100,7 +107,7 @@ class GraspScene:
     ) -> NDArray[np.float64]:
         """Deepest overlap [m] of hand and object in every frame (T,)."""
         data = mujoco.MjData(self.mj_model)
-        qpos = np.concatenate([angles, pose_to_qpos(T_wrist_object)], axis=1)
+        qpos = np.concatenate([angles, transform_poses(T_wrist_object)], axis=1)
         depth = np.zeros(len(qpos))
         first_object = self.object_geoms[0]
         for frame, row in enumerate(qpos):
@@ -133,29 +140,7 @@ def object_penetration(
         raise ArgumentError(
             f"qpos has {len(qpos)} frames and T_world_object {len(poses)}, expected equal numbers"
         )
-    return grasp_scene(model, obj).depth(qpos[:, 7:], np.linalg.inv(wrist_poses(qpos)) @ poses)
-
-
-def wrist_poses(qpos: Float[np.ndarray, "T 27"]) -> NDArray[np.float64]:
-    """`T_world_wrist` (T, 4, 4) of poses."""
-    poses = np.tile(np.eye(4), (len(qpos), 1, 1))
-    poses[:, :3, :3] = quaternion_matrix(qpos[:, 3:7])
-    poses[:, :3, 3] = qpos[:, :3]
-    return poses
-
-
-def pose_to_qpos(poses: Float[np.ndarray, "*batch 4 4"]) -> NDArray[np.float64]:
-    """Position and wxyz quaternion (..., 7) of rigid transforms."""
-    flat = poses.reshape(-1, 4, 4)
-    rows = np.concatenate([flat[:, :3, 3], rotation_quaternions(flat[:, :3, :3])], axis=1)
-    return rows.reshape(*poses.shape[:-2], 7)
-
-
-def qpos_to_pose(qpos: Float[np.ndarray, "7"]) -> NDArray[np.float64]:
-    """Rigid transform (4, 4) of a position and a wxyz quaternion."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = quaternion_matrix(qpos[3:]), qpos[:3]
-    return pose
+    return grasp_scene(model, obj).depth(qpos[:, 7:], np.linalg.inv(pose_matrices(qpos[:, :7])) @ poses)
 
 
 def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
@@ -343,8 +328,7 @@ def _perpendicular(axis: NDArray[np.float64], angle: float) -> NDArray[np.float6
     axis = axis / np.linalg.norm(axis)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
-    rotated: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
-    return rotated
+    return np.asarray(np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
 
 
 def _landmark(
@@ -356,8 +340,7 @@ def _landmark(
     radius = model.capsules.radii[model.capsules.bones == number][0]
     sideways = -sideways if model.shape.side == "left" else sideways
     local = np.array([along * model.skeleton.lengths[number], sideways * radius, back * radius])
-    world: NDArray[np.float64] = bones[number, :3, :3] @ local + bones[number, :3, 3]
-    return world
+    return np.asarray(bones[number, :3, :3] @ local + bones[number, :3, 3])
 
 
 def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -451,10 +434,6 @@ def settle_hold(
     """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
 
     The hold is one of `hold_names`, a random one when not given.
-
-    Raises:
-        ArgumentError: The object has no hold of this name.
-        PoseError: This hand does not get hold of it in forty tries.
     """
     names = hold_names(obj) if hold is None else (hold,)
     scene = grasp_scene(model, obj)
@@ -512,7 +491,7 @@ def why_not_held(style: HoldStyle, touching: set[str]) -> str:
 def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
     """Close the fingers; the object is first guided by a soft spring, then free, or lies in the palm."""
     model = scene.mj_model
-    guide = pose_to_qpos(start)
+    guide = transform_poses(start[None])[0]
     data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
     data.eq_active[:] = 1
     body = model.body("object").id
@@ -585,9 +564,6 @@ def sample_held_poses(
     """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
 
     Returns joint angles [rad], and `T_wrist_object` [m].
-
-    Raises:
-        PoseError: The hold is not valid, such as one of another hand.
     """
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])
@@ -626,8 +602,7 @@ def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
 def rotation_between(start: Held, end: Held) -> NDArray[np.float64]:
     """Rotation vectors (B, 3) [rad] from one orientation of the object to another, in its own frame."""
     between = np.swapaxes(start.poses[:, :3, :3], 1, 2) @ end.poses[:, :3, :3]
-    rotation: NDArray[np.float64] = Rotation.from_matrix(between).as_rotvec()
-    return rotation
+    return np.asarray(Rotation.from_matrix(between).as_rotvec())
 
 
 def is_held_valid(scene: GraspScene, held: Held) -> Bool[np.ndarray, "B"]:
@@ -649,5 +624,4 @@ def _deviations(style: HoldStyle, count: int, rng: np.random.Generator) -> NDArr
             opening = -most[kind] * rng.uniform(0.0, 1.0, (count, 4)) ** np.array([1.0, 0.7, 0.7, 1.0])
             opening[:, 0] = most[kind, 0] * rng.uniform(-1.0, 1.0, count)
             deviations[lifts, index] = opening[lifts]
-    flat: NDArray[np.float64] = deviations.reshape(count, NUM_JOINTS)
-    return flat
+    return np.asarray(deviations.reshape(count, NUM_JOINTS))

@@ -7,19 +7,19 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim._checks import check_array, check_choice, check_number, check_rng, check_span, check_type
+from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.inputs import package_data
-from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos, load_model
 from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape
+from handsim.settings import Limits, Settings
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.shapes import (
@@ -50,35 +50,23 @@ _FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # how far the fingers part before, in 
 
 
 @dataclass(frozen=True, slots=True)
-class MotionConfig:
-    """Speeds of a hand, and the volume in which its wrist moves.
+class MotionConfig(Settings):
+    """Speeds of a hand, and the volume in which its wrist moves."""
 
-    Raises:
-        ArgumentError: A number or a pair of numbers is out of range.
-    """
-
-    rate: float = 120.0
+    rate: Annotated[float, Limits(0.0, above=True)] = 120.0
     """Frames per second [Hz]."""
-    max_speed: float = 10.0
+    max_speed: Annotated[float, Limits(0.0, above=True)] = 10.0
     """Highest joint speed [rad/s]; rapid finger tapping reaches about this."""
-    max_acceleration: float = 200.0
+    max_acceleration: Annotated[float, Limits(0.0, above=True)] = 200.0
     """Largest joint acceleration [rad/s^2]."""
-    durations: tuple[float, float] = (0.15, 0.8)
+    durations: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.15, 0.8)
     """Shortest and longest time of a path that the limits would allow to be quicker [s]."""
-    hold: float = 0.3
+    hold: Annotated[float, Limits(0.0)] = 0.3
     """Longest rest at a pose [s]."""
-    volume: float = 0.3
+    volume: Annotated[float, Limits(0.0)] = 0.3
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
-    wrist_time: tuple[float, float] = (0.6, 2.0)
+    wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.6, 2.0)
     """Shortest and longest time between two positions of the wrist [s]."""
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "max_speed", "max_acceleration"):
-            check_number(name, getattr(self, name), 0.0, above=True)
-        for name in ("hold", "volume"):
-            check_number(name, getattr(self, name), 0.0)
-        for name in ("durations", "wrist_time"):
-            check_span(name, getattr(self, name))
 
 
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
@@ -155,27 +143,17 @@ _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True)
-class WristConfig:
-    """Positions and orientations of the wrist of a person at a table.
-
-    Raises:
-        ArgumentError: A number or a pair of numbers is out of range.
-    """
+class WristConfig(Settings):
+    """Positions and orientations of the wrist of a person at a table."""
 
     center: tuple[float, float, float] = ROOM_CENTER
     """Middle of the cube it moves in [m]."""
-    volume: float = 0.3
+    volume: Annotated[float, Limits(0.0)] = 0.3
     """Half side of that cube [m]."""
-    turning: float = 0.5
+    turning: Annotated[float, Limits(0.0)] = 0.5
     """Standard deviation of the rotation about each axis, from fingers ahead and palm down [rad]."""
-    times: tuple[float, float] = (0.6, 2.0)
+    times: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.6, 2.0)
     """Shortest and longest time between two positions [s]."""
-
-    def __post_init__(self) -> None:
-        check_array("center", self.center, (3,))
-        check_number("volume", self.volume, 0.0)
-        check_number("turning", self.turning, 0.0)
-        check_span("times", self.times)
 
 
 def free_wrist_path(
@@ -316,11 +294,7 @@ def count_frames(duration: float, config: MotionConfig) -> int:
 def angles_through(
     model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each.
-
-    Raises:
-        PoseError: No path leads out of a pose.
-    """
+    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each."""
     paths = [straight_path(start, target, config, rng) for start, target in pairwise(poses)]
     ends = np.cumsum([len(path) for path in paths])
     valid = np.split(is_valid(model, np.concatenate(paths)), ends[:-1])

@@ -12,10 +12,9 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.capsules import overlap_between
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import BodyMotion, HandMotion
+from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import axis_angle_matrix
+from handsim.space.transforms import axis_angle_matrix, pose_matrices, transform_poses
 from poses.grasps import (
     GraspScene,
     Held,
@@ -27,12 +26,10 @@ from poses.grasps import (
     hold_style,
     is_held_valid,
     object_penetration,
-    pose_to_qpos,
     rotation_between,
     sample_held_poses,
     settle_hold,
     why_not_held,
-    wrist_poses,
 )
 from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
 from poses.shapes import MAX_PENETRATION
@@ -52,10 +49,6 @@ def sample_object_motion(
     """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
     It has `round(duration * rate) + 1` frames.
-
-    Raises:
-        ArgumentError: The duration is not positive.
-        PoseError: This hand does not get hold of the object, or finds no valid path out of a hold.
     """
     config = MotionConfig()
     if not 0.0 < duration < np.inf:
@@ -75,7 +68,7 @@ def sample_object_motion(
     position, quaternion = free_wrist_path(frames, config, rng=rng)
     position = position + _scribble(frames, player.style.scribble, config.rate, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
-    return HandMotion(qpos, config.rate), BodyMotion(wrist_poses(qpos) @ held, config.rate)
+    return HandMotion(qpos, config.rate), BodyMotion(pose_matrices(qpos[:, :7]) @ held, config.rate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,19 +157,13 @@ def point_pen(
 ) -> tuple[HandMotion, BodyMotion]:
     """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
 
-    Args:
-        pen: Its tip is its first marker, its body goes from there along its z axis.
-        held: Motion of fingers and pen relative to the wrist; the wrist's own motion is computed here.
-        path: Poses of the pen with its tip at the origin, from `pointing_path`.
-
-    Raises:
-        PoseError: Something touches even when drawn back.
+    Fingers and pen move in the wrist's frame as they are `held`. The pen's tip is its first marker.
     """
     motion, body = held
-    T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
+    T_wrist_pen = np.linalg.inv(pose_matrices(motion.qpos[:, :7])) @ body.T_world_body
     T_world_pen = path @ _rotated_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
     qpos = motion.qpos.copy()
-    qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+    qpos[:, :7] = transform_poses(T_world_pen @ np.linalg.inv(T_wrist_pen))
     led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
     return keep_apart(holder, other, pen, led, other_motion, path[:, :3, 2])
 
@@ -255,10 +242,7 @@ def pointing_path(
 ) -> Float[np.ndarray, "T 4 4"]:
     """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
 
-    Args:
-        positions: Possible targets, moving in the world [m].
-        outward: Unit directions from which each can be reached.
-        speed: Highest speed of the tip [m/s], see `SPEED`.
+    Targets [m] are reached from their outward unit directions, by a tip no faster than `speed` [m/s].
     """
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
@@ -350,8 +334,7 @@ def _between(
     angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
     mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
     mixed = np.where(angle > 1e-6, mixed, start)
-    between: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12)
-    return between
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12))
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_callable, check_choice, check_number, check_rng, check_type
+from handsim._checks import check_array, check_callable, check_choice, check_rng, check_type
 from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
-from handsim.errors import ArgumentError, PoseError, choices
+from handsim.errors import ArgumentError, PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
+from handsim.settings import Expected, Mixture
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
 """Names of all libraries; no two hold the same name."""
@@ -26,56 +27,45 @@ _GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to li
 @cache
 def _library(library: str) -> dict[str, NDArray[np.float64]]:
     check_choice(library, LIBRARIES, noun="library")
-    data = package_data("poses", library)
-    shapes = package_data("poses", "gestures")  # those of single digits serve all libraries
+    digits = package_data("poses", "gestures")  # those of single digits serve all libraries
     gestures: dict[str, NDArray[np.float64]] = {}
-    for name, entry in data["gestures"].items():
-        fingers = np.array([_numbers(finger, shapes["fingers"]) for finger in entry["fingers"]])
+    for name, entry in package_data("poses", library)["gestures"].items():
+        fingers = np.array([_angles_of(finger, digits["fingers"]) for finger in entry["fingers"]])
         fingers[:, 0] += entry.get("spread", 0.0) * _GESTURE_SPREAD
-        thumb = _numbers(entry["thumb"], shapes["thumbs"])
+        thumb = _angles_of(entry["thumb"], digits["thumbs"])
         gestures[name] = np.deg2rad(np.concatenate([thumb, fingers.ravel()]))
     return gestures
 
 
-def _numbers(digit: str | list[float], shapes: dict[str, list[float]]) -> NDArray[np.float64]:
+@cache
+def _gestures() -> dict[str, NDArray[np.float64]]:
+    return {name: angles for library in LIBRARIES for name, angles in _library(library).items()}
+
+
+def _angles_of(digit: str | list[float], named: dict[str, list[float]]) -> NDArray[np.float64]:
     """Four angles [deg] of a digit that is named or written out."""
-    return np.array(shapes[digit] if isinstance(digit, str) else digit, dtype=np.float64)
+    return np.array(named[digit] if isinstance(digit, str) else digit, dtype=np.float64)
 
 
 def gesture_names(library: str = "gestures") -> tuple[str, ...]:
-    """Names of all gestures of one library.
-
-    Raises:
-        ArgumentError: There is no such library.
-    """
+    """Names of all gestures of one library; an `ArgumentError` if there is no such library."""
     return tuple(_library(library))
 
 
 def gesture(name: str) -> Float[np.ndarray, "20"]:
-    """Joint angles [rad] of a named gesture of any library, in the order of `topology.JOINTS`.
-
-    Raises:
-        ArgumentError: No library holds this name.
-    """
-    for library in LIBRARIES:
-        if name in _library(library):
-            return _library(library)[name].copy()
-    names = [known for library in LIBRARIES for known in _library(library)]
-    raise ArgumentError(choices(name, names, noun="gesture"))
+    """Joint angles [rad] of a gesture of any library, in the order of `topology.JOINTS`, or an error."""
+    check_choice(name, _gestures(), noun="gesture")
+    return _gestures()[name].copy()
 
 
 def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
-    """Joint angles [rad] of every gesture of one library, in the order of `gesture_names(library)`.
-
-    Raises:
-        ArgumentError: There is no such library.
-    """
+    """Joint angles [rad] of every gesture of one library, in the order of `gesture_names(library)`."""
     return np.stack(list(_library(library).values()))
 
 
 def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
     """Joint angles [rad] of every named gesture of all libraries, in the order of `topology.JOINTS`."""
-    return {name: angles.copy() for library in LIBRARIES for name, angles in _library(library).items()}
+    return {name: angles.copy() for name, angles in _gestures().items()}
 
 
 def all_gestures() -> Float[np.ndarray, "G 20"]:
@@ -86,6 +76,9 @@ def all_gestures() -> Float[np.ndarray, "G 20"]:
     return gestures_of("gestures")
 
 
+# Couplings between joints, as of a relaxed hand. Sources (docs/anatomy.md): DIP follows PIP (two thirds on
+# average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
+# neighbors share tendons, so that one finger's flexion drags the next.
 LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
 HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
 
@@ -104,7 +97,7 @@ def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]
 
 
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
-    """Nearest-by-clamping angles [rad] that respect ranges and couplings."""
+    """Clamp angles [rad] to ranges and couplings."""
     coupled = np.clip(angles, LOW, HIGH)
     fingers = finger_view(coupled)[:, 1:]
     flexion = fingers[..., 1]
@@ -116,8 +109,7 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
     fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
-    inside: np.ndarray = np.clip(coupled, LOW, HIGH)
-    return inside
+    return np.asarray(np.clip(coupled, LOW, HIGH))
 
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
@@ -137,11 +129,10 @@ _FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviati
 
 
 @dataclass(frozen=True, slots=True)
-class PoseMix:
+class PoseMix(Mixture):
     """How often each source of poses is drawn; the shares are normalized.
 
-    Raises:
-        ArgumentError: A share is negative, or all are zero.
+    No recorded motion is used: common poses are dense, and all possible poses are covered.
     """
 
     gestures: float = 0.45
@@ -151,16 +142,6 @@ class PoseMix:
     anywhere: float = 0.05
     """Uniform within the ranges."""
 
-    def __post_init__(self) -> None:
-        for name in ("gestures", "curls", "anywhere"):
-            check_number(name, getattr(self, name), 0.0)
-        check_number(
-            "the sum of gestures, curls and anywhere",
-            self.gestures + self.curls + self.anywhere,
-            0.0,
-            above=True,
-        )
-
 
 DEFAULT_MIX: Final = PoseMix()
 
@@ -168,12 +149,8 @@ DEFAULT_MIX: Final = PoseMix()
 def sample_angles(
     count: int, mix: PoseMix = DEFAULT_MIX, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Random joint angles [rad] inside ranges and couplings; digits may still touch.
-
-    `poses.shapes` makes such poses valid.
-    """
-    shares = np.array([mix.gestures, mix.curls, mix.anywhere])
-    source = rng.choice(3, size=count, p=shares / shares.sum())
+    """Random joint angles [rad] inside ranges and couplings; digits may still touch."""
+    source = rng.choice(3, size=count, p=mix.shares)
     angles = np.empty((count, len(LOW)))
     for number, draw in enumerate((_blend_gestures, _curl_fingers, _anywhere)):
         chosen = source == number
@@ -218,8 +195,7 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
     """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
     common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
-    mixed: NDArray[np.float64] = np.sqrt(0.75) * common + np.sqrt(0.25) * own
-    return mixed
+    return np.asarray(np.sqrt(0.75) * common + np.sqrt(0.25) * own)
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -257,7 +233,7 @@ _FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])
 def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
-    """Which poses are inside all ranges and penetrate no deeper than `max_penetration` [m]."""
+    """Which poses are inside all ranges and penetrate the hand no deeper than `max_penetration` [m]."""
     inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
@@ -284,8 +260,7 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
     if not valid.any():
         raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
-    resting: NDArray[np.float64] = tries[valid.argmax()]
-    return resting
+    return np.asarray(tries[valid.argmax()])
 
 
 def make_valid(
@@ -294,14 +269,8 @@ def make_valid(
     """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
 
     The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
-    enough. The path to rest is bisected a few times, so that a fist that was too tight ends as a fist whose
-    fingers touch.
-
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-
-    Raises:
-        PoseError: This hand has no valid pose at rest.
+    enough: a fist that was too tight ends as a fist whose fingers touch. A shape or the name of a size is a
+    right hand.
     """
     model = load_model(model)
     resting = resting_angles(model)
@@ -337,8 +306,12 @@ def sample_valid_angles(
 
 SAMPLERS: Final = "handsim.pose_samplers"
 """Group of entry points of pose samplers."""
+SAMPLER: Final = Expected(
+    "a function (model, num_poses, *, rng), module:name of one, or its entry point",
+    lambda: list_plugins(SAMPLERS),
+)
+"""What errors say of settings that name a sampler."""
 _NOUN: Final = "pose sampler"
-_EXPECTED: Final = "a function (model, num_poses, *, rng), module:name of one, or its entry point"
 _WIDEST: Final = 2.0 * np.pi  # [rad], no joint turns so far
 _FARTHEST: Final = 100.0  # [m] of a wrist from the origin
 
@@ -402,38 +375,28 @@ def sample_poses(
     check_rng(rng)
     if num_poses < 1:
         raise ArgumentError(f"num_poses is {num_poses}, expected a positive number")
-    drawn = checked_sampler(sampler)(hand, num_poses, rng=rng)
+    drawn = load_sampler(sampler, is_tried=False)(hand, num_poses, rng=rng)
     qpos = join_qpos(make_valid(hand, drawn[:, -NUM_JOINTS:]))
-    qpos[:, :-NUM_JOINTS] = qpos[:, :-NUM_JOINTS] if drawn.shape[1] == NUM_JOINTS else drawn[:, :-NUM_JOINTS]
+    if drawn.shape[1] == NUM_QPOS:
+        qpos[:, :-NUM_JOINTS] = drawn[:, :-NUM_JOINTS]
     return qpos
 
 
-def load_sampler(sampler: PoseSampler | str) -> PoseSampler:
+def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSampler:
     """A user's sampler, or the one of a name, behind checks of what it returns; it is tried once.
-
-    Args:
-        sampler: A function like `PoseSampler`; `module:name` of one or of a class whose instances are; or an
-            entry point of the group `handsim.pose_samplers`.
-
-    Returns:
-        A sampler of finite joint angles (T, 20) [rad] or whole poses (T, 27).
 
     Raises:
         ArgumentError: There is none of that name, it does not take a sampler's arguments, or what it returns
             for two poses of a hand of size M has another shape or is not finite.
         HandSimError: It raised an error.
     """
-    checked = checked_sampler(sampler)
-    checked(HandModel.named("M"), 2, rng=np.random.default_rng(0))
-    return checked
-
-
-def checked_sampler(sampler: PoseSampler | str) -> PoseSampler:
-    """As `load_sampler`, but not tried."""
     if not isinstance(sampler, str):
-        names = ", ".join(list_plugins(SAMPLERS))
-        check_callable("sampler", sampler, _EXPECTED + (f"; valid names: {names}" if names else ""))
-    return functools.partial(_drawn, sampler)
+        names = ", ".join(SAMPLER.names())
+        check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))
+    checked = functools.partial(_drawn, sampler)
+    if is_tried:
+        checked(HandModel.named("M"), 2, rng=np.random.default_rng(0))
+    return checked
 
 
 def _drawn(

@@ -129,8 +129,7 @@ def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str
     contact = thumb_contact(model, angles, finger)
     touching = (contact.overlap >= 0.0) & (contact.overlap <= MAX_OVERLAP)
     facing = (contact.facing >= MIN_FACING).all(axis=1)
-    valid: NDArray[np.bool_] = touching & facing & is_valid(model, angles)
-    return valid
+    return np.asarray(touching & facing & is_valid(model, angles))
 
 
 def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,14 +141,12 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
     residuals = _residuals(model, finger, start, moving)
 
     def value(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        values: NDArray[np.float64] = residuals(x[None])[0]
-        return values
+        return np.asarray(residuals(x[None])[0])
 
     def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.where(x + _STEP > high, -_STEP, _STEP)
         moved = residuals(np.vstack([x, x + np.diag(steps)]))
-        quotients: NDArray[np.float64] = (moved[1:] - moved[0]).T / steps
-        return quotients
+        return np.asarray((moved[1:] - moved[0]).T / steps)
 
     inside = np.clip(start[moving], low + 1e-4, high - 1e-4)
     solution = least_squares(

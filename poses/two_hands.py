@@ -15,8 +15,7 @@ from handsim._checks import check_choice
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions
@@ -86,8 +85,7 @@ class Meeting:
 
     def directions(self, beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
         """Unit directions (T, 3) in which the moving hand backs off."""
-        directions: NDArray[np.float64] = self.axis[beats.astype(int)]
-        return directions
+        return np.asarray(self.axis[beats.astype(int)])
 
     def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
@@ -101,8 +99,7 @@ def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> 
     """Values between keys, `beats` counting keys from 0."""
     low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
     share = (beats - low)[:, None]
-    values: NDArray[np.float64] = keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low])
-    return values
+    return np.asarray(keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low]))
 
 
 def check_names(names: tuple[str, ...]) -> None:
@@ -146,13 +143,7 @@ class _FingerSketch(NamedTuple):
 def sketch_meeting(
     variant: dict[str, Any], count: int, *, together: bool, rng: np.random.Generator
 ) -> Sketch:
-    """Random positions, orientations and fingers for `count` beats.
-
-    Args:
-        variant: Its description, from `draw_variant`.
-        count: Number of beats, K.
-        together: Whether beats belong to one meeting, and so resemble each other, or are independent.
-    """
+    """Random positions, orientations and fingers for beats, which are alike if they are `together`."""
     noise = _Noise(count, together, rng)
     still, moving = (
         _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
@@ -163,13 +154,7 @@ def sketch_meeting(
 
 
 def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Meeting:
-    """The beats of all sketches, one sketch after another, with valid fingers of these hands.
-
-    Args:
-        sketches: What was drawn, from `sketch_meeting`.
-        still: The hand that holds still.
-        moving: The other hand, of the other side.
-    """
+    """The beats of all sketches, one sketch after another, with valid fingers of these hands."""
     mirror = np.eye(3) if still.shape.side == "right" else MIRROR
     counts = [len(sketch.targets) for sketch in sketches]
     fingers = _valid_fingers(moving, [sketch.moving for sketch in sketches])
@@ -216,8 +201,7 @@ def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> N
         return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
     side = (-1.0) ** np.arange(count)[:, None]
     direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
-    offsets: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
-    return offsets
+    return np.asarray(side * direction * rng.uniform(0.6, 1.0, size=(count, 1)))
 
 
 def _sketch_fingers(
@@ -257,8 +241,7 @@ def _anchors(
     if isinstance(anchor, str):
         bone = bones_of(anchor)[-1]
         frames = moving.forward_kinematics(join_qpos(opened))[:, bone]
-        tips: NDArray[np.float64] = frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0]
-        return tips
+        return np.asarray(frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0])
     mirror = MIRROR if moving.shape.side == "left" else np.eye(3)
     return np.tile(moving.shape.length * np.array(anchor) @ mirror, (len(opened), 1))
 
@@ -282,11 +265,7 @@ class _Course(NamedTuple):
 
 
 def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random.Generator) -> Passage | None:
-    """One interaction from coming together to letting go; None when this draw is not valid.
-
-    Args:
-        name: One of `INTERACTIONS`.
-    """
+    """One interaction from coming together to letting go; None when this draw is not valid."""
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
@@ -308,12 +287,7 @@ def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random
 def draw_poses(
     right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
 ) -> Passage:
-    """Valid single poses of several interactions, the roles drawn once for each.
-
-    Args:
-        counts: Names out of `INTERACTIONS`, each with a number of poses to draw; those that are not valid are
-            left out.
-    """
+    """The valid ones of so many single poses of several interactions, the roles drawn once for each."""
     draws = [_draw(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")
     passages, valid = [], []
@@ -480,8 +454,7 @@ def two_hands_penetration(
         left.capsules,
         left.forward_kinematics(left_qpos),
     )
-    depth: NDArray[np.float64] = np.maximum(overlap, 0.0)
-    return depth
+    return np.asarray(np.maximum(overlap, 0.0))
 
 
 def sample_two_hand_motion(
@@ -498,11 +471,6 @@ def sample_two_hand_motion(
     It has `round(duration * RATE) + 1` frames, and the interactions are all of `INTERACTIONS` when not given.
     Between two meetings hands rest apart for a time from shortest to longest pause [s]. The left hand may be
     another person's.
-
-    Raises:
-        ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
-            and a left one.
-        PoseError: No valid path that brings them together was found.
     """
     names = INTERACTIONS if interactions is None else tuple(interactions)
     check_names(names)
@@ -521,12 +489,7 @@ def sample_two_hand_motion(
 def sample_two_hand_poses(
     right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
-    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid.
-
-    Raises:
-        ArgumentError: The count is not positive, or the hands are not a right and a left one.
-        PoseError: No valid poses were found.
-    """
+    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid."""
     _check_sides(right, left)
     if count < 1:
         raise ArgumentError(f"the count of poses is {count}, expected a positive number")

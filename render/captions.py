@@ -10,6 +10,7 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from scipy.optimize import isotonic_regression
 
 from handsim.errors import HandSimError
 from handsim.files.outputs import atomic_write
@@ -149,21 +150,12 @@ def with_names(
 
 
 def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> Doubles:
-    """Ascending heights near the desired ones, at least `step` apart, between `low` and `high` [px].
-
-    They are the least-squares solution, by pooling adjacent violators.
-    """
-    slots = step * np.arange(len(desired))
-    blocks: list[tuple[float, int]] = []  # mean of desired - slot, how many
-    for offset in desired - slots:
-        mean, count = float(offset), 1
-        while blocks and blocks[-1][0] > mean:
-            before, size = blocks.pop()
-            mean, count = (before * size + mean * count) / (size + count), size + count
-        blocks.append((mean, count))
-    means = np.repeat([mean for mean, _ in blocks], [count for _, count in blocks]) if blocks else slots
-    most = max(low, high - (slots[-1] if len(slots) else 0.0))
-    return np.asarray(np.clip(means, low, most) + slots)
+    """Ascending heights nearest to the desired ones, at least `step` apart, between `low` and `high` [px]."""
+    slots: Doubles = step * np.arange(len(desired), dtype=np.float64)
+    if not len(desired):
+        return slots
+    most = max(low, high - slots[-1])
+    return np.asarray(np.clip(isotonic_regression(desired - slots).x, low, most) + slots)
 
 
 def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Picture:
@@ -177,20 +169,15 @@ def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Pi
 
 def text_width(text: str) -> int:
     """Width of a name or title [pixels]."""
-    return int(cv2.getTextSize(text, _FONT, _scale(), 2)[0][0])
-
-
-def _scale() -> float:
-    return _TEXT_HEIGHT / 32.0
+    return int(cv2.getTextSize(text, _FONT, _TEXT_HEIGHT / 32.0, 2)[0][0])
 
 
 def _write(picture: Picture, text: str, origin: tuple[int, int], ink: tuple[int, ...]) -> None:
-    cv2.putText(picture, text, origin, _FONT, _scale(), ink, 2, cv2.LINE_AA)
+    cv2.putText(picture, text, origin, _FONT, _TEXT_HEIGHT / 32.0, ink, 2, cv2.LINE_AA)
 
 
 _GAP: Final = 6  # [px]
 _FRACTION_BITS: Final = 4  # OpenCV draws between pixels in sixteenths
-_EMPTY: Final = tuple(round(255 * level) for level in BACKGROUND)
 
 
 def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:
@@ -198,13 +185,11 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
 
     A frame without colors shows its depth alone.
     """
-    if not frames:
-        raise HandSimError("a contact sheet needs at least one frame")
     cells = [_cell(frame, width) for frame in frames]
     height = max(cell.shape[0] for cell in cells)
     across = max(cell.shape[1] for cell in cells)
     cells = [_padded(cell, height, across) for cell in cells]
-    blank = np.broadcast_to(np.array(_EMPTY, dtype=np.uint8), cells[0].shape)
+    blank = np.broadcast_to(np.array(_PAPER, dtype=np.uint8), cells[0].shape)
     columns = min(columns, len(cells))
     cells += [blank] * (math.ceil(len(cells) / columns) * columns - len(cells))
     rows = [side_by_side(cells[start : start + columns]) for start in range(0, len(cells), columns)]
@@ -238,7 +223,7 @@ def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
     """Depth as colors, the nearest red, the farthest blue; background where there is nothing."""
     present = depth > 0.0
     picture: Bytes = np.empty((*depth.shape, 3), dtype=np.uint8)
-    picture[:] = _EMPTY
+    picture[:] = _PAPER
     if present.any():
         near, far = depth[present].min(), depth[present].max()
         share = (far - depth) / max(far - near, 1e-9)
@@ -250,8 +235,6 @@ def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
 
 def _cell(frame: RenderedFrame, width: int) -> Picture:
     sensed = as_sensed(frame)
-    if sensed.rgb is None and sensed.depth is None:
-        raise HandSimError(f"frame {frame.number} has neither colors nor depth to show")
     scale = min(1.0, width / frame.camera.size[0])
     parts = []
     if sensed.rgb is not None:

@@ -79,6 +79,13 @@ def smooth(values: NDArray[Any], low: float | NDArray[Any], high: float | NDArra
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
+def along_segment(points: Doubles, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
+    """How far along a segment in a plane points (N, 2) are, 0 to 1, and how far from it."""
+    way = end - start
+    along = np.clip((points - start) @ way / (way @ way), 0.0, 1.0)
+    return along, np.linalg.norm(points - start - along[:, None] * way, axis=1)
+
+
 def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:
     """A Gaussian bell of height 1."""
     return np.exp(-((distance / width) ** 2))

@@ -250,9 +250,7 @@ def render_take(
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
     Args:
-        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
-            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
-            that is not there.
+        source: What to draw, as in `draw`.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
         formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
@@ -263,7 +261,7 @@ def render_take(
         person: Which of the people is in each pose (T,); when not given, a number of people is distributed at
             random, and of hands there is one, or one for each pose.
         glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
-        camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
+        camera: Camera of your own, as in `draw`.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
         progress: Called with the numbers of finished pictures and of all pictures: first with what is there

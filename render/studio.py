@@ -274,7 +274,7 @@ class Studio:
         for number, hand in enumerate(self._hands):
             pose = moment.hand(number)
             if pose is not None:
-                elbow, forearm = hand.forearm_line(pose)
+                elbow, forearm = hand.skin.forearm_line(pose)
                 there.append(number)
                 elbows.append(elbow)
                 forearms.append(forearm)

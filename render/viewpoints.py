@@ -273,18 +273,16 @@ class Viewpoints:
     """Cameras of every frame."""
 
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
-        if config.cameras is not None:
-            own = config.cameras
+        framing, own = Framing(take), config.cameras
+        if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
-            self._centers = hand_centers(take)
         else:
-            framing = Framing(take)
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-            self._centers = framing.centers
+        self._centers = framing.centers
 
     @property
     def num_cameras(self) -> int:
@@ -303,11 +301,6 @@ class Viewpoints:
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
         return [path.at(frame) for path in self._paths]
-
-
-def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
-    """Middle of the box around the hands of each frame [m]; interpolated over frames without hands."""
-    return Framing(take).centers
 
 
 def _along(take: Take) -> Doubles:

@@ -13,7 +13,7 @@ from handsim.hand.model import HandModel, hand_keypoints
 from render import RenderConfig, draw
 from render.viewpoints import ViewConfig
 from track.captures import track_capture
-from train.simulation.takes import TakeConfig
+from train.simulation.takes import SimulateSettings
 
 MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0
@@ -23,7 +23,7 @@ FRAMES = 120
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
-    simulate(folder / "take.c3d", TakeConfig(kind="hand-hand", num_frames=FRAMES))
+    simulate(folder / "take.c3d", SimulateSettings(kind="hand-hand", num_frames=FRAMES))
     return load_take(folder / "take.truth.npz"), folder
 
 
@@ -41,7 +41,7 @@ def test_hands_are_tracked_to_a_millimeter(truth, tracked):
     take, _ = truth
     result, _ = tracked
     for hand in take.moving_hands():
-        place = result.hand(hand.shape.side)
+        place = result.hand_index(hand.shape.side)
         there = np.isfinite(result.qpos[:, place, 0])
         assert there.mean() >= 0.98
         model = HandModel(hand.shape)

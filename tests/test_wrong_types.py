@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 
@@ -11,6 +12,8 @@ import pytest
 from gloves import Capture
 from handsim import HandModel, HandSimError
 from train import Corruption
+from train.simulation.takes import SimulateSettings
+from train.simulation.training_frames import GenerateSettings
 
 PACKAGES = ("handsim", "poses", "gloves", "train")
 WRONG = (5, None, [1, 2], {"a": 1}, object(), 2.5, "no such thing", b"bytes", HandSimError)
@@ -48,6 +51,8 @@ VALID: dict[str, dict[str, object]] = {
     "train.train_labeler": {"dataset": "set", "out": "run"},
 }  # fmt: skip
 """Public functions with arguments that would do; each is then exchanged for wrong ones."""
+SETTINGS = {"train.generate_dataset": GenerateSettings, "train.simulate_take": SimulateSettings}
+"""What the options of functions are."""
 
 
 def functions() -> dict[str, object]:
@@ -76,7 +81,8 @@ CASES = [
 def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     function = functions()[name]
-    default = inspect.signature(function).parameters[argument].default
+    parameters = inspect.signature(function).parameters
+    default = parameters[argument].default if argument in parameters else usual(name, argument)
     if wrong is default or (wrong is None and default is None):
         pytest.skip("the default")
     if is_right(name, argument, wrong):
@@ -86,6 +92,12 @@ def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, m
     said = str(error.value)
     assert said and "\n" not in said, said
     assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def usual(name, argument):
+    """The default of a setting, which is one of the function's options."""
+    (field,) = [field for field in dataclasses.fields(SETTINGS[name]) if field.name == argument]
+    return field.default
 
 
 def is_right(name, argument, wrong) -> bool:

@@ -169,4 +169,4 @@ def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
 
 def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels are reliable."""
-    return np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
+    return np.isin(take.status[:, take.hand_index(side)], (TRACKED, INITIALIZED))

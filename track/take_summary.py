@@ -111,7 +111,7 @@ def _unlabeled_at_hands(take: Take) -> int:
 
 def _suspicions_of(take: Take, side: Side) -> list[str]:
     """What tells of a mistake about one hand."""
-    hand = take.hand(side)
+    hand = take.hand_index(side)
     shown = take.status[:, hand] != LOST
     if shown.mean() < _LEAST_SEEN:
         if ((take.status != LOST).mean(axis=0) >= _LEAST_SEEN).any():

@@ -112,11 +112,7 @@ class LabelCounts:
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
-    """Mean F1 of the classes that occur, as true or given labels; NaN where none does.
-
-    Args:
-        confusion: Counts, rows the truth.
-    """
+    """Mean F1 of the classes that occur, as true (rows) or given labels; NaN where none does."""
     occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
     there = occurs > 0
     if not there.any():
@@ -136,11 +132,7 @@ class Reliability:
 
 
 def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> Reliability:
-    """Share of right labels by confidence.
-
-    Args:
-        confidence: Confidence of each label, 0 to 1; a bin includes its lower edge, the last one also 1.
-    """
+    """Share of right labels by confidence; a bin includes its lower edge, the last one also 1."""
     index = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
     count = np.bincount(index, minlength=BINS)
     sums = [np.bincount(index, weights, minlength=BINS) for weights in (confidence, right)]
@@ -149,11 +141,7 @@ def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]
 
 
 def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> float:
-    """Mean difference of a bin's confidence and its share of right labels, weighted by points; NaN if empty.
-
-    Args:
-        confidence: Confidence of each label, 0 to 1.
-    """
+    """Mean difference of a bin's confidence and its share of right labels, weighted by points."""
     if not len(confidence):
         return float("nan")
     bins = reliability(confidence, right)

@@ -305,9 +305,6 @@ class TrainingState:
         """Make one gradient step together with the other devices and return the loss before it.
 
         Each device learns from its part of the batch; the rng is the same on each.
-
-        Raises:
-            TrainingError: The loss is not finite; the state is of no use then.
         """
         began = time.perf_counter()
         rate = self.settings.learning_rate * _rate(self.settings, self.done / self.settings.samples)
@@ -467,12 +464,9 @@ def _passed(done: int, settings: TrainSettings, parts: int) -> bool:
 
 
 def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:
-    """The network's settings with the reject that labels most slots right, and the best calibrated spread.
+    """Choose the reject that labels most slots of held-out rows right, and the best calibrated spread.
 
     Settings that the network has already are kept.
-
-    Args:
-        rows: A few hundred held-out rows of a training set; they get the paper's corruption.
     """
     labeler = _Recalling(network, marker_names)
 

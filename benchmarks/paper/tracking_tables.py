@@ -31,7 +31,7 @@ from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
 from train.labelers.storage import load_labeler
 from train.simulation.scenes import KINDS
-from train.simulation.takes import TakeConfig, record_config
+from train.simulation.takes import SimulateSettings, simulate_take
 
 _HEAD: Final = ("method", "hands")
 _PAPERS_GLOVE: Final = "dense19"
@@ -94,7 +94,7 @@ def cameras(config: _Config, rig: str = "six") -> None:
         rig: Camera rig: a shipped name or the path of a .toml file.
     """
     num_frames = CAMERAS_FRAMES if config.num_frames is None else config.num_frames
-    twin = TakeConfig("single-hand", num_frames, config.glove, rig, config.seed)
+    twin = SimulateSettings("single-hand", num_frames, config.glove, rig, config.seed)
     takes, measured = _measure_on({"single-hand": twin}, config)
     missing = 1.0 - takes["single-hand"].markers_present().mean()
     with_paper = config.glove == _PAPERS_GLOVE
@@ -112,14 +112,14 @@ TRACKING_TABLES: Final[dict[str, Callable[..., None]]] = {
 
 def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures of all kinds, and run all trackers over them."""
-    twins: dict[str, TakeConfig] = {
-        kind: TakeConfig(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
+    twins: dict[str, SimulateSettings] = {
+        kind: SimulateSettings(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
     }
     return _measure_on(twins, config, trials=trials)
 
 
 def _measure_on(
-    twins: Mapping[str, TakeConfig], config: TableConfig, *, trials: int = 0
+    twins: Mapping[str, SimulateSettings], config: TableConfig, *, trials: int = 0
 ) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     network = load_labeler(config.glove, config.labeler)
@@ -127,7 +127,7 @@ def _measure_on(
     with progress_bar("captures") as bar:
         bar(0, len(twins))
         for kind, twin in twins.items():
-            takes[kind] = record_config(twin)
+            takes[kind] = simulate_take(settings=twin)
             bar.advance()
     bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())

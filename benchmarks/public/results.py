@@ -27,8 +27,7 @@ from benchmarks.public.answers import (
     unpack_answers,
 )
 from gloves.captures.capture import UNLABELED, Capture
-from gloves.captures.formats import read_capture
-from gloves.captures.text_formats import MOTIVE_BEGIN
+from gloves.captures.formats import MOTIVE_BEGIN, read_capture
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular, read_bytes

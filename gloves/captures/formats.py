@@ -1,17 +1,36 @@
 """Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in.
 
-Many captures make one stack of labeled frames (`read_markers`).
+TRC is tab-separated. Five header lines (file type, keys, their values, marker names, axes), then one line per
+frame: number, time, and three cells per marker. Rows may hold more trajectories than line 4 names.
+
+Of OptiTrack Motive's CSV, format versions 1.2x and 1.3x are read, and 1.23 is written. Line 1 is a list of
+keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row of quantities, a row
+of axes that begins with 'Frame', and one row per frame. Labels and types decide, not positions: newer exports
+add rows and a TimeCode column. Exports of Motive 1.9 and before (1.20, 1.21) have the same rows without
+labels: types first, then names.
+
+Vicon Nexus, and Vicon Workstation before it, write sections. A section is a line with its title, a line with
+its rate, a row of names (one in three cells), a row that begins with 'Frame' (in Workstation 'Field #') and
+holds the axes, in Nexus a row of units, one row per frame, and a blank line. Sections of other data (Devices,
+Model Outputs, ...) may precede and follow that of the trajectories.
+
+Qualisys Track Manager's TSV of 3D data has lines of a key and its values (NO_OF_FRAMES, FREQUENCY,
+MARKER_NAMES, ...), then, if it was asked for, a line of column names, then one line per frame: frame number
+and time, if they were asked for, and three cells per marker in millimeters. Newer exports begin with
+FILE_VERSION.
 """
 
 from __future__ import annotations
 
+import csv
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import (
@@ -23,26 +42,438 @@ from gloves.captures.capture import (
     unlabeled_frames,
     zeros_as_missing,
 )
-from gloves.captures.text import Tell, separator_behind, split_lines
-from gloves.captures.text_formats import (
-    MOTIVE_BEGIN,
-    read_motive_csv,
-    read_qtm_tsv,
-    read_trc,
-    read_vicon_csv,
-    vicon_sections,
-    write_motive_csv,
-    write_trc,
+from gloves.captures.text import (
+    MOST_CELLS,
+    TAB,
+    StatedTimes,
+    Tell,
+    cell_number,
+    check_width,
+    header_cells,
+    marker_titles,
+    meters_per,
+    parse_table,
+    plain_lines,
+    separator_behind,
+    split_lines,
+    timed_positions,
+    warn,
 )
 from handsim._checks import check_type
-from handsim.errors import CaptureError, HandSimWarning, choices
+from handsim.errors import CaptureError, HandSimWarning, choices, shortened
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
+
+_BEGIN: Final = b"PathFileType"
+_HEADER_LINES: Final = 5
+_LEADING: Final = 2  # frame number and time
+_NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
+_KEYS: Final = (
+    "DataRate",
+    "CameraRate",
+    "NumFrames",
+    "NumMarkers",
+    "Units",
+    "OrigDataRate",
+    "OrigDataStartFrame",
+    "OrigNumFrames",
+)
+
+
+def read_trc(data: bytes, tell: Tell = warn) -> Capture:
+    """The capture in the bytes of a TRC file."""
+    lines, ended = split_lines(data)
+    if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
+        raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
+    lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
+    # A header line counts only with its line end: what precedes a cut may be incomplete.
+    whole = len(lines) if ended else len(lines) - 1
+    if whole < _HEADER_LINES:
+        raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
+    keys, values, titles, axes = (
+        header_cells(line, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
+    )
+    stated = _stated(keys, values)
+    if not stated.get("units"):
+        raise CaptureError("the header (lines 2 and 3) states no Units")
+    scale = meters_per(stated["units"])
+    names = _marker_names(titles, sum(bool(cell) for cell in axes))
+    names += _unnamed(lines[_HEADER_LINES:], len(names))
+
+    titles = marker_titles(("frame number", "time"), names)
+    table = parse_table(lines, start=_HEADER_LINES, ended=ended, titles=titles)
+    positions = table[:, _LEADING:].reshape(len(table), len(names), 3) * scale
+    times = StatedTimes(
+        stated.get("datarate", ""),
+        "DataRate",
+        numbers=table[:, 0],
+        times=table[:, 1],
+        count=stated.get("numframes", ""),
+        count_name="NumFrames",
+        count_is_reliable=False,
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
+
+
+def write_trc(path: Path, capture: Capture, *, title: str) -> None:
+    """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
+
+    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
+    count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
+    """
+    num_frames, num_markers = capture.positions.shape[:2]
+    rate = repr(capture.rate).removesuffix(".0")
+    values = (rate, rate, str(num_frames), str(num_markers), "mm", rate, "1", str(num_frames))
+    header = (
+        f"PathFileType\t4\t(X/Y/Z)\t{title}",
+        "\t".join(_KEYS),
+        "\t".join(values),
+        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", "")), ""]),
+        "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
+    )
+    row_format = "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers)
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(header) + "\n\n")
+        for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
+            text = row_format % (frame + 1, frame / capture.rate, *row.tolist())
+            file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
+
+
+def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
+    """Values of line 3 by the lower-case keys of line 2; some writers put two tabs between values."""
+    if sum(map(bool, keys)) == sum(map(bool, values)):
+        keys, values = list(filter(None, keys)), list(filter(None, values))
+    return {key.lower(): value for key, value in zip(keys, values, strict=False)}
+
+
+def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
+    """Names of line 4, one in every three cells; a blank one becomes '*n'. There may be none."""
+    lower = [title.lower() for title in titles[: 2 * _LEADING]]
+    if not lower[0].startswith("frame"):
+        raise CaptureError(_NO_MARKERS)
+    cells = titles[lower.index("time") + 1 if "time" in lower else _LEADING :]
+    while cells and not cells[-1]:
+        cells.pop()
+    if not any(cell for index, cell in enumerate(cells) if index % 3):
+        return tuple(cell or f"*{number}" for number, cell in enumerate(cells[::3], 1))
+    names = tuple(cell for cell in cells if cell)
+    if num_axes != 3 * len(names):
+        raise CaptureError(
+            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, expected three per name"
+        )
+    return names
+
+
+def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
+    """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them."""
+    expected = _LEADING + 3 * num_named
+    widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
+    width = max(widths, default=0)
+    extra = max(0, width - expected)
+    check_width(width, _HEADER_LINES + 1 + (widths.index(width) if widths else 0))
+    if extra % 3:
+        raise CaptureError(
+            f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or "
+            "three more for each trajectory without a name"
+        )
+    if not num_named and not extra and any(row.strip(b" \t") for row in rows):
+        raise CaptureError(_NO_MARKERS)
+    return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
+
+
+_MOST_HEADER_LINES: Final = 20
+MOTIVE_BEGIN: Final = b"Format Version"
+_COUNT: Final = "Total Exported Frames"
+_AXES: Final = ["X", "Y", "Z"]
+_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
+
+
+def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
+    """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out."""
+    lines, ended = split_lines(data)
+    separator = separator_behind([MOTIVE_BEGIN], lines[0])
+    if separator is None:
+        raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
+    lines = plain_lines(lines, separator)
+    rows = [header_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
+    stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
+    rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
+    if not stated.get("Length Units"):
+        tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
+    scale = meters_per(stated.get("Length Units") or "Meters")
+    end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
+    if end is None or (end == len(lines) - 1 and not ended):
+        raise CaptureError("the header is cut: no whole row begins with 'Frame'")
+    axes = rows[end]
+    types, names = _types_and_names(rows[1:end], len(axes))
+    header = rows[1:end]
+    row = next((row for row in reversed(header) if any(row)), [])
+    quantities = row + [""] * (len(axes) - len(row))
+    columns = _marker_columns(types, quantities, axes)
+
+    table = parse_table(
+        lines,
+        start=end + 1,
+        ended=ended,
+        titles=[f"{name} {axis}".strip() for name, axis in zip(names, axes, strict=False)],
+        text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
+    )
+    positions = table[:, np.array(columns)[:, None] + np.arange(3)]
+    labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns, 1))
+    times = StatedTimes(
+        stated.get(rate_key, ""),
+        rate_key,
+        numbers=table[:, 0],
+        times=table[:, 1] if axes[1].lower().startswith("time (") or axes[1].lower() == "time" else None,
+        count=stated.get(_COUNT, ""),
+        count_name=_COUNT,
+    )
+    return Capture(labels, *timed_positions(positions * scale, times, tell))
+
+
+def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
+    """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells."""
+    num_frames, num_markers = capture.positions.shape[:2]
+    rate = f"{capture.rate:.6f}"
+    stated = {
+        "Format Version": "1.23",
+        "Take Name": Path(title).stem,
+        "Take Notes": "",
+        "Capture Frame Rate": rate,
+        "Export Frame Rate": rate,
+        "Capture Start Time": "",
+        "Total Frames in Take": str(num_frames),
+        "Total Exported Frames": str(num_frames),
+        "Rotation Type": "Quaternion",
+        "Length Units": "Millimeters",
+        "Coordinate Space": "Global",
+    }
+    ids = [f"{number:032X}" for number in range(1, num_markers + 1)]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([cell for pair in stated.items() for cell in pair])
+        writer.writerow([])
+        writer.writerow(["", "Type", *["Marker"] * (3 * num_markers)])
+        for label, values in (("Name", capture.names), ("ID", ids)):
+            writer.writerow(["", label, *(value for value in values for _ in _AXES)])
+        writer.writerow(["", "", *["Position"] * (3 * num_markers)])
+        writer.writerow(["Frame", "Time (Seconds)", *_AXES * num_markers])
+        row_format = "%d,%.6f" + ",%.6f" * (3 * num_markers)
+        for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
+            text = row_format % (frame, frame / capture.rate, *row.tolist())
+            file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
+
+
+def _types_and_names(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
+    """Type and name of each column, from the header rows between line 1 and the axes."""
+    filled = [row for row in rows if any(row)]
+    # Without labels the first row says 'Marker' itself, behind two blank cells.
+    if len(filled) > 2 and not any(filled[0][:2]) and set(filled[0]) & _TYPES:
+        types, names = filled[:2]
+    else:
+        types, names = (_labeled_row(filled, label) for label in ("Type", "Name"))
+    return types + [""] * (width - len(types)), names + [""] * (width - len(names))
+
+
+def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
+    """The header row whose first cell with text is `label`."""
+    for row in rows:
+        if next(cell for cell in row if cell) == label:
+            return row
+    raise CaptureError(f"not a Motive CSV export: no header row is labeled '{label}'")
+
+
+def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) -> list[int]:
+    """Where the position of each marker begins."""
+    columns = [
+        index
+        for index, (kind, quantity, axis) in enumerate(zip(types, quantities, axes, strict=False))
+        if kind == "Marker" and quantity == "Position" and axis == "X"
+    ]
+    if not columns:
+        kinds = sorted({kind for kind in types if kind not in {"", "Type"}})
+        raise CaptureError(
+            "no markers: no column has type 'Marker' and quantity 'Position'; types in the file: "
+            f"{', '.join(kinds) or 'none'} (export it with markers and unlabeled markers)"
+        )
+    for index in columns:
+        if axes[index : index + 3] != _AXES:
+            raise CaptureError(
+                f"column {index + 1}: expected the axes X, Y, Z, got {', '.join(axes[index : index + 3])}"
+            )
+    return columns
+
+
+_TITLE: Final = "Trajectories"
+_SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
+_FIRST_CELLS: Final = ("frame", "field #")
+_BLANKS: Final = b' \t",;'
+
+
+def vicon_sections(lines: list[bytes]) -> dict[str, int]:
+    """Where the sections of a Vicon export begin: index of the title's line by title."""
+    titles = {name.lower().encode(): name for name in _SECTIONS}
+    found: dict[str, int] = {}
+    for index, line in enumerate(lines):
+        if line[:1].isalpha() or line[:1] == b'"':
+            title = titles.get(line.strip(_BLANKS).lower())
+            # Such a word may stand anywhere: the next line has to be the section's rate.
+            if title and index + 1 < len(lines) and lines[index + 1].lstrip(_BLANKS)[:1].isdigit():
+                found.setdefault(title, index)
+    return found
+
+
+def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
+    """The trajectories in the bytes of a Vicon CSV, labeled or not."""
+    lines, ended = split_lines(data)
+    sections = vicon_sections(lines)
+    if _TITLE not in sections:
+        raise CaptureError(
+            "not a Vicon CSV export with trajectories: no line reads 'Trajectories'; sections in the file: "
+            f"{', '.join(sections) or 'none'}"
+        )
+    at = sections[_TITLE]
+    end = next((row for row in range(at, len(lines)) if not lines[row].strip(_BLANKS)), len(lines))
+    if end < at + 4 or (end == at + 4 == len(lines) and not ended):
+        raise CaptureError("the header is cut: expected rate, names and axes behind the line 'Trajectories'")
+    separator = max(b",", b";", b"\t", key=lines[at + 3].count)
+    lines = [*lines[:at], *plain_lines(lines[at:end], separator, first=at + 1), *lines[end:]]
+    rates, names, axes = (header_cells(lines[row], row + 1) for row in range(at + 1, at + 4))
+    columns = _vicon_columns(axes, at + 4)
+    start, scales = _scales(lines[:end], at + 4, columns, tell)
+    names += [""] * (len(axes) - len(names))
+    table = parse_table(
+        lines[:end],
+        start=start,
+        ended=ended or end < len(lines),
+        titles=[f"{_name_of(names, column)} {axis}".strip() for column, axis in enumerate(axes)],
+    )
+    positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
+    labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
+    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=table[:, 0])
+    return Capture(labels, *timed_positions(positions, times, tell))
+
+
+def _vicon_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
+    """Where the position of each trajectory begins, by the row of axes."""
+    if axes[0].lower() not in _FIRST_CELLS:
+        raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
+    columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]
+    if not columns:
+        raise CaptureError(f"no markers: line {number} has no axes X, Y, Z")
+    return np.array(columns)
+
+
+def _scales(
+    lines: list[bytes], row: int, columns: Int[np.ndarray, "N"], tell: Tell
+) -> tuple[int, Float[np.ndarray, "N"]]:
+    """Index of the first row of numbers, and meters per unit of each trajectory."""
+    cells = header_cells(lines[row], row + 1) if row < len(lines) else []
+    if cells and cells[0]:  # a frame's number
+        tell("the file states no unit of length, read as millimeters, which Vicon's programs write")
+        return row, np.full(len(columns), meters_per("mm"))
+    units = [cells[column] if column < len(cells) else "" for column in columns]
+    scales = {unit: meters_per(unit) for unit in set(units)}
+    return row + 1, np.array([scales[unit] for unit in units])
+
+
+def _name_of(names: list[str], column: int) -> str:
+    """The name over a column, or over one of the two columns before it."""
+    return next((name for name in reversed(names[max(0, column - 2) : column + 1]) if name), "")
+
+
+_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
+_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
+_QTM_LEADING: Final = ("frame", "time")
+_MOST_DIGITS: Final = 12  # of a count
+_UNIT: Final = "mm"  # the only one that QTM writes
+
+
+def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
+    """The markers in the bytes of a Qualisys TSV with 3D data; frames missing or too many are told."""
+    lines, ended = split_lines(data)
+    separator = separator_behind(_BEGINS, lines[0])
+    if separator is None:
+        raise CaptureError(
+            "not a Qualisys TSV export: line 1 does not begin with 'NO_OF_FRAMES' or 'FILE_VERSION'"
+        )
+    lines = plain_lines(lines, separator, wider=True)
+    start = next((index for index, line in enumerate(lines) if not _KEY.match(line)), len(lines))
+    if start == len(lines) and not ended:
+        raise CaptureError("the header is cut: no line of column names or numbers follows it")
+    stated = {
+        cells[0]: cells[1:]
+        for number, line in enumerate(lines[:start], 1)
+        for cells in [header_cells(line, number)]
+    }
+    included = _first(stated, "DATA_INCLUDED") or "3D"
+    if included != "3D":
+        raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
+    if "MARKER_NAMES" not in stated:
+        raise CaptureError("the header states no MARKER_NAMES")
+    names = _names(stated)
+    start, leading = _begin_of_rows(lines, start, 3 * len(names))
+
+    titles = marker_titles(_QTM_LEADING[:leading], names)
+    table = parse_table(lines, start=start, ended=ended, titles=titles)
+    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per(_UNIT)
+    times = StatedTimes(
+        _first(stated, "FREQUENCY"),
+        "FREQUENCY",
+        numbers=table[:, 0] if leading > 0 else None,
+        times=table[:, 1] if leading > 1 else None,
+        count=_first(stated, "NO_OF_FRAMES"),
+        count_name="NO_OF_FRAMES",
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
+
+
+def _first(stated: dict[str, list[str]], key: str) -> str:
+    """The first value of a key, blank if there is none."""
+    return next(iter(stated.get(key, ())), "")
+
+
+def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
+    """One name per marker; one without a name becomes '*n'."""
+    names = stated["MARKER_NAMES"]
+    while names and not names[-1]:
+        names = names[:-1]
+    text = _first(stated, "NO_OF_MARKERS")
+    count = int(text[:_MOST_DIGITS]) if text.isdecimal() else len(names)
+    if count < len(names) or count > MOST_CELLS // 3:
+        raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
+    if not count:
+        raise CaptureError("no markers: MARKER_NAMES holds no name")
+    names = names + [""] * (count - len(names))
+    return tuple(name or f"*{number}" for number, name in enumerate(names, 1))
+
+
+def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int]:
+    """Index of the first row of numbers, and how many of its cells precede the positions (`width` cells)."""
+    while start < len(lines) and not lines[start].strip():
+        start += 1
+    if start == len(lines):
+        raise CaptureError("no frames: nothing follows the header")
+    cells = header_cells(lines[start], start + 1)
+    if cells[0].lower() == _QTM_LEADING[0]:
+        return start + 1, 2 if cells[1:2] and cells[1].lower() == _QTM_LEADING[1] else 1
+    try:
+        cell_number(cells[0])
+    except ValueError:  # names of columns, without frame and time
+        return start + 1, 0
+    while cells and not cells[-1]:
+        cells.pop()
+    leading = {width: 0, width + 2: 2}.get(len(cells))
+    if leading is None:
+        raise CaptureError(
+            f"line {start + 1} has {len(cells)} cells, expected {width}, or {width + 2} with frame and time"
+        )
+    return start, leading
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
     """A CSV by its content, since Motive's and Vicon's have the same suffix."""
-    if separator_behind([MOTIVE_BEGIN], split_lines(data[:_BEGIN])[0][0]) is not None:
+    if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
         return read_motive_csv(data, tell)
     if vicon_sections(split_lines(data)[0]):
         return read_vicon_csv(data, tell)
@@ -52,7 +483,7 @@ def _read_csv(data: bytes, tell: Tell) -> Capture:
     )
 
 
-_BEGIN: Final = 200  # bytes that show which program wrote a CSV
+_FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": read_qtm_tsv}
 _TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)

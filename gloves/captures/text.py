@@ -160,13 +160,17 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
             )
 
 
+def marker_titles(leading: Sequence[str], names: Sequence[str]) -> list[str]:
+    """What messages call the columns of a table with three cells per marker."""
+    return [*leading, *(f"{name} {axis}" for name in names for axis in "XYZ")]
+
+
 def parse_table(
     lines: list[bytes],
     *,
     start: int,
     ended: bool,
-    num_columns: int,
-    column_name: Callable[[int], str],
+    titles: Sequence[str],
     text_columns: frozenset[int] = frozenset(),
 ) -> Float[np.ndarray, "T columns"]:
     """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
@@ -174,10 +178,11 @@ def parse_table(
     Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its
     end, because some writers leave out what was not seen, and may have blank cells too many. Only the last
     line of a file can have been cut: it counts as cut if it has no line end and fewer cells than
-    `num_columns` or than the first row, which tells whether rows end in a separator, or if its last number
+    `titles` or than the first row, which tells whether rows end in a separator, or if its last number
     alone has fewer decimals. (A cut inside the last cell of a row whose numbers have as many decimals as it
     happens leaves no trace and is not noticed.)
     """
+    num_columns = len(titles)
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
     if not rows:
         raise CaptureError("no frames: nothing follows the header")
@@ -201,8 +206,8 @@ def parse_table(
         try:
             table[row, : len(cells)] = [float(cell) if cell else _BLANK for cell in cells]
         except ValueError:
-            table[row, : len(cells)] = _parse_cells(cells, number, column_name)
-    _check_finite(table, rows, column_name)
+            table[row, : len(cells)] = _parse_cells(cells, number, titles)
+    _check_finite(table, rows, titles)
     return table
 
 
@@ -259,7 +264,7 @@ def _check_last_number(lines: list[bytes], number: int) -> None:
         )
 
 
-def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], str]) -> list[float]:
+def _parse_cells(cells: list[bytes], number: int, titles: Sequence[str]) -> list[float]:
     """The slow parser for one row: cells may hold blanks, and a cell that is not a number is named."""
     values = []
     for column, cell in enumerate(cells):
@@ -269,7 +274,7 @@ def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], s
         except ValueError:
             mixed = "," in text and "." not in text and text.count(",") == 1
             raise CaptureError(
-                f"line {number}, column {column + 1} ({column_name(column)}): '{shortened(text)}' is not a "
+                f"line {number}, column {column + 1} ({titles[column]}): '{shortened(text)}' is not a "
                 f"number{', since others have decimal points' if mixed else ''}"
             ) from None
     return values
@@ -278,13 +283,13 @@ def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], s
 def _check_finite(
     table: Float[np.ndarray, "T columns"],
     rows: list[int],
-    column_name: Callable[[int], str],
+    titles: Sequence[str],
 ) -> None:
     infinite = np.argwhere(np.isinf(table))
     if len(infinite):
         row, column = (int(index) for index in infinite[0])
         raise CaptureError(
-            f"line {rows[row] + 1}, column {column + 1} ({column_name(column)}): infinite, expected a "
+            f"line {rows[row] + 1}, column {column + 1} ({titles[column]}): infinite, expected a "
             "finite number or a blank cell"
         )
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_number, check_span
-from handsim.errors import ArgumentError
 from handsim.kernels import kernel, segment_distance_squared
+from handsim.settings import Limits, Settings
 from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
 
@@ -23,8 +22,7 @@ def reflect(
 ) -> Float[np.ndarray, "*batch 3"]:
     """Mirror images of points in planes given by a point and a unit normal [m]."""
     height = np.einsum("...i,...i->...", points - plane_point, plane_normal)
-    mirrored: NDArray[np.float64] = points - 2.0 * height[..., None] * plane_normal
-    return mirrored
+    return np.asarray(points - 2.0 * height[..., None] * plane_normal)
 
 
 def cameras_by_mirror(
@@ -36,14 +34,9 @@ def cameras_by_mirror(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T P C"]:
-    """Which cameras see which mirror image: in the patch, in view, and with both legs of the path free.
+    """Which cameras see which mirror image [m]: in the patch, in view, and with both legs of the path free.
 
-    Args:
-        images: Mirror images of the markers [m]; NaN where there is none.
-        plane_point: Middle of the patch in each frame [m].
-        plane_normal: Unit normal of its shiny side.
-        radius: Radius of the patch [m].
-        segments: Axes of the capsules that block the view, in the world [m].
+    The patch is a disc with a unit normal on its shiny side [m]; capsules of these axes [m] block the view.
     """
     seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
     _over_patch(images, plane_point, plane_normal, radius, rig.arrays, segments, radii, seen)
@@ -101,30 +94,19 @@ def _clear(start: Any, end: Any, segments: Any, radii: Any) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class StrayConfig:
-    """Number of reflecting spots, their positions and the duration of their flashes.
+class StrayConfig(Settings):
+    """Number of reflecting spots, their positions and the duration of their flashes."""
 
-    Raises:
-        ArgumentError: A number is out of range.
-    """
-
-    number: float = 1.0
+    number: Annotated[float, Limits(0.0)] = 1.0
     """Mean number of reflecting spots, Poisson distributed."""
-    reach: float = 0.12
+    reach: Annotated[float, Limits(0.0)] = 0.12
     """Radius of the ball around the middle of the carrier in which they lie [m]."""
-    shown: float = 0.4
+    shown: Annotated[float, Limits(0.0, above=True)] = 0.4
     """Mean time that a spot reflects [s]."""
-    hidden: float = 1.0
+    hidden: Annotated[float, Limits(0.0)] = 1.0
     """Mean time that it does not [s]."""
-    camera_share: float = 0.5
+    camera_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of the cameras that a spot reflects to."""
-
-    def __post_init__(self) -> None:
-        for name in ("number", "reach", "shown", "hidden"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ArgumentError(f"{name} of strays is {getattr(self, name):g}, expected a number from 0")
-        if self.shown <= 0.0 or not 0.0 <= self.camera_share <= 1.0:
-            raise ArgumentError("strays need a time shown above 0 s and a camera_share from 0 to 1")
 
 
 def sample_strays(
@@ -136,15 +118,9 @@ def sample_strays(
     num_cameras: int,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "T K 3"], Bool[np.ndarray, "T K C"]]:
-    """Strays carried by a hand, an object or the room.
+    """Positions [m] of strays around the middle [m] of a carrier, and which cameras each reflects to.
 
-    Args:
-        T_world_carrier: Pose of the carrier.
-        middle: Middle of the ball in which they lie, in the carrier's frame [m].
-        num_cameras: Cameras of the rig.
-
-    Returns:
-        Positions in the world [m], and which cameras each reflects to; occlusion is not tested here.
+    Occlusion is not tested here.
     """
     count = int(rng.poisson(config.number))
     directions = rng.standard_normal((count, 3))
@@ -180,32 +156,21 @@ GHOST_REACH: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class GhostConfig:
-    """How often ghosts appear and where.
+class GhostConfig(Settings):
+    """How often ghosts appear and where."""
 
-    Raises:
-        ArgumentError: A number is out of range.
-    """
-
-    mirror_rate: float = 0.25
+    mirror_rate: Annotated[float, Limits(0.0, 1.0)] = 0.25
     """Share of frames with a shiny surface near the hand."""
-    mirror_distance: tuple[float, float] = (0.02, 0.10)
+    mirror_distance: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.02, 0.10)
     """Distance of the surface from the middle of the markers' box, beyond its half side [m]."""
-    mirror_radius: float = 0.06
+    mirror_radius: Annotated[float, Limits(0.0)] = 0.06
     """Radius of the shiny patch [m]."""
-    reflectance: float = 0.5
+    reflectance: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Chance that a marker's mirror image is bright enough."""
-    stray_rate: float = 0.8
+    stray_rate: Annotated[float, Limits(0.0)] = 0.8
     """Mean number of stray reflections per frame, Poisson distributed."""
-    stray_margin: float = 0.3
+    stray_margin: Annotated[float, Limits(0.0)] = 0.3
     """Strays lie in the markers' box grown by this share."""
-
-    def __post_init__(self) -> None:
-        for name in ("mirror_rate", "reflectance"):
-            check_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("mirror_radius", "stray_rate", "stray_margin"):
-            check_number(name, getattr(self, name), 0.0)
-        check_span("mirror_distance", self.mirror_distance)
 
 
 def sample_ghosts(
@@ -218,12 +183,9 @@ def sample_ghosts(
     min_cameras: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 3"]:
-    """Ghosts [m] of every frame, NaN where there is none.
+    """Ghosts [m] of every frame, NaN where there is none, near markers [m] behind capsules of these axes [m].
 
-    Args:
-        markers: Marker centers in the world [m].
-        segments: Axes of the capsules that block the view, in the world [m].
-        min_cameras: Cameras that must see a mirror image before it is a point.
+    A mirror image is a point if at least `min_cameras` see it.
     """
     frames = len(markers)
     low, high = markers.min(axis=1), markers.max(axis=1)

@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 import heapq
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel, squared_distance
+from handsim.settings import Limits, Settings
 from handsim.space.camera import PINHOLE, distort_jacobian
 from handsim.space.rig import CameraRig
 
@@ -337,61 +338,42 @@ MAX_FALSE_POINTS: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class OpticsConfig:
-    """Properties of cameras and solver; the defaults are those of a well-kept optical system.
+class OpticsConfig(Settings):
+    """Properties of cameras and solver; the defaults are those of a well-kept optical system."""
 
-    Raises:
-        ArgumentError: A number is out of range.
-    """
-
-    noise: float = 0.12
+    noise: Annotated[float, Limits(0.0)] = 0.12
     """Standard deviation of a blob's center per axis in the camera's own pixels [px], for a sphere of 3.2 mm
     radius; it falls with the root of the radius."""
-    partial: float = 0.5
+    partial: Annotated[float, Limits(0.0)] = 0.5
     """Each line of sight goes to a random point of the marker within this share of its radius, so markers
     behind an edge flicker."""
-    marker_radius: float | None = None
+    marker_radius: Annotated[float, Limits(0.0, above=True)] | None = None
     """Radius of the glove's spheres [m]; the layout's when not given."""
-    roundness: float = 0.5
+    roundness: Annotated[float, Limits(0.0)] = 0.5
     """Two blobs that touch merge: they count as a marker while their centers are nearer than this share of
     the sum of their radii, and are discarded as not round beyond it."""
-    blob_loss: float = 0.002
+    blob_loss: Annotated[float, Limits(0.0, 1.0)] = 0.002
     """Chance that a camera misses a blob it should see."""
-    dropout: float = 0.0002
+    dropout: Annotated[float, Limits(0.0, 1.0)] = 0.0002
     """Chance per frame that cameras begin to lose their pictures: a lost packet, or an arm in front."""
-    dropout_length: float = 3.0
+    dropout_length: Annotated[float, Limits(1.0)] = 3.0
     """Mean number of pictures that they lose then."""
-    dropout_cameras: int = 1
+    dropout_cameras: Annotated[int, Limits(0)] = 1
     """Number of cameras that lose them together, as those on one network switch do."""
-    min_rays: int = 2
+    min_rays: Annotated[int, Limits(2)] = 2
     """Rays that must meet for a point to exist."""
-    min_rays_to_start: int = 3
+    min_rays_to_start: Annotated[int, Limits(2)] = 3
     """Rays that must meet for a point that did not exist in the frame before."""
-    max_residual: float = 0.003
+    max_residual: Annotated[float, Limits(0.0)] = 0.003
     """Largest distance of a ray from its point [m]; the worst ray is dropped first."""
-    min_angle: float = 10.0
+    min_angle: Annotated[float, Limits(0.0, 90.0)] = 10.0
     """Two rays alone must cross at this angle at least [deg]."""
-    min_distance: float = 0.004
+    min_distance: Annotated[float, Limits(0.0)] = 0.004
     """Points nearer to each other than this are one: the one with more rays [m]."""
 
-    def __post_init__(self) -> None:
-        if self.marker_radius is not None and not 0.0 < self.marker_radius < np.inf:
-            raise ArgumentError(f"marker_radius is {self.marker_radius:g}, expected a positive finite number")
-        for name in ("noise", "partial", "max_residual", "min_distance", "roundness"):
-            value = getattr(self, name)
-            if not 0.0 <= value < np.inf:
-                raise ArgumentError(f"{name} is {value:g}, expected a finite number that is not negative")
-        for name in ("blob_loss", "dropout"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ArgumentError(f"{name} is {getattr(self, name):g}, expected a chance from 0 to 1")
-        if not 1.0 <= self.dropout_length < np.inf or self.dropout_cameras < 0:
-            raise ArgumentError(
-                f"dropout_length is {self.dropout_length:g} and dropout_cameras {self.dropout_cameras}, "
-                "expected at least 1 picture, and 0 cameras or more"
-            )
-        if not 0.0 <= self.min_angle <= 90.0:
-            raise ArgumentError(f"min_angle is {self.min_angle:g}, expected 0 to 90 degrees")
-        if not 2 <= self.min_rays <= self.min_rays_to_start:
+    def check(self) -> None:
+        """Refuse points that begin with fewer rays than they need to go on."""
+        if self.min_rays > self.min_rays_to_start:
             raise ArgumentError(
                 f"min_rays is {self.min_rays} and min_rays_to_start {self.min_rays_to_start}, "
                 "expected 2 <= min_rays <= min_rays_to_start"
@@ -428,13 +410,9 @@ def reconstruct(
     continuous: bool,
     rng: np.random.Generator,
 ) -> Reconstruction:
-    """Simulate detection and triangulation.
+    """Simulate detection and triangulation of sources of these radii [m], where cameras have seen them.
 
-    Args:
-        sources: True positions of markers, mirror images and strays [m]; NaN where there is none.
-        seen: Which cameras have a free view of each.
-        radii: Radius of each source, or of all [m].
-        continuous: Frames follow each other in time; otherwise each stands alone, and `min_rays` is enough.
+    Frames follow each other in time if `continuous`; otherwise each stands alone, and `min_rays` is enough.
     """
     frames, count = sources.shape[:2]
     positions = np.full((frames, count, 3), np.nan)
@@ -485,12 +463,8 @@ def pack_columns(
 ) -> tuple[Int[np.ndarray, "T S"], int]:
     """Pack many runs into few columns: an unbroken stretch of a column is one run, then a frame is empty.
 
-    Args:
-        present: Which source has a point in which frame.
-        rng: Decides the order of runs that begin together, so that columns do not reveal sources.
-
-    Returns:
-        The column of every point, -1 where there is none, and the number of columns.
+    Gives the column of every point, -1 where there is none, and their number. Runs that begin together have
+    random columns, which do not reveal sources.
     """
     ids = number_runs(present)
     first, source = np.nonzero(present & np.vstack([np.ones_like(present[:1]), ~present[:-1]]))

@@ -138,13 +138,6 @@ class MeshTree:
 
     Nodes are stored in depth-first order, a left child right after its parent, and `skip` is the node that
     follows when a branch is left out: a search needs no stack, and a refit is one backward pass.
-
-    Args:
-        vertices: Rest positions [m].
-        faces: Triangles of either winding.
-
-    Raises:
-        ArgumentError: There is no triangle, an array has another shape, or a face names no vertex.
     """
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
@@ -277,8 +270,7 @@ def clear_of_mesh(
         raise ArgumentError("vertices holds NaN or infinite values, expected finite numbers")
     nodes, spots = (tree.faces, tree.first, tree.skip), (tree.spots, tree.spots_start)
     lines = (starts, ends[None], np.asarray(needed, dtype=np.bool_))
-    clear: NDArray[np.bool_] = clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes))
-    return clear
+    return np.asarray(clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes)))
 
 
 def clear_of_body(
@@ -298,8 +290,7 @@ def clear_of_body(
     ends = np.ascontiguousarray((ends - positions) @ rotations)
     nodes, no_refit = (tree.faces, tree.first, tree.skip), (tree.spots[:0], tree.spots_start)
     lines = (starts, ends, np.asarray(needed, dtype=np.bool_))
-    clear: NDArray[np.bool_] = clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes)
-    return clear
+    return np.asarray(clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes))
 
 
 def _check_lines(
@@ -344,13 +335,7 @@ def visible_cameras(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras see each marker: in view, facing, and not occluded by the hand.
-
-    Args:
-        markers: Marker centers in the world [m].
-        normals: Outward unit directions of the skin under the markers.
-        segments: Both ends of every capsule's axis in the world [m].
-    """
+    """Which cameras see each marker: in view, facing, and not occluded by the hand."""
     seen = facing_cameras(markers, normals, rig)
     _keep_free(markers, rig.positions, segments, radii, seen)
     return seen
@@ -359,12 +344,7 @@ def visible_cameras(
 def facing_cameras(
     markers: Float[np.ndarray, "T M 3"], normals: Float[np.ndarray, "T M 3"], rig: CameraRig
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras would see each marker without occlusion: in view, and on its outward side.
-
-    Args:
-        markers: Marker centers in the world [m].
-        normals: Outward unit directions of the surface under the markers.
-    """
+    """Which cameras would see each marker without occlusion: in view, and on its outward side."""
     seen: NDArray[np.bool_] = _facing(
         np.ascontiguousarray(markers, dtype=np.float64),
         np.ascontiguousarray(normals, dtype=np.float64),
@@ -377,8 +357,7 @@ def facing_cameras(
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
     """Visibility as one bit per camera: bit c is set where camera c sees."""
     bits = visible.astype(np.uint32) << np.arange(visible.shape[-1], dtype=np.uint32)
-    packed: NDArray[np.uint32] = bits.sum(axis=-1, dtype=np.uint32)
-    return packed
+    return np.asarray(bits.sum(axis=-1, dtype=np.uint32))
 
 
 @kernel

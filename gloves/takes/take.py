@@ -42,8 +42,16 @@ from gloves.takes.points import (
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
+from handsim.hand.model import (
+    KEYPOINT_NAMES,
+    HandModel,
+    HandMotion,
+    between_poses,
+    bridge_gaps,
+    hand_keypoints,
+    is_steady,
+    times_at,
+)
 from handsim.hand.shape import (
     HAND_DTYPE,
     JOINT_NAMES,
@@ -56,7 +64,8 @@ from handsim.hand.shape import (
 from handsim.motion_files.motion import (
     OPENXR_SUFFIX,
     Motion,
-    posed_hands,
+    PosedBody,
+    PosedHand,
     write_bvh,
     write_joint_csv,
     write_joint_parquet,
@@ -91,7 +100,7 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
     """The keypoints of all hands as markers, in the take's axes, so that they lie among its markers."""
     del up
     positions, names = [], []
-    for hand in posed_hands(motion):
+    for hand in motion.hands:
         keypoints = hand_keypoints(hand.model, hand.qpos)
         positions.append(np.where(hand.present[:, None, None], keypoints, np.nan))
         names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
@@ -167,7 +176,8 @@ class Take:
     entries (`dataclasses.replace(take, labels=...)`).
 
     Raises:
-        ArgumentError: The arrays do not fit together, or hold what they cannot.
+        ArgumentError: The arrays do not fit together, or hold what they cannot; a method is asked for a hand
+            that is not in the take.
     """
 
     rate: float
@@ -418,31 +428,19 @@ class Take:
         return JOINT_NAMES
 
     def angles(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
-        """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
-        """
-        return dict(zip(JOINT_NAMES, self.qpos[:, self.hand(side), 7:].T, strict=True))
+        """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose."""
+        return dict(zip(JOINT_NAMES, self.qpos[:, self.hand_index(side), 7:].T, strict=True))
 
     def angle_spreads(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
-        """The standard deviation of each joint's angle over time [rad]; NaN where it is not known.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
-        """
+        """The standard deviation of each joint's angle over time [rad]; NaN where it is not known."""
         spread = self.angle_spread
         if spread is None:
             spread = np.full((*self.status.shape, NUM_JOINTS), np.nan, dtype=np.float32)
-        return dict(zip(JOINT_NAMES, spread[:, self.hand(side)].T, strict=True))
+        return dict(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
 
     def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
-        """In which frames a hand's pose follows from the points; it coasts or is lost in the others.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
-        """
-        tracked: NDArray[np.bool_] = self.status[:, self.hand(side)] >= INITIALIZED
+        """In which frames a hand's pose follows from the points; it coasts or is lost in the others."""
+        tracked: NDArray[np.bool_] = self.status[:, self.hand_index(side)] >= INITIALIZED
         return tracked
 
     @property
@@ -460,12 +458,8 @@ class Take:
         """The labels of each hand's markers."""
         return spans([hand.layout.num_markers for hand in self.hands])
 
-    def hand(self, side: Side) -> int:
-        """The index of a hand among the hands.
-
-        Raises:
-            ArgumentError: It is not in the take.
-        """
+    def hand_index(self, side: Side) -> int:
+        """The index of a hand among the hands."""
         check_choice(side, self.sides, noun="hand")
         return self.sides.index(side)
 
@@ -481,31 +475,21 @@ class Take:
 
         Args:
             of: A hand's side, a body's name, or any labels that follow one another.
-
-        Raises:
-            ArgumentError: There is no such hand or body.
         """
         return self.point_list.labeled(of if isinstance(of, range) else self._labels_of(of))
 
     def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
-        """Which markers of a hand were not seen, in frames with a pose, from which they can be filled in.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
-        """
+        """Which markers of a hand were not seen, in frames with a pose, from which they can be filled in."""
         seen = np.isfinite(self.observed(side)[..., 0])
-        filled: NDArray[np.bool_] = ~seen & (self.status[:, self.hand(side)] != LOST)[:, None]
+        filled: NDArray[np.bool_] = ~seen & (self.status[:, self.hand_index(side)] != LOST)[:, None]
         return filled
 
     def markers(self, side: Side) -> Float[np.ndarray, "T M 3"]:
         """The markers of a hand [m] as seen, or from the pose where they were not; NaN where it has no pose.
 
         Gloves slip: a marker that is filled in is shifted by its `marker_bias`.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
         """
-        number, markers = self.hand(side), self.observed(side)
+        number, markers = self.hand_index(side), self.observed(side)
         there = self.status[:, number] != LOST
         filled = np.isnan(markers[..., 0])
         markers[~there] = np.nan
@@ -521,11 +505,8 @@ class Take:
         Args:
             side: The hand.
             frames: The frames; all when None.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
         """
-        number, bias = self.hand(side), self.marker_bias(side)
+        number, bias = self.hand_index(side), self.marker_bias(side)
         worn, qpos = self.hands[number], self.qpos[:, number]
         qpos = qpos if frames is None else qpos[frames]
         markers = np.full((len(qpos), worn.layout.num_markers, 3), np.nan)
@@ -543,11 +524,8 @@ class Take:
 
         It is learned from the frames whose pose was fitted to points; 0 where these are few. A tracker
         fits poses to markers that are shifted by this; so must be what stands between its poses.
-
-        Raises:
-            ArgumentError: The hand is not in the take.
         """
-        number = self.hand(side)
+        number = self.hand_index(side)
         worn, qpos = self.hands[number], self.qpos[:, number]
         fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
         fits = fits[:: -(-len(fits) // _MOST_LEARNED) or 1]
@@ -581,7 +559,7 @@ class Take:
         Raises:
             ArgumentError: The hand is not in the take, or has no pose in any frame.
         """
-        qpos = self.qpos[:, self.hand(side)]
+        qpos = self.qpos[:, self.hand_index(side)]
         if np.isnan(qpos[:, 0]).all():
             raise ArgumentError(f"the {side} hand has no pose in any frame")
         return bridge_gaps(self.times, qpos, self.rate)
@@ -686,7 +664,7 @@ class Take:
         motion = self.poses_alone(rate)
         if form.steady and not is_steady(motion.times, motion.rate):
             motion = motion.poses_alone(motion.rate)
-        form.write(path, motion, up)
+        form.write(path, posed_motion(motion), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take (.npz), whole or not at all; `load_take` gives the same numbers again.
@@ -717,6 +695,13 @@ class Take:
         check_choice(name, names, noun="hand or body")
         counts = [hand.layout.num_markers for hand in self.hands]
         return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
+
+
+def posed_motion(take: Take) -> Motion:
+    """The hands and bodies of a take, each with a pose in one frame at least, as writers take them."""
+    hands = [PosedHand.of(hand.model, take.qpos[:, n]) for n, hand in enumerate(take.hands)]
+    bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
+    return Motion(take.rate, take.times, hands, bodies)
 
 
 def load_take(path: str | Path) -> Take:

@@ -24,10 +24,8 @@ Make = Callable[[Path, int], int]
 """Takes a folder and a number, leaves the number's files in the folder, and returns the number."""
 Place = Path | UPath
 """A folder of this machine, or of an object store."""
-_EXTRA: Final = "object-stores"
 _PASSWORD: Final = re.compile(r"[^/@]*:[^/]*@")
 _HERE: Final = ("", "file", "local")
-_AGAIN: Final = "what is there stays, and the same command goes on after it"
 
 
 def place_of(out: str | Place) -> Place:
@@ -112,8 +110,7 @@ class Output:
     def job(self, make: Make, *, last: Sequence[str] = ()) -> Job:
         """A job that writes to the claimed folder.
 
-        Args:
-            last: Patterns of the files that say that a job is finished, whose content is then complete.
+        Files whose names match the patterns `last` say that a job is finished: all others come before them.
         """
         name = self._claimed[0]
         if isinstance(self.place, Path):
@@ -121,11 +118,7 @@ class Output:
         return _StoredJob(make, self.place, tuple(last), self.folder.parent)
 
     def sizes(self) -> dict[str, int]:
-        """Names of all files there and their lengths [bytes].
-
-        Raises:
-            HandSimError: The store does not answer or refuses.
-        """
+        """Names of all files there and their lengths [bytes]."""
         if self.is_here:
             return {name: (self.folder / name).stat().st_size for name in _files_in(self.folder)}
         with _one_sentence(self.place, "listing"):
@@ -135,15 +128,11 @@ class Output:
                 found = system.find(start, detail=True)
             except FileNotFoundError:
                 return {}
-        names = {path.removeprefix(start): about["size"] for path, about in found.items()}
-        return {name: int(size) for name, size in names.items() if _is_inside(name)}
+        names = {path.removeprefix(start): int(about["size"]) for path, about in found.items()}
+        return {name: size for name, size in names.items() if _is_inside(name)}
 
     def fetch(self, *patterns: str, names_of: Sequence[str] = ()) -> None:
-        """Have files in the folder here that match patterns, and empty ones where the name is enough.
-
-        Raises:
-            HandSimError: The store does not give them.
-        """
+        """Have files in the folder here that match patterns, and empty ones where the name is enough."""
         if self.is_here:
             return
         lacking = [name for name in self.sizes() if not (self.folder / name).exists()]
@@ -157,13 +146,7 @@ class Output:
         _transfer("get", self.place, {str(self.place / name): str(self.folder / name) for name in wanted})
 
     def checksum(self, name: str) -> str:
-        """SHA-256 of a file there.
-
-        Raises:
-            HandSimError: It is gone, or the store does not give it.
-        """
-        if self.is_here:
-            return checksum(self.folder / name)
+        """SHA-256 of a file there."""
         with _one_sentence(self.place, f"reading {name}"):
             return checksum(self.place / name)
 
@@ -171,17 +154,12 @@ class Output:
         """Put all files that were made in the folder here, one of them after all others."""
         if not self.is_here:
             made = [name for name in _files_in(self.folder) if name not in self._fetched]
-            _put(self.place, self.folder, [name for name in made if name != last])
-            _put(self.place, self.folder, [name for name in made if name == last])
+            _put(self.place, self.folder, made, [last])
 
 
 @contextmanager
 def open_output(out: str | Place) -> Iterator[Output]:
-    """Where the files of jobs go; what workers left that died or were ended is removed after the block.
-
-    Raises:
-        ArgumentError: There is no such place, or what an object store needs is not installed.
-    """
+    """Where the files of jobs go; what workers left that died or were ended is removed after the block."""
     place = place_of(out)
     if isinstance(place, Path):
         output = Output(place, place)
@@ -204,14 +182,13 @@ def open_output(out: str | Place) -> Iterator[Output]:
 
 @dataclass(frozen=True, slots=True)
 class _FolderJob:
-    """A job that writes to a folder, which whoever does it must see as the one who asks for it does."""
+    """A job that writes to a folder, if the worker sees the settings file there as the command does."""
 
     make: Make
     folder: Path
     claimed: str
-    """The settings file there."""
     content: str
-    """Its checksum."""
+    """Checksum of the settings file."""
 
     def __call__(self, number: int) -> int:
         path = self.folder / self.claimed
@@ -237,11 +214,8 @@ class _StoredJob:
         _check_store(self.store)  # before the work
         near = self.near if self.near.is_dir() else None
         with tempfile.TemporaryDirectory(prefix="handsim-", dir=near) as name:
-            folder = Path(name)
-            self.make(folder, number)
-            files = _files_in(folder)
-            _put(self.store, folder, [file for file in files if not _matches(file, self.last)])
-            _put(self.store, folder, [file for file in files if _matches(file, self.last)])
+            self.make(Path(name), number)
+            _put(self.store, Path(name), _files_in(Path(name)), self.last)
         return number
 
 
@@ -253,13 +227,15 @@ def _check_store(store: UPath) -> None:
     except ImportError as error:
         raise ArgumentError(
             f"{store} needs a package that cannot be imported ({' '.join(str(error).split())}); "
-            f"for s3:// run `pip install 'handsim[{_EXTRA}]'`"
+            "for s3:// run `pip install 'handsim[object-stores]'`"
         ) from error
 
 
-def _put(store: Place, folder: Path, names: Collection[str]) -> None:
-    """Put files of a folder; each object is there with all its bytes, or as it was before."""
-    _transfer("put", store, {str(folder / name): str(store / name) for name in names})
+def _put(store: Place, folder: Path, names: Collection[str], last: Sequence[str] = ()) -> None:
+    """Put files of a folder, those that match `last` after the others; each is whole, or as it was before."""
+    for late in (False, True):
+        chosen = [name for name in names if _matches(name, last) == late]
+        _transfer("put", store, {str(folder / name): str(store / name) for name in chosen})
 
 
 def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
@@ -270,15 +246,18 @@ def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
 
 
 @contextmanager
-def _one_sentence(store: Place, doing: str) -> Iterator[None]:
+def _one_sentence(place: Place, doing: str) -> Iterator[None]:
     """Tell trouble with a store in one sentence: each protocol has errors of its own."""
     try:
         yield
     except ImportError:
         raise
     except Exception as error:
+        if isinstance(place, Path):
+            raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise HandSimError(f"{store}: {doing} failed: {reason}; {_AGAIN}") from error
+        again = "what is there stays, and the same command goes on after it"
+        raise HandSimError(f"{place}: {doing} failed: {reason}; {again}") from error
 
 
 def _files_in(folder: Path) -> list[str]:

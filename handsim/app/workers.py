@@ -51,15 +51,8 @@ def check_workers(workers: int | None) -> int:
 def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:
     """Do jobs, each in any process and in any order, and yield the number of each when it is done.
 
-    Args:
-        job: Takes a number and returns it.
-        workers: Number of processes, all cores when not given; or an executor. With a number the first job is
-            done in this process, before the others: this fills numba's cache before workers need it, and a
-            mistake common to all jobs shows at once.
-
-    Raises:
-        Exception: What a job raised.
-        DatasetError: A worker died.
+    With a number of processes (all cores when None) the first job is done in this process, before the others:
+    this fills numba's cache before workers need it, and a mistake common to all jobs shows at once.
     """
     if isinstance(workers, Executor):
         yield from _share_out(job, todo, workers)
@@ -189,11 +182,7 @@ def chosen_workers(
 ) -> Iterator[int | Executor]:
     """What the options --cluster and --workers stand for: a number of processes, or a cluster's executor.
 
-    Args:
-        cluster: `tcp://host:port` or `tls://host:port` of a Dask scheduler, its file (.json), or `local`;
-            this machine when not given.
-        workers: Processes of this machine, all cores when not given.
-        tell: Takes a line for the user.
+    The user is told of the cluster by a line.
     """
     if cluster is None:
         yield check_workers(workers)
@@ -278,9 +267,6 @@ class ClusterExecutor(Executor):
     A worker that dies loses the job that it was doing, and another does that again. Workers that come later
     take part. Each must have the versions of this machine and one thread. Jobs are done in the folder that
     this process runs in, where a worker has it.
-
-    Args:
-        client: A `distributed.Client`.
     """
 
     def __init__(self, client: Any) -> None:

@@ -20,14 +20,14 @@ from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import WRIST_VOLUME, simulate_take
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
 
 def generate(
     out: Annotated[str, tyro.conf.arg(metavar="PATH")],
-    config: Annotated[DatasetConfig, tyro.conf.arg(name="")],
+    settings: Annotated[GenerateSettings, tyro.conf.arg(name="")],
     workers: int | None = None,
     cluster: str | None = None,
 ) -> None:
@@ -36,7 +36,7 @@ def generate(
     Args:
         out: Folder for the shards, their manifest and report.html; or a folder of an object store, as
             s3://bucket/prefix, which gets no report (docs/object_stores.md).
-        config: What to make.
+        settings: What to make.
         workers: Processes; all cores when not given.
         cluster: Where else to make shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
@@ -47,26 +47,25 @@ def generate(
         chosen_workers(cluster, workers, bar.say) as chosen,
     ):
         manifest = make_dataset(
-            config,
+            settings,
             place,
             workers=chosen,
             progress=bar,
         )
-    print_line(f"{manifest.num_frames} frames of {config.glove} in {place}")
+    print_line(f"{manifest.num_frames} frames of {settings.glove} in {place}")
     if isinstance(place, Path):
-        print_line(f"report in {_report(config, place)}")
+        print_line(f"report in {_report(settings, place)}")
 
 
-def _report(config: DatasetConfig, out: Path) -> Path:
-    """Write the page of plots."""
-    # Not in make_dataset: a set is complete without its report, whose bytes depend on matplotlib.
+def _report(settings: GenerateSettings, out: Path) -> Path:
+    """Write the page of plots, without which a set is complete: its bytes depend on matplotlib."""
     with named_steps("drawing the report"):
         kind: SimulatedKind = (
-            "hand-hand" if len(load_layout(config.glove).sides) == len(SIDES) else "single-hand"
+            "hand-hand" if len(load_layout(settings.glove).sides) == len(SIDES) else "single-hand"
         )
-        rig = as_rig(config.rig)
+        rig = as_rig(settings.rig)
         if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
             # A small rig stands where the hands of a simulated capture would move.
             return write_dataset_page(out / REPORT, Dataset(out))
-        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=rig)
+        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=settings.glove, rig=rig)
         return write_dataset_page(out / REPORT, Dataset(out), present=take.markers_present(), rate=take.rate)

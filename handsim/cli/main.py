@@ -49,7 +49,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "handsim.cli.export:export",
         "Write a take's motion for other programs (.glb, .bvh, .usdc, .csv, ...), or a labeler as .onnx.",
     ),
-    "evaluate": ("handsim.cli.evaluate:evaluate", "Measure a labeler on a labeled capture."),
+    "evaluate": ("handsim.cli.train:evaluate", "Measure a labeler on a labeled capture."),
     "simulate": ("handsim.cli.simulate:simulate", "Simulate a capture of hands, with its truth."),
     "calibrate": ("handsim.cli.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("handsim.cli.track:track", "Follow hands through a marker capture or a live stream."),

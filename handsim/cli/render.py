@@ -30,21 +30,10 @@ _FLAT: Final = tyro.conf.arg(name="")
 
 
 @dataclass(frozen=True, slots=True)
-class ViewOptions(ViewConfig):
-    """`ViewConfig` as the command line spells it, not checked."""
-
-    cameras: str | None = None
-    """File of your own cameras, instead of all these: ours (.toml), OpenCV's (.yml, .json), or COLMAP's (the
-    folder of cameras.txt and images.txt)."""
-
-    def __post_init__(self) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
 class RenderOptions(RenderConfig):
     """`RenderConfig` as the command line spells it, not checked."""
 
-    view: Annotated[ViewOptions, _FLAT] = field(default_factory=ViewOptions)
+    view: Annotated[ViewConfig, _FLAT] = field(default_factory=ViewConfig)
     tones: tuple[str, ...] = ()  # type: ignore[assignment]  # names
     """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
     all when not given."""
@@ -71,7 +60,6 @@ class RenderOptions(RenderConfig):
         return RenderConfig(
             **given
             | {
-                "view": ViewConfig(**{one.name: getattr(self.view, one.name) for one in fields(ViewConfig)}),
                 "tones": self.tones or ALL_TONES,
                 "background": Backgrounds.of(kinds | {"photos": self.photos}) if kinds else Backgrounds(),
                 "depth_sensor": "auto" if names == ("auto",) else DepthSensor(names) if names else None,
@@ -132,7 +120,9 @@ def render(
     if table is None and (hands, people, glove) != (None, None, "dense19"):
         raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
     source = cast("Path", take) if table is None else PoseFile(table, hands, people, glove)
-    check_outputs((take, poses, options.view.cameras), (place if isinstance(place, Path) else None,))
+    check_outputs(
+        (take, poses, cast("str | None", options.view.cameras)), (place if isinstance(place, Path) else None,)
+    )
     config, start, counts = options.config(), time.perf_counter(), []
     with (
         progress_bar("images") as bar,

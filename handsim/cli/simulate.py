@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,12 +10,12 @@ import tyro
 
 from gloves.captures.capture import UNLABELED, Capture, run_lengths
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.takes.take import SUFFIX, Take, load_take
+from gloves.takes.take import SUFFIX, load_take
 from handsim.app.messages import print_line
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_free, check_memory, check_outputs, written_together
-from train.simulation.takes import TakeConfig, record_config
+from train.simulation.takes import SimulateSettings, simulate_take
 
 _MEMORY: Final = 20_000
 """Bytes that a frame of two hands takes while it is simulated; 18,000 were measured with 24,000 frames."""
@@ -24,46 +23,41 @@ _DISK: Final = 2_000  # bytes of a frame in both files
 
 
 def simulate(
-    out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")], cluster: str | None = None
+    out: Path, settings: Annotated[SimulateSettings, tyro.conf.arg(name="")], cluster: str | None = None
 ) -> None:
     """Simulate a capture of one hand or two; the truth goes beside it.
 
     Args:
         out: Unlabeled .c3d, .trc or Motive .csv file; OUT.truth.npz takes IDs, labels, poses and shapes.
-        config: What to simulate.
+        settings: What to simulate.
         cluster: Where else to simulate: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
     """
     truth = out.with_suffix(SUFFIX)
     check_suffix(out, WRITABLE)
-    check_outputs((str(config.glove), str(config.rig)), (out, truth))
-    num_frames = config.num_frames or 0
+    check_outputs((str(settings.glove), str(settings.rig)), (out, truth))
+    num_frames = settings.num_frames or 0
     what = f"{num_frames} frames"
     remedy = "simulate shorter captures with different seeds"
     check_memory(num_frames * _MEMORY, what, remedy)
     check_free(out.parent, num_frames * _DISK, what, remedy, error=ArgumentError)
     if cluster is None:
-        take = _simulate_into(out, config)
+        _simulate_into(out, settings, 0)
     else:
         with chosen_workers(cluster, None, print_line) as workers:
-            list(run_jobs(functools.partial(_capture_of_seed, out, config), [config.seed], workers))
-        take = load_take(truth)
+            list(run_jobs(functools.partial(_simulate_into, out, settings), [0], workers))
+    take = load_take(truth)
     gaps = len(run_lengths(~take.markers_present()))
     print_line(
         f"{out}: {take.num_frames} frames, {gaps} gap{'s' * (gaps != 1)} of single markers; truth in {truth}"
     )
 
 
-def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
-    """The job of a worker."""
-    _simulate_into(out, dataclasses.replace(config, seed=seed))
-    return seed
-
-
-def _simulate_into(out: Path, config: TakeConfig) -> Take:
-    take = record_config(config)
-    names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.point_list.num_columns))
+def _simulate_into(out: Path, settings: SimulateSettings, number: int) -> int:
+    """Write a capture and its truth; a worker's job, of which there is one."""
+    take = simulate_take(settings=settings)
+    names = tuple(f"{UNLABELED}{column + 1}" for column in range(take.point_list.num_columns))
     with written_together():  # a capture without its truth is no use
         write_capture(out, Capture(names, take.points, take.rate))
         take.save(out.with_suffix(SUFFIX))
-    return take
+    return number

@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
+from handsim._checks import check_array, check_choice, check_rng, check_type
 from handsim.errors import ArgumentError
+from handsim.settings import Limits, Settings
 
 Side = Literal["left", "right"]
 SIDES: Final[tuple[Side, Side]] = ("left", "right")
@@ -249,26 +250,21 @@ def named_shape(size: str, *, side: Side = "right") -> HandShape:
 
 
 @dataclass(frozen=True, slots=True)
-class Population:
+class Population(Settings):
     """The people whose hands `sample_shape` draws; spreads are standard deviations from mean proportions."""
 
-    children: float = 0.0
+    children: Annotated[float, Limits(0.0, 1.0)] = 0.0
     """Share of children: hand lengths from 0.6 of an adult's (about three years old) upwards."""
-    digit_spread: float = 0.035
+    digit_spread: Annotated[float, Limits(0.0)] = 0.035
     """Log spread of a whole digit's length."""
-    bone_spread: float = 0.045
+    bone_spread: Annotated[float, Limits(0.0)] = 0.045
     """Log spread of a single bone's length."""
-    knuckle_spread: float = 0.001
+    knuckle_spread: Annotated[float, Limits(0.0)] = 0.001
     """Spread of each knuckle's position [m]."""
-    angle_spread: float = 3.0
+    angle_spread: Annotated[float, Limits(0.0)] = 3.0
     """Spread of each finger's base angles [deg]; three times this for the thumb."""
-    girth_spread: float = 0.06
+    girth_spread: Annotated[float, Limits(0.0)] = 0.06
     """Log spread of a digit's girth."""
-
-    def __post_init__(self) -> None:
-        check_number("children", self.children, 0.0, 1.0)
-        for name in ("digit_spread", "bone_spread", "knuckle_spread", "angle_spread", "girth_spread"):
-            check_number(name, getattr(self, name), 0.0)
 
 
 ADULTS: Final = Population()

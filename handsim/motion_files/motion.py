@@ -25,7 +25,7 @@ import csv
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol, cast
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -69,72 +69,25 @@ SKIN: Final = Material("skin", (0.66, 0.38, 0.28), 0.65)
 THING: Final = Material("thing", (0.16, 0.2, 0.26), 0.5)
 
 
-class HasModel(Protocol):
-    """Anything with a hand: a `gloves.GloveFit`."""
-
-    @property
-    def model(self) -> HandModel:
-        """The hand."""
-        ...
-
-
-class NamedBody(Protocol):
-    """A rigid body."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def shape(self) -> RigidObject | None:
-        """Its surface; None where only its poses are known."""
-        ...
-
-
-class Motion(Protocol):
-    """Hands and rigid bodies, frame by frame: a `gloves.Take`. Each has a pose in one frame at least."""
-
-    @property
-    def rate(self) -> float:
-        """Frames per second [Hz]; of a stream, the usual one."""
-        ...
-
-    @property
-    def times(self) -> Float[np.ndarray, "T"]:
-        """Time of each frame [s], increasing."""
-        ...
-
-    @property
-    def hands(self) -> Sequence[HasModel]:
-        """The hands, at most one per side."""
-        ...
-
-    @property
-    def qpos(self) -> Float[np.ndarray, "T H 27"]:
-        """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where there is no pose."""
-        ...
-
-    @property
-    def bodies(self) -> Sequence[NamedBody]:
-        """The rigid bodies."""
-        ...
-
-    @property
-    def body_poses(self) -> Float[np.ndarray, "T B 7"]:
-        """Position [m] and orientation (wxyz); NaN where there is no pose."""
-        ...
-
-
 class PosedHand(NamedTuple):
     """A hand of a motion."""
 
     model: HandModel
-    side: Side
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose."""
+    """The frames with a pose; there is one at least."""
     qpos: Float[np.ndarray, "T 27"]
     """The poses [m, rad]; without one the last pose, and before the first one that."""
+
+    @property
+    def side(self) -> Side:
+        """Which hand it is."""
+        return self.model.shape.side
+
+    @classmethod
+    def of(cls, model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> PosedHand:
+        """A hand with its poses, NaN where it has none."""
+        present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
+        return cls(model, present, _held(qpos, present))
 
 
 class PosedBody(NamedTuple):
@@ -142,32 +95,34 @@ class PosedBody(NamedTuple):
 
     name: str
     shape: RigidObject | None
+    """Its surface; None where only its poses are known."""
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose."""
+    """The frames with a pose; there is one at least."""
     T_world_body: Float[np.ndarray, "T 4 4"]
     """The poses [m]; without one the last pose, and before the first one that."""
 
-
-def posed_hands(motion: Motion) -> Iterator[PosedHand]:
-    """Each hand, with its last pose where it has none."""
-    for number, hand in enumerate(motion.hands):
-        qpos = motion.qpos[:, number]
-        present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        yield PosedHand(hand.model, hand.model.shape.side, present, _held(qpos, present))
-
-
-def posed_bodies(motion: Motion) -> Iterator[PosedBody]:
-    """Each rigid body, with its last pose where it has none."""
-    for number, body in enumerate(motion.bodies):
-        poses = motion.body_poses[:, number]
+    @classmethod
+    def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
+        """A body with its positions [m] and orientations (wxyz), NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
-        yield PosedBody(body.name, body.shape, present, pose_matrices(_held(poses, present)))
+        return cls(name, shape, present, pose_matrices(_held(poses, present)))
 
 
-def seconds_of(motion: Motion) -> Float[np.ndarray, "T"]:
-    """Time since the first frame [s]."""
-    seconds: NDArray[np.float64] = motion.times - motion.times[0]
-    return seconds
+class Motion(NamedTuple):
+    """Hands and rigid bodies, frame by frame."""
+
+    rate: float
+    """Frames per second [Hz]; of a stream, the usual one."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s], increasing."""
+    hands: Sequence[PosedHand]
+    bodies: Sequence[PosedBody]
+
+    @property
+    def seconds(self) -> Float[np.ndarray, "T"]:
+        """Time since the first frame [s]."""
+        seconds: NDArray[np.float64] = self.times - self.times[0]
+        return seconds
 
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
@@ -317,7 +272,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is."""
-    hands = tuple(posed_hands(motion))
+    hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
     row_format = ",%.9g" * len(NUMBERS)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
@@ -336,7 +291,7 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         from pyarrow import parquet
     except ImportError as error:
         raise HandSimError(".parquet needs pyarrow; run `pip install 'handsim[parquet]'`") from error
-    hands = tuple(posed_hands(motion))
+    hands = motion.hands
     count = len(hands)
     numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(NUMBERS))
     columns = {
@@ -363,8 +318,8 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the angles of all hands, in the take's axes whatever `up` is."""
-    hands = tuple(posed_hands(motion))
-    table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
+    hands = motion.hands
+    table = np.concatenate([motion.seconds[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
     names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
     header = [
         as_text(path.stem),
@@ -401,10 +356,10 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     turn = file_axes(up)
     columns = [np.zeros((len(motion.times), 6))]
     lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
-    for hand in posed_hands(motion):
+    for hand in motion.hands:
         lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
         columns.append(_hand_columns(hand, turn))
-    for thing in posed_bodies(motion):
+    for thing in motion.bodies:
         content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
         lines += _indented([f"JOINT {_word(thing.name)}", "{", *_indented(content), "}"])
         poses = thing.T_world_body
@@ -494,7 +449,7 @@ _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the joints of all hands as JSON, by custom to a name that ends in `.openxr.json`."""
-    tracks = tuple(posed_hands(motion))
+    tracks = motion.hands
     header = {
         "format": "XR_EXT_hand_tracking joints by handsim",
         "schema": 1,

@@ -42,9 +42,6 @@ from handsim.motion_files.motion import (
     corner_normals,
     file_axes,
     local_rotations,
-    posed_bodies,
-    posed_hands,
-    seconds_of,
     smooth_quaternions,
     split_vertices,
 )
@@ -71,7 +68,7 @@ class _Scene:
     """The document while it grows."""
 
     def __init__(self, motion: Motion, up: UpAxis) -> None:
-        self._times = seconds_of(motion)
+        self._times = motion.seconds
         self._buffer = GlbBuffer()
         self._meshes: list[dict[str, Any]] = []
         self._skins: list[dict[str, Any]] = []
@@ -83,9 +80,9 @@ class _Scene:
         self._seconds = (
             self._buffer.add(self._times.astype("<f4"), bounds=True) if len(self._times) > 1 else None
         )
-        for hand in posed_hands(motion):
+        for hand in motion.hands:
             self._add_hand(hand)
-        for thing in posed_bodies(motion):
+        for thing in motion.bodies:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
@@ -286,15 +283,15 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    codes = np.round(seconds_of(motion) * motion.rate, 6)  # whole ones at a steady rate
+    codes = np.round(motion.seconds * motion.rate, 6)  # whole ones at a steady rate
     stage.SetTimeCodesPerSecond(motion.rate)
     stage.SetFramesPerSecond(motion.rate)
     stage.SetStartTimeCode(0.0)
     stage.SetEndTimeCode(float(codes[-1]))
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/hands").GetPrim())
-    for hand in posed_hands(motion):
+    for hand in motion.hands:
         _add_hand(stage, hand, codes)
-    for number, thing in enumerate(posed_bodies(motion)):
+    for number, thing in enumerate(motion.bodies):
         _add_thing(stage, thing, number, codes)
     with atomic_write(path) as temporary, plain_path(temporary) as plain:
         try:

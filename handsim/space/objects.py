@@ -44,7 +44,9 @@ Solid = tuple[list[Part], Any]
 
 def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
     """Parts and mesh of one entry of `data/objects.json` (millimeters and degrees there, meters here)."""
-    return _SOLIDS[kind](np.asarray(numbers, dtype=np.float64))
+    import trimesh
+
+    return _SOLIDS[kind](np.asarray(numbers, dtype=np.float64), trimesh)
 
 
 def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
@@ -76,18 +78,14 @@ def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArra
     return _at((start + end) / 2, rotation), float(np.linalg.norm(end - start))
 
 
-def _sphere(numbers: NDArray[np.float64]) -> Solid:
-    import trimesh
-
+def _sphere(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     position, radius = 1e-3 * numbers[:3], 1e-3 * numbers[3]
     pose = _at(position)
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     return [_part("sphere", (radius, 0.0, 0.0), pose)], mesh.apply_transform(pose)
 
 
-def _capsule(numbers: NDArray[np.float64]) -> Solid:
-    import trimesh
-
+def _capsule(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     radius = 1e-3 * numbers[6]
     pose, length = _along(1e-3 * numbers[:3], 1e-3 * numbers[3:6])
     mesh = trimesh.creation.capsule(height=length, radius=radius, count=[_AROUND, _AROUND // 2])
@@ -95,27 +93,21 @@ def _capsule(numbers: NDArray[np.float64]) -> Solid:
     return [_part("capsule", (radius, length / 2, 0.0), pose)], mesh.apply_transform(pose)
 
 
-def _box(numbers: NDArray[np.float64]) -> Solid:
-    import trimesh
-
+def _box(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
     mesh = trimesh.creation.box(extents=2e-3 * numbers[3:6])
     return [_part("box", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
-def _ellipsoid(numbers: NDArray[np.float64]) -> Solid:
-    import trimesh
-
+def _ellipsoid(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
     mesh = trimesh.creation.icosphere(subdivisions=2)
     mesh.apply_scale(1e-3 * numbers[3:6])
     return [_part("ellipsoid", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
-def _cup(numbers: NDArray[np.float64]) -> Solid:
+def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     """A hollow cup to cameras, a full cylinder to fingers."""
-    import trimesh
-
     low, high, radius, wall, depth = 1e-3 * numbers
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
@@ -124,21 +116,22 @@ def _cup(numbers: NDArray[np.float64]) -> Solid:
     return [_part("cylinder", (radius, (high - low) / 2, 0.0), pose)], mesh
 
 
-def _arc(numbers: NDArray[np.float64]) -> Solid:
+def _arc(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     """A bent tube: a chain of capsules to fingers."""
     center, radius, tube = 1e-3 * numbers[:3], 1e-3 * numbers[9], 1e-3 * numbers[10]
     first, second = (axis / np.linalg.norm(axis) for axis in (numbers[3:6], numbers[6:9]))
     angles = np.deg2rad(np.linspace(numbers[11], numbers[12], int(numbers[13]) + 1))
     outward = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     points = center + radius * outward
-    parts = []
-    for start, end in itertools.pairwise(points):
-        pose, length = _along(start, end)
-        parts.append(_part("capsule", (tube, length / 2, 0.0), pose))
-    return parts, _tube_mesh(points, outward, np.cross(first, second), tube, bool(np.ptp(angles) > 6.28))
+    pieces = [_along(start, end) for start, end in itertools.pairwise(points)]
+    parts = [_part("capsule", (tube, length / 2, 0.0), pose) for pose, length in pieces]
+    return parts, _tube_mesh(
+        trimesh, points, outward, np.cross(first, second), tube, bool(np.ptp(angles) > 6.28)
+    )
 
 
 def _tube_mesh(
+    trimesh: Any,
     points: NDArray[np.float64],
     outward: NDArray[np.float64],
     across: NDArray[np.float64],
@@ -146,21 +139,18 @@ def _tube_mesh(
     ring: bool,
 ) -> Any:
     """Mesh around a polyline: closed upon itself, or with flat ends."""
-    import trimesh
-
     angle = np.linspace(0.0, 2 * np.pi, _TUBE_SIDES, endpoint=False)
     cross = np.cos(angle)[:, None, None] * outward + np.sin(angle)[:, None, None] * across
     rows = (points + tube * cross).swapaxes(0, 1)  # (points, sides, 3)
     if ring:
         rows = rows[:-1]
     count, sides = rows.shape[:2]
-    quads = []
-    for row in range(count if ring else count - 1):
-        for side in range(sides):
-            here, there = row * sides, (row + 1) % count * sides
-            after = (side + 1) % sides
-            quads.append((here + side, here + after, there + after, there + side))
-    faces = [(a, b, c) for a, b, c, _ in quads] + [(a, c, d) for a, _, c, d in quads]
+    numbers = np.arange(count * sides).reshape(count, sides)
+    here = numbers if ring else numbers[:-1]
+    there = np.roll(numbers, -1, axis=0)[: len(here)]
+    corners = [here, np.roll(here, -1, axis=1), np.roll(there, -1, axis=1), there]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    faces = [*quads[:, [0, 1, 2]].tolist(), *quads[:, [0, 2, 3]].tolist()]
     vertices = rows.reshape(-1, 3)
     if not ring:
         last = (count - 1) * sides
@@ -172,7 +162,7 @@ def _tube_mesh(
     return mesh
 
 
-_SOLIDS: Final[dict[str, Callable[[NDArray[np.float64]], Solid]]] = {
+_SOLIDS: Final[dict[str, Callable[[NDArray[np.float64], Any], Solid]]] = {
     "sphere": _sphere,
     "capsule": _capsule,
     "box": _box,
@@ -318,6 +308,10 @@ def _close(mesh: Any, path: Path) -> Part:
     return hull
 
 
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
 def _library() -> dict[str, Any]:
     library: dict[str, Any] = package_data("handsim", "objects")["objects"]
     return library
@@ -350,8 +344,3 @@ def _build(name: str, entry: dict[str, Any]) -> RigidObject:
         mass=entry["mass"],
         shiny=shiny,
     )
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    unit: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit

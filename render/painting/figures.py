@@ -146,7 +146,7 @@ class HandFigure:
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
         bony = look.skin.relief if look.glove is None else 0.0  # cloth levels it
-        self._skin = PosableSkin(fit.model, look.forearm, bony)
+        self.skin = PosableSkin(fit.model, look.forearm, bony)
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
@@ -155,17 +155,11 @@ class HandFigure:
         if look.glove is not None:
             self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
-    def forearm_line(
-        self, qpos: Float[np.ndarray, "27"]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """See `PosableSkin.forearm_line`."""
-        return self._skin.forearm_line(qpos)
-
     def drawn(
         self, qpos: Float[np.ndarray, "27"], number: int, upper_arm: Float[np.ndarray, "3"] | None = None
     ) -> list[Drawn]:
         """Skin, and markers where a glove is worn."""
-        skin, first_part = self._skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
+        skin, first_part = self.skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
             skin.vertices,

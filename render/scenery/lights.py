@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from handsim.errors import HandSimError
 from render.frames import Doubles, Integers
 from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
 from render.skin.look import SkinLook
 
-_MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
 _SIZE: Final = (64, 48)  # of the picture that gives light
 _DIRECTIONS: Final = 1024
 _MIDDLE_SKIN: Final = 0.3  # reflectance
@@ -51,12 +49,6 @@ class Lighting:
     ambient: tuple[float, float, float]  # ambient light that a white surface reflects, linear
     surroundings: tuple[tuple[float, float, float], ...] = ()
     """Ambient light by the surface's normal, see `surroundings.irradiance`; OpenGL uses `ambient` instead."""
-
-    def __post_init__(self) -> None:
-        if len(self.lamps) > _MOST_LAMPS:
-            raise HandSimError(f"{len(self.lamps)} lamps, expected at most {_MOST_LAMPS}")
-        if len(self.surroundings) not in (0, 9):
-            raise HandSimError(f"{len(self.surroundings)} rows of light from around, expected none or nine")
 
 
 STUDIO: Final = Lighting(

@@ -15,15 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from handsim._checks import check_choice, check_type
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError
 from handsim.hand.shape import HandShape
+from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR
 from render.fields import smooth
@@ -45,20 +46,20 @@ _REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
 
 
 @dataclass(frozen=True, slots=True)
-class SkinLook:
+class SkinLook(Settings):
     """One person's skin. Colors are CIELAB (D65); strengths are factors, 1 for an average adult.
 
     Raises:
-        HandSimError: The lightness is not within 0 and 100, or the roughness not within 0 and 1.
+        ArgumentError: The lightness is not within 0 and 100, or the roughness not within 0 and 1.
     """
 
-    lightness: float = 62.0
+    lightness: Annotated[float, Limits(0.0, 100.0)] = 62.0
     """L* of the back of the hand."""
     redness: float = 10.5
     """a* of the back of the hand."""
     yellowness: float = 17.0
     """b* of the back of the hand."""
-    palm_lightness: float = 66.0
+    palm_lightness: Annotated[float, Limits(0.0, 100.0)] = 66.0
     """L* of the palm."""
     flush: float = 1.0
     """Redness of finger tips, knuckles and the balls of the hand."""
@@ -76,19 +77,10 @@ class SkinLook:
     """Share of the nails' color that is `polish_color`."""
     polish_color: tuple[float, float, float] = (40.0, 50.0, 20.0)
     """CIELAB."""
-    roughness: float = 0.55
+    roughness: Annotated[float, Limits(0.0, 1.0)] = 0.55
     """Roughness of the microfacet model, from 0 (mirror) to 1 (chalk)."""
     seed: int = 0
     """Seed of blotches, veins and lines."""
-
-    def __post_init__(self) -> None:
-        if not (0.0 <= self.lightness <= 100.0 and 0.0 <= self.palm_lightness <= 100.0):
-            raise HandSimError(
-                f"skin of lightness {self.lightness:g} and {self.palm_lightness:g}, "
-                "expected CIELAB's 0 to 100"
-            )
-        if not 0.0 <= self.roughness <= 1.0:
-            raise HandSimError(f"roughness is {self.roughness:g}, expected 0 to 1")
 
     @property
     def typology_angle(self) -> float:
@@ -182,7 +174,6 @@ def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
     return float(lows[-1] + along)
 
 
-_LONGEST: Final = 1.0  # [m]
 _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
@@ -219,12 +210,6 @@ class Forearm:
     sleeve: float = 1.0  # start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm
     sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)  # sRGB in [0, 1]
     looseness: float = 1.2  # girth of the sleeve over the arm's in it
-
-    def __post_init__(self) -> None:
-        if not 0.02 <= self.length <= _LONGEST:
-            raise HandSimError(f"a forearm of {self.length:g} m, expected 0.02 to {_LONGEST:g}")
-        if not self.girth > 0.0:
-            raise HandSimError(f"a forearm's girth is {self.girth:g}, expected a positive factor")
 
 
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:

@@ -34,7 +34,7 @@ from handsim.hand.skin import (
 )
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
-from render.fields import bump, smooth
+from render.fields import along_segment, bump, smooth
 from render.frames import FOREARM, Bytes, Doubles, Floats, Integers
 from render.skin.look import ELBOW, Forearm, bent_rings, forearm_rings
 
@@ -241,12 +241,6 @@ class _Skin(NamedTuple):
         frame = self.frames[bone]
         return (self.points - frame[:3, 3]) @ frame[:3, :3], self.normals @ frame[:3, 2]
 
-    def beside(self, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
-        """How far along a segment of the wrist's x and y [m] points are, 0 to 1, and how far from it [m]."""
-        way = end - start
-        along = np.clip((self.points[:, :2] - start) @ way / (way @ way), 0.0, 1.0)
-        return along, np.linalg.norm(self.points[:, :2] - start - along[:, None] * way, axis=1)
-
     def knob(
         self, bone: int, height: float, along: float, aside: float, *, at: tuple[float, float] = (0.0, 0.0)
     ) -> Doubles:
@@ -285,7 +279,7 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
     yield _Hill(_joint(f"{digit}_DIP_flexion"), 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
-    along, aside = skin.beside(root, knuckle)
+    along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
     yield _Hill(bent, *straight, skin.scale * ridge)
     place, facing = skin.local(first)
@@ -304,7 +298,7 @@ def _valleys(skin: _Skin) -> Iterator[_Hill]:
         first, second = 1 + 3 * number, 4 + 3 * number
         here = 0.5 * (skin.frames[first, :2, 3] + skin.frames[second, :2, 3])
         parted = here + 0.45 * (0.5 * (skin.frames[first + 1, :2, 3] + skin.frames[second + 1, :2, 3]) - here)
-        along, aside = skin.beside(here, parted)
+        along, aside = along_segment(skin.points[:, :2], here, parted)
         hollow = -0.0042 * bump(aside, skin.scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
         hollow *= 1.0 - 0.4 * along
         yield _Hill(_joint(f"{_FINGERS[number]}_MCP_flexion"), 10.0, 85.0, skin.scale * hollow)

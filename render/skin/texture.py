@@ -18,12 +18,11 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
 from handsim.hand.skin import vertex_normals
 from handsim.kernels import kernel
-from render.fields import bump, noise, smooth
+from render.fields import along_segment, bump, noise, smooth
 from render.frames import Bytes, Doubles, Floats, Integers
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas
@@ -154,10 +153,7 @@ def _palm_distances() -> tuple[Integers, Doubles]:
         knots = np.stack([np.interp(fine, np.arange(len(knots)), knots[:, i]) for i in range(2)], axis=1)
         knots = ndimage.gaussian_filter1d(knots, 4.0, axis=0, mode="nearest")
         for a, b in itertools.pairwise(knots):
-            along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-            distances[number] = np.minimum(
-                distances[number], np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
-            )
+            distances[number] = np.minimum(distances[number], along_segment(points, a, b)[1])
     return near, distances
 
 
@@ -254,20 +250,15 @@ def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
     texels = skin_texels()
     back = texels.back
     near, distances = _palm_distances()
-    on_palm = (1.0 - back[near]) * (
-        1.0 - sum(_share_at(digit, near, len(back)) for digit in texels.digits[1:])
-    )
+    shares = np.zeros((len(texels.digits), len(back)))
+    for share, digit in zip(shares, texels.digits, strict=True):
+        share[digit.texels] = digit.share
+    on_palm = (1.0 - back[near]) * (1.0 - sum(share[near] for share in shares[1:]))
     lines = tuple((on_palm * bump(distance, 0.0011)).astype(np.float32) for distance in distances)
     depth = np.zeros(len(back))
     for position in _WRIST_LINES:
         depth = np.maximum(depth, 0.35 * bump(texels.positions[:, 0] - position, 0.0009) * (1.0 - back))
     return near, lines, depth.astype(np.float32)
-
-
-def _share_at(digit: DigitTexels, texels: Integers, count: int) -> Doubles:
-    share = np.zeros(count)
-    share[digit.texels] = digit.share
-    return share[texels]
 
 
 _STEEPEST: Final = 0.9  # height over distance
@@ -322,10 +313,7 @@ def relief() -> Doubles:
     knuckles = shape.knuckles[1:, :2]
     for knuckle in knuckles:
         root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
-        along = np.clip(
-            (positions - root) @ (knuckle - root) / ((knuckle - root) @ (knuckle - root)), 0.0, 1.0
-        )
-        aside = np.linalg.norm(positions - root - along[:, None] * (knuckle - root), axis=1)
+        along, aside = along_segment(positions, root, knuckle)
         height += 0.00025 * smooth(along, 0.2, 0.8) * bump(aside, 0.0032)
         height += 0.0005 * bump(np.linalg.norm(positions - knuckle, axis=1), 0.0065)
     for hollow in 0.5 * (knuckles[:-1] + knuckles[1:]) + [0.004, 0.0]:
@@ -578,10 +566,6 @@ class GloveLook:
     roughness: float = 0.85
     wear: float = 1.0  # unevenness of the cloth, 1 for a used glove
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.cuff >= 0.01:
-            raise HandSimError(f"a glove's cuff {self.cuff:g} m behind the wrist, expected at least 0.01")
 
 
 def sample_glove_look(*, rng: np.random.Generator) -> GloveLook:

@@ -80,8 +80,8 @@ def c3d(folder: Path) -> list[Path]:
 
 def csv(folder: Path) -> list[Path]:
     """Two of Motive, with labels of rows and as we write it, one of Vicon among others; two European."""
+    from tests.gloves.captures.test_formats import DEVICES, nexus
     from tests.gloves.captures.test_text import rewritten
-    from tests.gloves.captures.test_text_formats import DEVICES, nexus
 
     (folder / "take.csv").write_text(MOTIVE)
     write_capture(folder / "ours.csv", capture())
@@ -93,7 +93,7 @@ def csv(folder: Path) -> list[Path]:
 
 
 def tsv(folder: Path) -> list[Path]:
-    from tests.gloves.captures.test_text_formats import qtm
+    from tests.gloves.captures.test_formats import qtm
 
     (folder / "take.tsv").write_text(qtm(version=True, events=("Start",)))
     (folder / "bare.tsv").write_text(qtm(columns=False, leading=False))

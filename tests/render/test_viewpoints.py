@@ -13,7 +13,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.space.camera import look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
 from render.subject import subject_of_poses
-from render.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, check_hands_in_view, hand_centers
+from render.viewpoints import PLACEMENTS, Framing, ViewConfig, Viewpoints, check_hands_in_view
 from train.simulation.takes import SimulatedKind, simulate_take
 
 
@@ -26,7 +26,7 @@ def take() -> Take:
 def test_every_placement_sees_the_hands(take, placement):
     config = ViewConfig(placement, "vga_wide", views=2)
     viewpoints = Viewpoints(config, take, rng=np.random.default_rng(1))
-    centers = hand_centers(take)
+    centers = Framing(take).centers
     for frame in range(0, 60, 7):
         cameras = viewpoints.cameras(frame)
         assert len(cameras) == (6 if placement == "rig" else 2)
@@ -45,7 +45,7 @@ def test_the_same_seed_gives_the_same_places(take):
 
 def test_cameras_anywhere_keep_their_distance(take):
     config = ViewConfig("anywhere", distance=(0.5, 0.6))
-    viewpoints, centers = Viewpoints(config, take, rng=np.random.default_rng(0)), hand_centers(take)
+    viewpoints, centers = Viewpoints(config, take, rng=np.random.default_rng(0)), Framing(take).centers
     away = [np.linalg.norm(viewpoints.cameras(n)[0].T_world_camera[:3, 3] - centers[n]) for n in range(60)]
     assert min(away) >= 0.5 - 1e-9 and max(away) <= 0.6 + 1e-9
 
@@ -63,9 +63,9 @@ def test_cameras_anywhere_keep_clear_of_arms(take):
 def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
     qpos, status = take.qpos.copy(), take.status.copy()
     qpos[20:30], status[20:30] = np.nan, LOST
-    centers = hand_centers(dataclasses.replace(take, qpos=qpos, status=status))
+    centers = Framing(dataclasses.replace(take, qpos=qpos, status=status)).centers
     assert np.isfinite(centers).all()
-    assert np.linalg.norm(centers[25] - hand_centers(take)[25]) < 0.1
+    assert np.linalg.norm(centers[25] - Framing(take).centers[25]) < 0.1
 
 
 @pytest.mark.parametrize(

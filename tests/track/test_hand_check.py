@@ -30,7 +30,7 @@ def test_hands_that_fit_are_told_nothing_of_the_one_that_is_not_there(capture):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         take = track_capture(capture)
-    right, left = (take.status[:, take.hand(side)] for side in ("right", "left"))
+    right, left = (take.status[:, take.hand_index(side)] for side in ("right", "left"))
     assert (right > 0).mean() > 0.99 and (left > 0).mean() <= 0.005
 
 

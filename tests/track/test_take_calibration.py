@@ -32,7 +32,7 @@ def seen(truth) -> Take:
 
 def angle_error(take: Take, truth: Take) -> float:
     """Of the right hand's joint angles [deg]."""
-    found, true = (one.qpos[:, one.hand("right"), 7:] for one in (take, truth))
+    found, true = (one.qpos[:, one.hand_index("right"), 7:] for one in (take, truth))
     return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
 
 

@@ -16,7 +16,7 @@ from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
 from train.loop import train_labeler
 from train.settings import CNNConfig, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 CONFIG = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
 
@@ -27,7 +27,7 @@ FIXED = dataclasses.replace(CONFIG, cnn=CNNConfig(reject=0.04, spread=0.005))
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    config = DatasetConfig(num_frames=200, seed=3, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
+    config = GenerateSettings(num_frames=200, seed=3, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
     make_dataset(config, out, workers=1)
     return Dataset(out)
 

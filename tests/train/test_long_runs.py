@@ -18,7 +18,7 @@ from train.labelers.storage import WEIGHTS, load_labeler
 from train.loop import CHECKPOINT, TrainingError, train_labeler
 from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)
@@ -28,7 +28,7 @@ OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--n
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 

@@ -28,7 +28,7 @@ from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE
 from train.settings import SetLabelerConfig, TrainSettings, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,7 +45,7 @@ SRUN |= {"SLURM_NODEID": "0"}
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    config = DatasetConfig(num_frames=300, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
+    config = GenerateSettings(num_frames=300, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
     make_dataset(config, out, workers=1)
     return Dataset(out)
 

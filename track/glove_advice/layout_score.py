@@ -17,8 +17,8 @@ from track.glove_advice.observed_hands import ObservedHand
 from track.glove_advice.trials import Trial
 from train.data.batches import Corruption, corrupt, paper_corruption
 from train.evaluation import LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
+from train.labelers.pose_prior import SideClassifier
 from train.labelers.protocol import Labeler
-from train.labelers.side import SideClassifier
 
 _NEAR: Final = 0.003  # between two markers' surfaces [m], where gloves and blobs touch
 _SIDE_FRAMES: Final = 500

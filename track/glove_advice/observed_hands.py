@@ -14,13 +14,14 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.rig import ROOM_CENTER, CameraRig
-from train.simulation.scenes import sample_hands, wear_gloves
 from train.simulation.training_frames import (
-    DatasetConfig,
     FrameScene,
+    GenerateSettings,
     HandFrames,
     observe_scene,
     sample_frame_scene,
+    sample_hands,
+    wear_gloves,
 )
 
 _POSES_EACH: Final = 60  # of a person
@@ -46,11 +47,11 @@ def observe_poses(
     Raises:
         LayoutError: A marker misses the skin.
     """
-    config, observed, done = DatasetConfig(), [], 0
+    config, observed, done = GenerateSettings(), [], 0
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     while done < num_frames:
         models = sample_hands(config.population, rng=rng)
-        scene = sample_frame_scene(models, _POSES_EACH, config.scenes, config.poses, config.volume, rng=rng)
+        scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
         fits = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         hands = list(_observe(scene, fits, rig, rng))
         observed += hands
@@ -90,7 +91,7 @@ def observe_motion(
 def _observe(
     scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
 ) -> Iterator[ObservedHand]:
-    config = DatasetConfig()
+    config = GenerateSettings()
     # Single frames do not continue points, so that two rays are enough, as for points that exist already.
     optics = dataclasses.replace(config.optics, min_rays_to_start=config.min_cameras)
     frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)

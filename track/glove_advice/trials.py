@@ -137,7 +137,7 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     for name, take in zip(METHODS, (labeled, tracked), strict=True):
         slots[name], frames[name] = _rights(truth, take)
     errors = [
-        (tracked.qpos[:, tracked.hand(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
+        (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
         for number, hand in enumerate(truth.hands)
     ]
     size_error = abs(tracked.hands[0].shape.length - truth.hands[0].shape.length)

@@ -17,8 +17,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig
 from track.glove_advice.joint_spread import pose_spreads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, sample_single_hand
+from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
 
 _TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
 _JOINT_POSES: Final = 6  # of a person, from which the joints' spread is taken
@@ -78,13 +77,13 @@ class WornPlaces:
     def __init__(
         self, num_people: int, poses_each: int, radius: float, rig: CameraRig, *, rng: np.random.Generator
     ) -> None:
-        config = DatasetConfig()
+        config = GenerateSettings()
         self._radius, self._rig, self._rng = radius, rig, rng
         self._slip = config.slip_along, float(np.deg2rad(config.slip_around))
         self._people: list[tuple[HandModel, Float[np.ndarray, "T 27"], Float[np.ndarray, "T L 4 4"]]] = []
         for _ in range(num_people):
             model = sample_hands(config.population, rng=rng)[SIDES.index("right")]
-            (qpos,) = sample_single_hand(model, poses_each, config.poses, config.volume, rng=rng).qpos
+            (qpos,) = sample_single_hand(model, poses_each, config, rng=rng).qpos
             self._people.append((model, qpos, model.forward_kinematics(qpos)))
 
     def put_on(self, places: Sequence[MarkerPlace]) -> Columns:

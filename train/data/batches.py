@@ -4,44 +4,34 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Annotated, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_callable, check_number, check_rng, check_type, shown_value
+from handsim._checks import check_callable, check_rng, check_type, shown_value
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
+from handsim.settings import Limits, Settings
 from train.data.shards import MappedRows
 
 _MOST: Final = 100  # points to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
-class Corruption:
-    """The paper's corruption, as it is drawn for training and for tests.
+class Corruption(Settings):
+    """The paper's corruption, as it is drawn for training and for tests."""
 
-    Raises:
-        ArgumentError: A number is of another type or out of range.
-    """
-
-    occlude: int = 5
+    occlude: Annotated[int, Limits(0, _MOST)] = 5
     """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
-    ghosts: int = 2
+    ghosts: Annotated[int, Limits(0, _MOST)] = 2
     """Most ghosts added, uniform in the sample's box grown by `margin`."""
-    jitter: float = 0.0
+    jitter: Annotated[float, Limits(0.0, 0.1)] = 0.0
     """Half width of the uniform noise on each coordinate [m]."""
-    margin: float = 0.1
+    margin: Annotated[float, Limits(0.0, 10.0)] = 0.1
     """Growth of the box [share of its sides]."""
-
-    def __post_init__(self) -> None:
-        for name in ("occlude", "ghosts"):
-            check_type(name, getattr(self, name), (int, np.integer), "a whole number")
-            check_number(name, getattr(self, name), 0, _MOST)
-        check_number("jitter", self.jitter, 0.0, 0.1)
-        check_number("margin", self.margin, 0.0, 10.0)
 
 
 class Cloud(NamedTuple):
@@ -178,18 +168,7 @@ def draw_cloud(
 def own_cloud(
     corruption: OwnCorruption | str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
 ) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption.
-
-    Args:
-        corruption: A function like `OwnCorruption`; `module:name` of one or of a class whose instances are;
-            or an entry point of the group `handsim.corruptions`.
-        markers: Clean markers.
-
-    Raises:
-        ArgumentError: There is none of that name, it does not take these arguments, or what it returns has
-            another shape, labels that are none, or points that are half NaN or beyond 10 m.
-        HandSimError: It raised an error.
-    """
+    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption."""
     if isinstance(corruption, str):
         function = load_plugin(corruption, group=CORRUPTIONS, noun=_NOUN)
     else:
@@ -210,11 +189,7 @@ def own_cloud(
 
 
 def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
-    """Load a corruption and try it on two clouds, before the work.
-
-    Raises:
-        HandSimError: As `own_cloud`.
-    """
+    """Load a corruption and try it on two clouds, before the work."""
     rng = np.random.default_rng(0)
     own_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
@@ -315,12 +290,7 @@ class BatchRecipe:
 def draw_batch(
     rows: NDArray[np.void] | MappedRows, recipe: BatchRecipe, *, rng: np.random.Generator
 ) -> Batch:
-    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones.
-
-    Args:
-        rows: Rows of a training set, see `train.data.shards.row_dtype`.
-        recipe: Size of the batch, and how to corrupt it.
-    """
+    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones."""
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)
     center = markers.mean(axis=1, keepdims=True)
@@ -359,8 +329,7 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
     """Symmetric matrices (B, 3, 3) that stretch along random orthogonal directions."""
     axes, _ = np.linalg.qr(rng.standard_normal((count, 3, 3)))
     factors = np.exp(anisotropy * rng.standard_normal((count, 1, 3)))
-    stretches: NDArray[np.float64] = (axes * factors) @ axes.transpose(0, 2, 1)
-    return stretches
+    return np.asarray((axes * factors) @ axes.transpose(0, 2, 1))
 
 
 def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:

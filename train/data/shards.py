@@ -11,10 +11,10 @@ import dataclasses
 import io
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 from jaxtyping import Int, Shaped
@@ -25,11 +25,12 @@ from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim._checks import check_type
 from handsim.app.output import Place, place_of
-from handsim.errors import DatasetError, LayoutError, choices
+from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutError
 from handsim.files.arrays import check_npy_header
 from handsim.files.inputs import checksum, load_json
-from handsim.files.outputs import atomic_write, save_json
+from handsim.files.outputs import atomic_write
 from handsim.hand.shape import HAND_DTYPE, NUM_QPOS, HandShape, unpack_hand
+from handsim.settings import Limits, Settings
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
@@ -57,14 +58,15 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
+class Manifest(Settings):
     """What a finished training set is made of."""
 
+    noun: ClassVar[str] = "field"
     config: dict[str, Any]
     """The settings that made it."""
     marker_names: tuple[str, ...]
-    num_frames: int
-    min_cameras: int
+    num_frames: Annotated[int, Limits(1)]
+    min_cameras: Annotated[int, Limits(1)]
     """Cameras that must see a marker before it exists."""
     files: dict[str, str]
     """SHA-256 of every file, by name."""
@@ -72,6 +74,25 @@ class Manifest:
     """How often people or scenes had to be drawn again, by reason; None in a set that did not count them."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
+
+    def check(self) -> None:
+        """Refuse tables that are none, names that are equal, and files of other folders."""
+        if not isinstance(self.config, dict):
+            raise ArgumentError("config is not a table")
+        if not 0 < len(set(self.marker_names)) == len(self.marker_names):
+            raise ArgumentError("marker_names is not a list of different names")
+        if not (_is_table_of(self.files, str) and all(map(_is_file_name, self.files))):
+            raise ArgumentError("files is not a table of names of files in this folder and their SHA-256")
+        if not (self.redrawn is None or _is_table_of(self.redrawn, int)):
+            raise ArgumentError("redrawn is not a table of counts")
+
+
+def _is_file_name(name: str) -> bool:
+    return Path(name).name == name and len(name.encode(errors="replace")) <= _LONGEST_NAME
+
+
+def _is_table_of(value: object, kind: type) -> bool:
+    return isinstance(value, dict) and all(type(entry) is kind for entry in value.values())
 
 
 def rows_name(shard: int) -> str:
@@ -119,71 +140,22 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
         file.write(np.ascontiguousarray(array).tobytes())
 
 
-def save_manifest(out: Path, manifest: Manifest) -> None:
-    """Write the manifest, which makes the training set complete."""
-    save_json(out / MANIFEST, dataclasses.asdict(manifest))
-
-
 def load_manifest(path: Path) -> Manifest:
-    """The manifest of a finished training set; its files are not checked.
-
-    Args:
-        path: The folder that `handsim generate` wrote.
-    """
-    if not (path / MANIFEST).is_file():
+    """The manifest of a finished training set; its files are not checked."""
+    file = path / MANIFEST
+    if not file.is_file():
         hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
         raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
-    content = load_json(path / MANIFEST)
+    content = load_json(file)
     if content.get("schema") != SCHEMA:
         raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
-    return checked_manifest(path / MANIFEST, content)
-
-
-_MANIFEST_FIELDS: Final[dict[str, tuple[str, Callable[[Any], bool]]]] = {
-    "config": ("a table", lambda value: isinstance(value, dict)),
-    "marker_names": (
-        "a list of different names",
-        lambda value: _are_names(value) and len(set(value)) == len(value) > 0,
-    ),
-    "num_frames": ("a whole number of at least 1", lambda value: type(value) is int and value >= 1),
-    "min_cameras": ("a whole number of at least 1", lambda value: type(value) is int and value >= 1),
-    "files": (
-        "a table of names of files in this folder and their SHA-256",
-        lambda value: _is_table_of(value, str) and all(_is_file_name(name) for name in value),
-    ),
-    "redrawn": ("a table of counts", lambda value: value is None or _is_table_of(value, int)),
-    "units": ("text", lambda value: isinstance(value, str)),
-    "schema": (str(SCHEMA), lambda value: value == SCHEMA),
-}
-_MAY_LACK: Final = {"redrawn", "units"}
-
-
-def _are_names(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(name, str) for name in value)
-
-
-def _is_file_name(name: str) -> bool:
-    return Path(name).name == name and len(name.encode(errors="replace")) <= _LONGEST_NAME
-
-
-def _is_table_of(value: object, kind: type) -> bool:
-    return isinstance(value, dict) and all(type(entry) is kind for entry in value.values())
-
-
-def checked_manifest(file: Path, content: dict[str, Any]) -> Manifest:
-    """The manifest that a file's content is."""
-    remedy = "delete it and run handsim generate again"
-    for name in content.keys() | _MANIFEST_FIELDS.keys():
-        if name not in _MANIFEST_FIELDS:
-            raise DatasetError(
-                f"{file} is damaged: {choices(name, _MANIFEST_FIELDS, noun='field')}; {remedy}"
-            )
-        expected, is_right = _MANIFEST_FIELDS[name]
-        if name not in content and name not in _MAY_LACK:
-            raise DatasetError(f"{file} is damaged: the field {name} is missing; {remedy}")
-        if name in content and not is_right(content[name]):
-            raise DatasetError(f"{file} is damaged: {name} is not {expected}; {remedy}")
-    return Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
+    try:
+        for field in dataclasses.fields(Manifest):
+            if field.default is dataclasses.MISSING and field.name not in content:
+                raise DatasetError(f"the field {field.name} is missing")
+        return Manifest.of(None, content)
+    except HandSimError as error:
+        raise DatasetError(f"{file} is damaged: {error}; delete it and run handsim generate again") from error
 
 
 class Dataset:
@@ -283,12 +255,7 @@ class Dataset:
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:
-    """A training set as it is, or by its folder.
-
-    Raises:
-        ArgumentError: It is neither.
-        DatasetError: As of `Dataset`.
-    """
+    """A training set as it is, or by its folder."""
     if isinstance(dataset, Dataset):
         return dataset
     check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")

@@ -62,12 +62,7 @@ class MeanHand:
         points: Float[np.ndarray, "B N 3"],
         present: Bool[np.ndarray, "B N"],
     ) -> MeanHand:
-        """The mean hand of a training set.
-
-        Args:
-            markers: Markers of right hands [m].
-            points: What a camera system made of them [m].
-        """
+        """The mean hand of a training set: of markers of right hands [m], and of the clouds of them."""
         mean = markers[0]
         for _ in range(_ROUNDS):
             rotations, _ = rigid_fit(markers, mean)
@@ -109,11 +104,7 @@ class MeanHand:
         *,
         rng: np.random.Generator,
     ) -> NDArray[np.float64]:
-        """Views (B, 3, 3) of clouds of right hands: what labeling begins with, and what it is turned to.
-
-        Args:
-            markers: The markers behind them [m].
-        """
+        """Views (B, 3, 3) of right hands' clouds and markers [m]: first ones of labeling, or aligned ones."""
         aligned = self.align(markers, np.ones(len(markers)))
         axes = _nearest_axes(points, present, aligned)
         direction = rng.standard_normal((len(points), 3))
@@ -220,14 +211,11 @@ class ViewFrames:
     def normalize(self, positions: Float[np.ndarray, "B N 3"]) -> NDArray[np.float64]:
         """Positions (B, N, 3) in the input's frame [m] as view units; NaN stays NaN."""
         rotated = (positions - self.centers[:, None]) @ self.rotations.swapaxes(1, 2)
-        normalized: NDArray[np.float64] = rotated * self.scales[:, None, None]
-        return normalized
+        return np.asarray(rotated * self.scales[:, None, None])
 
     def restore(self, normalized: Float[np.ndarray, "B N 3"]) -> NDArray[np.float64]:
         """View units (B, N, 3), such as the network's output, as positions in the input's frame [m]."""
-        rotated = (normalized / self.scales[:, None, None]) @ self.rotations
-        positions: NDArray[np.float64] = rotated + self.centers[:, None]
-        return positions
+        return np.asarray((normalized / self.scales[:, None, None]) @ self.rotations + self.centers[:, None])
 
 
 def depth_images(
@@ -235,16 +223,9 @@ def depth_images(
     present: Bool[np.ndarray, "B N"],
     rotations: Float[np.ndarray, "B 3 3"],
 ) -> tuple[Float32[np.ndarray, "B 52 52"], ViewFrames]:
-    """Images of clouds by orthographic cameras whose axes pass through their means.
+    """Images of clouds [m], 0 for background and 0.1 (near) to 1.0 (far) for points, and their cameras.
 
-    The farther of two points in one pixel is lost. An empty cloud is an empty image.
-
-    Args:
-        points: Clouds [m]; padding is ignored.
-        rotations: From the clouds' frame into the camera's; with determinant -1 the image is mirrored.
-
-    Returns:
-        Images (row, column), 0 for background and 0.1 (near) to 1.0 (far) for points; and the cameras.
+    The farther of two points in one pixel is lost. A rotation with determinant -1 mirrors the image.
     """
     frames = _view_frames(points, present, rotations)
     safe = np.where(present[..., None], points, frames.centers[:, None])
@@ -282,8 +263,7 @@ def _view_frames(
     )
 
 
-_SEARCH_REJECT: Final = 0.04  # cost of a point without a label while views are compared [m]
-_REJECT: Final = _SEARCH_REJECT  # in the labels, before one is chosen [m]
+_SEARCH_REJECT: Final = 0.04  # cost of a point without a label where none is chosen [m]
 _SPREAD: Final = 0.005  # of the confidence before one is chosen [m]
 _ACCEPTED: Final = 0.01  # mean distance of labeled points from which no further view is tried [m]
 _GHOSTS: Final = 2  # most points without a label then
@@ -309,11 +289,8 @@ _NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
 class CNNLabeler:
     """The paper's network with weights, then equation 1, whose least cost also decides between views.
 
-    The network is trained on right hands; a mirrored view shows it a left hand as one.
-
-    Args:
-        positions: The trained network: from images (B, 1, 52, 52) to positions (B, M, 3) in view units.
-        hand: The mean hand of its training set.
+    The network, from images (B, 1, 52, 52) to positions (B, M, 3) in view units, was trained on right hands
+    with this mean hand; a mirrored view shows it a left hand as a right one.
     """
 
     def __init__(
@@ -327,7 +304,7 @@ class CNNLabeler:
         self._positions = positions
         self._hand = hand
         self._aligned = config.views == "aligned"
-        self._reject = config.reject or _REJECT
+        self._reject = config.reject or _SEARCH_REJECT
         self._spread = config.spread or _SPREAD
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
@@ -335,7 +312,7 @@ class CNNLabeler:
         return label_in_batches(frames, self.label_batch)
 
     def label_batch(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
-        """Label the points [m] of frames that are small enough to go through the network together."""
+        """Label the points [m] of a few frames together."""
         return [
             label_by_distance(distances, self._reject, self._spread) for distances in self.distances(clouds)
         ]
@@ -408,12 +385,10 @@ def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View
 
 
 def label_by_distance(distances: Float[np.ndarray, "N M"], reject: float, spread: float) -> Labeling:
-    """Labels of equation 1, and the weight of each as a share of the weights of all labels of its point.
+    """Labels of equation 1 by distances from predicted markers [m], a ghost costing `reject` [m].
 
-    Args:
-        distances: Of points from predicted markers [m].
-        reject: Cost of a point without a label [m].
-        spread: Difference of costs at which a weight falls to 1/e [m].
+    A confidence is the label's share of the weights of all labels of its point, which fall to 1/e over a
+    difference of `spread` [m].
     """
     labels = match_distances(distances, reject)
     rejects = np.full((len(distances), 1), reject)

@@ -50,12 +50,10 @@ class SparseFeatures(NamedTuple):
 
 
 def filter_sparse(images: Float[Tensor, "B 1 S S"], filters: Sequence[nn.Module]) -> SparseFeatures:
-    """Features of images whose background is 0.
+    """Features of images on the CPU whose background is 0.
 
-    Args:
-        images: Images on the CPU.
-        filters: 3x3 convolutions without padding, each followed by its batch normalization, and ReLUs and
-            2x2 max-poolings. Running statistics are updated as the dense layers do while they are trained.
+    The filters are 3x3 convolutions without padding, each followed by its batch normalization, and ReLUs and
+    2x2 max-poolings. Running statistics are updated as by the dense layers.
     """
     pictures = images[:, 0].numpy()
     there = pictures != 0.0
@@ -209,11 +207,7 @@ _SPARSE: Final = 10  # layers up to the third filter, which leave a large part o
 
 
 class DeepLabelCNN(nn.Module):
-    """Positions of a layout's markers from sparse 52×52 depth images.
-
-    Args:
-        config: Markers of the layout, and how the network is used.
-    """
+    """Positions of a layout's markers from sparse 52×52 depth images."""
 
     def __init__(self, config: CNNConfig) -> None:
         super().__init__()
@@ -275,20 +269,6 @@ def _filters(channels_in: int, channels_out: int) -> tuple[nn.Module, ...]:
     return nn.Conv2d(channels_in, channels_out, 3), nn.BatchNorm2d(channels_out), nn.ReLU(inplace=True)
 
 
-def position_loss(
-    predicted: Float[Tensor, "B M 3"], targets: Float[Tensor, "B M 3"], *, knee: float = 1.0
-) -> Tensor:
-    """Smooth L1 distance, the mean over coordinates.
-
-    Args:
-        predicted: From `DeepLabelCNN`.
-        targets: True positions in view units, those of occluded markers too.
-        knee: Distance at which it turns from quadratic to linear [view unit]; the paper gives none, 1 is
-            usual.
-    """
-    return functional.smooth_l1_loss(predicted, targets, beta=knee)
-
-
 def cnn_loss(
     network: nn.Module,
     batch: Batch,
@@ -309,4 +289,4 @@ def cnn_loss(
     images, frames = depth_images(mine.cloud.points, mine.cloud.present, views[part.first :: part.count])
     targets = torch.from_numpy(frames.normalize(mine.markers).astype(np.float32)).to(device)
     seen = torch.from_numpy(images)[:, None].to(device)
-    return mine.weights.clouds * position_loss(network(seen), targets, knee=config.knee)
+    return mine.weights.clouds * functional.smooth_l1_loss(network(seen), targets, beta=config.knee)

@@ -32,7 +32,7 @@ from handsim.files.inputs import checksum
 from handsim.files.outputs import atomic_write, save_json, written_together
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig, as_rig
-from train.data.batches import draw_batch
+from train.data.batches import Cloud, draw_batch
 from train.data.shards import row_dtype
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.labelers.pose_prior import PosePrior, learn_pose_prior
@@ -46,8 +46,14 @@ from train.labelers.protocol import (
 )
 from train.labelers.storage import LEARNED, learned_folder, learned_gloves
 from train.settings import TrainSettings
-from train.simulation.scenes import sample_hands, wear_gloves
-from train.simulation.training_frames import DatasetConfig, sample_single_hand, simulate_frames
+from train.simulation.training_frames import (
+    FrameSource,
+    GenerateSettings,
+    sample_hands,
+    sample_single_hand,
+    simulate_frames,
+    wear_gloves,
+)
 
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""
@@ -59,12 +65,7 @@ _POSES_EACH: Final = 100  # of a person
 
 
 class LayoutLabeler:
-    """Labels a glove that no network was trained on.
-
-    Args:
-        distances: What the network gets of the layout, see `mean_features`.
-        prior: What it knows of hands as wholes.
-    """
+    """Labels a glove that no network was trained on, of which it gets the `mean_features` of distances."""
 
     def __init__(
         self,
@@ -78,15 +79,7 @@ class LayoutLabeler:
 
     @classmethod
     def at_once(cls, layout: MarkerLayout, *, num_poses: int = NUM_POSES, seed: int = 0) -> Self:
-        """The shipped network with what a few seconds of simulation tell of a layout.
-
-        Args:
-            num_poses: Poses from which the layout is known.
-            seed: Of those poses.
-
-        Raises:
-            LayoutError: A marker misses the skin.
-        """
+        """The shipped network with what a few seconds of simulation tell of a layout."""
         rng = np.random.default_rng(seed)
         markers = sample_worn_markers(layout, num_poses, rng=rng)
         network, prior = shipped_network(), learn_pose_prior(markers, rng=rng)
@@ -176,18 +169,14 @@ def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -
 def sample_worn_markers(
     layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T M 3"]:
-    """Markers [m] of right hands in valid poses; every hundred are another person, whose glove has slipped.
-
-    Raises:
-        LayoutError: A marker misses the skin.
-    """
-    config = DatasetConfig()
+    """Markers [m] of right hands in valid poses; each hundred are another person's, whose glove slipped."""
+    config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts = []
     for first in range(0, num_frames, _POSES_EACH):
         count = min(_POSES_EACH, num_frames - first)
         right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
-        scene = sample_single_hand(right, count, config.poses, config.volume, rng=rng)
+        scene = sample_single_hand(right, count, config, rng=rng)
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)
@@ -198,8 +187,6 @@ MOST: Final = 32
 NUM_CLOUDS: Final = 15_000
 _BATCH: Final = 64
 _PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
-_FRAMES_EACH: Final = 100  # of a person
-_MOST_GRADIENT: Final = 1.0
 
 
 def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
@@ -208,14 +195,7 @@ def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
-    """The labeler of a glove, learned within a minute the first time and read within a second from then on.
-
-    Args:
-        rig: Cameras that see it while it is learned.
-
-    Raises:
-        LayoutError: A marker misses the skin.
-    """
+    """The labeler of a glove: learned within a minute the first time, later read within a second."""
     file = _file_of(layout, rig)
     found = _read(file, layout)
     if found is not None:
@@ -228,13 +208,9 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
     return _read(file, layout) or learned
 
 
-def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
-    return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
-
-
 @functools.lru_cache(maxsize=MOST)
 def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
-    """Of all that decides a labeler."""
+    """Digest of all that decides a labeler."""
     decides = {
         "layout": dataclasses.asdict(layout),
         "rig": as_rig(rig).record(),
@@ -242,6 +218,10 @@ def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
         "version": __version__,
     }
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+    return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
 
 
 def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
@@ -280,50 +260,46 @@ def fine_tuned_labeler(
     num_clouds: int = NUM_CLOUDS,
     seed: int = 0,
 ) -> LayoutLabeler:
-    """A labeler for any layout that has learned more of this one.
-
-    Args:
-        rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
-        num_clouds: Clouds to learn from, of two thirds as many frames.
-
-    Raises:
-        LayoutError: A marker misses the skin.
-    """
+    """A labeler for any layout that has learned more of this one, as a rig sees it, from so many clouds."""
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler.at_once(layout, seed=seed)
-    rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
+    source = FrameSource(GenerateSettings(), layout, as_rig(rig))
+    rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
+    for first in range(0, len(rows), _POSES_EACH):
+        models = sample_hands(source.settings.population, rng=rng)
+        simulate_frames(rows[first : first + _POSES_EACH], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = TrainSettings(batch=_BATCH).batch_recipe(layout.num_markers)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
+    optimizer = new_optimizer(network)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):
         for step in range(steps):
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
-            for group in optimizer.param_groups:
-                group["lr"] = float(_PEAK_RATE * rate)
-            cloud = draw_batch(rows, recipe, rng=rng).cloud
-            points, present = (
-                torch.from_numpy(cloud.points.astype(np.float32)),
-                torch.from_numpy(cloud.present),
-            )
-            loss = layout_loss(
-                network(points, present, labeler.distances), torch.from_numpy(cloud.truth), present
-            )
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(network.parameters(), _MOST_GRADIENT)
-            optimizer.step()
+            layout_step(network, optimizer, rate, draw_batch(rows, recipe, rng=rng).cloud, labeler.distances)
     labeler.network = network.eval()
     return labeler
 
 
-def _simulated_rows(
-    layout: MarkerLayout, rig: CameraRig, num_frames: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Frames as a training set has them, see `train.data.shards.row_dtype`."""
-    config = DatasetConfig()
-    rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
-    for first in range(0, num_frames, _FRAMES_EACH):
-        models = sample_hands(config.population, rng=rng)
-        simulate_frames(rows[first : first + _FRAMES_EACH], models, layout, rig, config, rng=rng)
-    return rows
+def new_optimizer(network: LayoutNetwork) -> torch.optim.Optimizer:
+    """What trains a network for any layout."""
+    return torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
+
+
+def layout_step(
+    network: LayoutNetwork,
+    optimizer: torch.optim.Optimizer,
+    rate: float,
+    cloud: Cloud,
+    layouts: Float[Tensor, "G M M K"],
+) -> tuple[float, Float[Tensor, "B N M+1"]]:
+    """Make one gradient step at a share of the peak rate; the loss before it, and the scores of points."""
+    for group in optimizer.param_groups:
+        group["lr"] = float(_PEAK_RATE * rate)
+    points, present = torch.from_numpy(cloud.points.astype(np.float32)), torch.from_numpy(cloud.present)
+    found = network(points, present, layouts)
+    loss = layout_loss(found, torch.from_numpy(cloud.truth), present)
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+    optimizer.step()
+    return float(loss.detach()), found[-1].points

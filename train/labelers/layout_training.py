@@ -29,11 +29,10 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
 from train.data.batches import Cloud, Corruption, corrupt, stretched
-from train.labelers.layout_labeler import save_layout_network
-from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.labelers.layout_labeler import layout_step, new_optimizer, save_layout_network
+from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features
 from train.labelers.protocol import torch_threads
-from train.simulation.scenes import sample_hands
-from train.simulation.training_frames import DatasetConfig, sample_frame_scene
+from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least
@@ -71,9 +70,7 @@ class SkinBank:
 def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generator) -> SkinBank:
     """Poses of random people as training sets have them, alone, together and holding something.
 
-    Args:
-        num_places: Places on the skin.
-        num_people: People, of whom each strikes up to 64 poses with one slip of every marker.
+    Each person strikes up to 64 poses with one slip of every marker.
     """
     places = sample_places(num_places, rng=rng)
     gloves = [
@@ -91,12 +88,7 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
 def sample_places(
     num_places: int, *, rng: np.random.Generator, apart: float = _APART
 ) -> tuple[MarkerPlace, ...]:
-    """Random places on the skin of the back and the sides of the hand.
-
-    Args:
-        num_places: Number of places; there are fewer where no more fit.
-        apart: Least distance between two of them on the flat hand [m].
-    """
+    """Random places on the skin of the back and the sides of the flat hand; fewer where no more fit."""
     model = HandModel.named("M")
     share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
     places: list[MarkerPlace] = []
@@ -136,9 +128,9 @@ def _point_of(place: MarkerPlace, model: HandModel) -> Float[np.ndarray, "3"] | 
 
 def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
     """Places of one person in some poses; None where a place misses the skin of the hand."""
-    config = DatasetConfig()
+    config = GenerateSettings()
     models = sample_hands(config.population, rng=rng)
-    scene = sample_frame_scene(models, _POSES_EACH, config.scenes, config.poses, config.volume, rng=rng)
+    scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
     model = scene.hands[0]
     bones = model.forward_kinematics(scene.qpos[0])
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
@@ -156,7 +148,7 @@ def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[
 PLACES, PEOPLE = 480, 1600
 _LAYOUTS, _CLOUDS = 8, 24  # of a batch; clouds of each layout
 _MARKERS: Final = (5, 31)  # of a layout: least, and one more than most
-_PEAK_RATE, _WARM_UP = 2e-3, 200  # learning rate; steps until it is reached
+_WARM_UP: Final = 200  # steps until the peak learning rate is reached
 _STRETCH: Final = 0.03  # anisotropy of a hand
 _JITTER: Final = 0.0015  # of a batch, at most [m]
 _GAP: Final = (0.006, 0.014)  # least distance of two markers [m]
@@ -227,38 +219,23 @@ class LayoutBatches:
 
 
 class LayoutTraining:
-    """Network and optimizer of a run.
-
-    Args:
-        steps: Steps of the run.
-    """
+    """Network and optimizer of a run of so many steps."""
 
     def __init__(self, steps: int, config: LayoutNetworkConfig = _CONFIG) -> None:
         torch.manual_seed(0)
         self.steps, self.done = steps, 0
         self.network = LayoutNetwork(config)
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True
-        )
+        self.optimizer = new_optimizer(self.network)
 
     def step(self, cloud: Cloud, layouts: Float[np.ndarray, "G M M K"]) -> tuple[float, float]:
         """Make one gradient step; returns the loss before it, and the share of markers labeled right."""
         progress = self.done / self.steps
         rate = min(1.0, (self.done + 1) / _WARM_UP) * (0.01 + 0.495 * (1.0 + np.cos(np.pi * progress)))
-        for group in self.optimizer.param_groups:
-            group["lr"] = float(_PEAK_RATE * rate)
-        points = torch.from_numpy(cloud.points.astype(np.float32))
-        present, truth = torch.from_numpy(cloud.present), torch.from_numpy(cloud.truth)
-        found = self.network(points, present, torch.from_numpy(layouts))
-        loss = layout_loss(found, truth, present)
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimizer.step()
+        loss, scores = layout_step(self.network, self.optimizer, rate, cloud, torch.from_numpy(layouts))
         self.done += 1
-        markers = present & (truth >= 0)
-        right = (found[-1].points.argmax(-1) == truth)[markers].float().mean()
-        return float(loss.detach()), float(right)
+        markers = torch.from_numpy(cloud.present & (cloud.truth >= 0))
+        right = (scores.argmax(-1) == torch.from_numpy(cloud.truth))[markers].float().mean()
+        return loss, float(right)
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""

@@ -7,16 +7,17 @@ neighbor's marker may stand in the place of an occluded one, or a chain of label
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from train.labelers.pose_prior import (
     NEAREST,
     PosePrior,
+    PriorTables,
     errors_of_products,
     factor_of,
     log_density,
@@ -26,7 +27,7 @@ from train.labelers.pose_prior import (
     products_with_means,
     residual_of,
     seen_as_right,
-    table_of,
+    tables_of,
 )
 
 GHOST = -1
@@ -50,17 +51,10 @@ IntArray = NDArray[np.int64]
 def pair_probabilities(
     point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
 ) -> Float[np.ndarray, "N+1 M+1"]:
-    """Probability of each label for each point when no two points may share one.
+    """Probability of each label for each point when no two points may share one; rows of points sum to 1.
 
-    Both scores are weighted, added and normalized over rows and columns in turn, so that every point and
-    every label is used once (Sinkhorn's iteration; ghosts and occluded labels are outside of it).
-
-    Args:
-        point_scores: Log-probability of each label, and last of ghost, for each point.
-        label_scores: Log-probability of each point, and last of occluded, for each label.
-
-    Returns:
-        Probabilities; the last column is "a ghost", the last row "occluded". Rows of points sum to 1.
+    Both log-probabilities are weighted, added and normalized over rows and columns in turn, so that every
+    point and every label is used once. Ghosts (last column) and occluded labels (last row) are outside of it.
     """
     return balance(
         point_scores.astype(np.float64), label_scores.astype(np.float64), _SCORE_WEIGHT, _SINKHORN_ROUNDS
@@ -76,15 +70,8 @@ def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.n
 def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
     """One-to-one labeling of a cloud with the least total distance.
 
-    The paper's equation 1, with the reject option that its results imply: a point may stay without a label at
-    the cost of `reject`, so no point is matched over a larger distance.
-
-    Args:
-        distances: Distance of each point from the predicted position of each marker [m].
-        reject: Cost of a point without a label [m].
-
-    Returns:
-        Label of each point, `GHOST` where none.
+    The paper's equation 1 for distances from predicted markers [m], with the reject option that its results
+    imply: a point may be a `GHOST` at the cost of `reject`, so that none is matched over a larger distance.
     """
     return assign(distances.astype(np.float64), np.full(len(distances), reject))[1]
 
@@ -264,16 +251,11 @@ def match_scores(
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """Most likely one-to-one labeling of one cloud.
 
-    A point may stay a ghost and a label occluded, each at its own cost, so nothing is forced (the paper's
-    equation 1 with a reject option).
-
-    Args:
-        point_scores: Log-probability of each label, and last of ghost, for each point.
-        label_scores: Log-probability of each point, and last of occluded, for each label.
-        prior: What hands look like; None to believe the scores alone.
+    A point may stay a `GHOST` and a label occluded, each at its own cost, so nothing is forced (the paper's
+    equation 1 with a reject option). Without a prior the scores alone decide.
 
     Returns:
-        Label of each point (`GHOST` where none), and its probability.
+        Label of each point, and its probability.
     """
     probabilities = pair_probabilities(point_scores, label_scores)
     labels = match_probabilities(probabilities)
@@ -286,33 +268,43 @@ def match_scores(
         or len(points) > 2 * num_labels  # more than a hand: somebody has to divide them first
     ):
         return labels, confidence
-    tables = table_of(prior), prior.means, prior.directions, prior.spreads, prior.log_weights
-    return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, *tables)
+    return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, tables_of(prior))
+
+
+class _Factors(NamedTuple):
+    """Cholesky factors by component and by set of markers, which most labelings share."""
+
+    sets: Bool[np.ndarray, "L M"]
+    """The sets of markers."""
+    stored: Int[np.ndarray, "L C"]
+    """Number of the factor of each set and component, -1 for none."""
+    factors: Float[np.ndarray, "F R R"]
+    counts: Int[np.ndarray, "2"]
+    """How many sets and factors there are."""
 
 
 @kernel
 def _verify(
     points: Float[np.ndarray, "N 3"],
     probabilities: Float[np.ndarray, "N+1 M+1"],
-    table: Float[np.ndarray, "M 3 K"],
-    means: Float32[np.ndarray, "K M 3"],
-    directions: Float32[np.ndarray, "K M 3 R"],
-    spreads: Float32[np.ndarray, "K"],
-    log_weights: Float32[np.ndarray, "K"],
+    prior: PriorTables,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label."""
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
-    near, mirrored = _near_components(points, labels, table, means, directions, spreads, log_weights)
-    near_table = means_by_marker(means, near)
+    near, mirrored = _near_components(points, labels, prior)
+    near_table = means_by_marker(prior.means, near)
     found = np.empty((_MOST, len(points)), dtype=np.int64)
     scores, densities = np.empty(_MOST), np.empty(_MOST)
     taken = np.full((_MOST, _ROUNDS), -1)  # points whose pairs were taken back for a labeling
     columns = np.full((_MOST, _ROUNDS), -1)  # and their labels then
-    # Cholesky factors by component and by the set of markers, which most labelings share.
-    sets, stored = np.empty((_MOST, len(means[0])), dtype=np.bool_), np.full((_MOST, len(near)), -1)
-    rank = directions.shape[3]
-    factors, counts = np.empty((NEAREST * _MOST, rank, rank)), np.zeros(2, np.int64)
+    rank = prior.directions.shape[3]
+    kept = _Factors(
+        np.empty((_MOST, len(prior.means[0])), dtype=np.bool_),
+        np.full((_MOST, len(near)), -1),
+        np.empty((NEAREST * _MOST, rank, rank)),
+        np.zeros(2, np.int64),
+    )
     front, num_front, num_found = np.zeros(_MOST, dtype=np.int64), 1, 0
     for step in range(_ROUNDS + 1):
         first = num_found
@@ -330,10 +322,7 @@ def _verify(
                 density = -np.inf
                 if len(known) >= _LEAST:
                     cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
-                    density = _log_density_of_near(
-                        cloud, known_labels, near, near_table, means, directions, spreads, log_weights,
-                        sets, stored, factors, counts,
-                    )  # fmt: skip
+                    density = _log_density_of_near(cloud, known_labels, near, near_table, prior, kept)
                 found[num_found] = fresh
                 scores[num_found] = _PRIOR_WEIGHT * (density + _GHOST * (len(fresh) - len(known))) - cost
                 densities[num_found] = density / max(1, 3 * len(known))
@@ -349,37 +338,31 @@ def _log_density_of_near(
     labels: Int[np.ndarray, "N"],
     near: Int[np.ndarray, "C"],
     table: Float[np.ndarray, "M 3 C"],
-    means: Float32[np.ndarray, "K M 3"],
-    directions: Float32[np.ndarray, "K M 3 R"],
-    spreads: Float32[np.ndarray, "K"],
-    log_weights: Float32[np.ndarray, "K"],
-    sets: Bool[np.ndarray, "L M"],
-    stored: Int[np.ndarray, "L C"],
-    factors: Float[np.ndarray, "F R R"],
-    counts: Int[np.ndarray, "2"],
+    prior: PriorTables,
+    kept: _Factors,
 ) -> float:
     """Log-density of centered, labeled points [m] by those of some components that are nearest to them.
 
-    The last four arrays keep factors from labeling to labeling: the sets of markers, the number of each set's
-    and component's factor or -1, the factors, and how many sets and factors there are.
+    `table` holds the mean hands of these components; factors are kept from labeling to labeling.
     """
-    marked = np.zeros(sets.shape[1], dtype=np.bool_)
+    marked = np.zeros(kept.sets.shape[1], dtype=np.bool_)
     marked[labels] = True
-    group = _index_of(marked, sets, counts[0])
+    group = _index_of(marked, kept.sets, kept.counts[0])
     if group < 0:
-        group = counts[0]
-        sets[group] = marked
-        counts[0] += 1
+        group = kept.counts[0]
+        kept.sets[group] = marked
+        kept.counts[0] += 1
     density = -np.inf
     for number in np.argsort(procrustes_errors(cloud, labels, table))[:NEAREST]:
-        component, spread = near[number], float(spreads[near[number]])
-        if stored[group, number] < 0:
-            stored[group, number] = counts[1]
-            factors[counts[1]] = factor_of(labels, directions[component], spread)
-            counts[1] += 1
-        lower = factors[stored[group, number]]
-        residual = residual_of(cloud, labels, means[component])
-        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
+        component, spread = near[number], float(prior.spreads[near[number]])
+        directions = prior.directions[component]
+        if kept.stored[group, number] < 0:
+            kept.stored[group, number] = kept.counts[1]
+            kept.factors[kept.counts[1]] = factor_of(labels, directions, spread)
+            kept.counts[1] += 1
+        lower = kept.factors[kept.stored[group, number]]
+        residual = residual_of(cloud, labels, prior.means[component])
+        log = prior.log_weights[component] + log_normal(residual, labels, directions, lower, spread)
         high = max(density, log)
         density = high + np.log(np.exp(density - high) + np.exp(log - high))
     return density
@@ -389,21 +372,19 @@ def _log_density_of_near(
 def _near_components(
     points: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
-    table: Float[np.ndarray, "M 3 K"],
-    means: Float32[np.ndarray, "K M 3"],
-    directions: Float32[np.ndarray, "K M 3 R"],
-    spreads: Float32[np.ndarray, "K"],
-    log_weights: Float32[np.ndarray, "K"],
+    prior: PriorTables,
 ) -> tuple[NDArray[np.int64], bool]:
     """The components (C,) near to labeled points as those of the likelier side, and whether it is left."""
     known = np.flatnonzero(labels >= 0)
     known_labels = labels[known]
     best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
-    products, squares = products_with_means(seen_as_right(points[known], False), known_labels, table)
+    products, squares = products_with_means(
+        seen_as_right(points[known], False), known_labels, prior.by_marker
+    )
     for mirrored in (False, True):
         cloud = seen_as_right(points[known], mirrored)
         chosen = np.argsort(errors_of_products(products, squares, mirrored))[:_NEAR]
-        density = log_density(cloud, known_labels, chosen[:NEAREST], means, directions, spreads, log_weights)
+        density = log_density(cloud, known_labels, chosen[:NEAREST], prior)
         if density > best or not len(near):
             best, near, left = density, chosen, mirrored
     return near, left

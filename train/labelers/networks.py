@@ -167,14 +167,7 @@ class MessageRound(nn.Module):
 
 
 def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weights: Weights = WHOLE) -> Tensor:
-    """Cross-entropy of both outputs.
-
-    Args:
-        scores: From `SetLabeler`.
-        truth: Label of each point (B, N), -1 for a ghost; padding is ignored.
-        present: Which points are there (B, N).
-        weights: Of the two, where the clouds are a part of a batch.
-    """
+    """Cross-entropy of both outputs; `truth` (B, N) is the label of each present point, -1 a ghost."""
     num_labels = scores.points.shape[-1] - 1
     of_point = torch.where(truth < 0, num_labels, truth)
     point_loss = -scores.points.gather(-1, of_point[..., None])[..., 0][present].mean()
@@ -253,9 +246,8 @@ class LayoutNetwork(nn.Module):
     ) -> list[LabelScores]:
         """Scores after each comparison, the best last.
 
-        Args:
-            points: Clouds [m], padded where not `present`; those of one layout follow each other.
-            layouts: Mean of `distance_features` over the poses of each layout; G divides B.
+        Clouds of one layout [m] follow each other; G, the number of layouts, divides their number. A layout
+        is the mean of `distance_features` over its poses.
         """
         graphs = _Graphs.of(points, present, layouts, self.config)
         there = graphs.there
@@ -481,11 +473,7 @@ def batch_device() -> torch.device:
 
 
 class BatchNetwork:
-    """A trained network for batches; a copy on a GPU is made for the first of them.
-
-    Args:
-        network: The network, on the CPU.
-    """
+    """A trained network for batches; where there is a GPU, a copy on it is made for the first of them."""
 
     def __init__(self, network: nn.Module) -> None:
         self._network = network

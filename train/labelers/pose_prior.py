@@ -1,9 +1,9 @@
-"""How likely labeled points are as the markers of a hand: a mixture of poses, wherever the hand is.
+"""What labeled points say of a hand as a whole: how likely its pose is, wherever it is, and its side.
 
-Each component is a mean hand with the directions in which markers move together around it (probabilistic
-principal components, Tipping and Bishop 1999), each learned from a cluster of frames. Missing markers are
-left out of mean and covariance, which is exact for a normal distribution. Points are turned and moved onto
-each mean hand first.
+The prior is a mixture. Each component is a mean hand with the directions in which markers move together
+around it (probabilistic principal components, Tipping and Bishop 1999), learned from a cluster of frames.
+Missing markers are left out of mean and covariance, which is exact for a normal distribution. Points are
+turned and moved onto each mean hand first.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Final
+from itertools import combinations
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
+from gloves.layout import MarkerLayout
 from handsim.errors import WeightsError
+from handsim.hand.shape import Side
 from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
@@ -31,11 +34,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePrior:
-    """Density of the markers of right hands, up to a rigid motion.
-
-    Raises:
-        WeightsError: The shapes do not agree, or something is not finite.
-    """
+    """Density of the markers of right hands, up to a rigid motion."""
 
     means: Float32[np.ndarray, "K M 3"]
     """Mean hand of each component [m]."""
@@ -66,47 +65,14 @@ class PosePrior:
         return int(self.means.shape[1])
 
     def log_density(
-        self,
-        points: Float[np.ndarray, "N 3"],
-        labels: Int[np.ndarray, "N"],
-        *,
-        mirrored: bool,
-        among: Int[np.ndarray, "C"] | None = None,
+        self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], *, mirrored: bool
     ) -> float:
-        """Logarithm of the density of labeled points; -inf for fewer than four.
-
-        Args:
-            labels: Marker of each point, no marker twice.
-            mirrored: Whether the hand is a left one.
-            among: The components that count, see `nearest`; all when not given.
-        """
+        """Logarithm of the density of labeled points, of a left hand where `mirrored`; -inf below four."""
         if len(points) < _LEAST_POINTS:
             return -np.inf
-        nearest = self.nearest(points, labels, mirrored=mirrored, count=NEAREST, among=among)
-        tables = self.means, self.directions, self.spreads, self.log_weights
-        return float(log_density(seen_as_right(points, mirrored), labels, nearest, *tables))
-
-    def nearest(
-        self,
-        points: Float[np.ndarray, "N 3"],
-        labels: Int[np.ndarray, "N"],
-        *,
-        mirrored: bool,
-        count: int,
-        among: Int[np.ndarray, "C"] | None = None,
-    ) -> Int[np.ndarray, "K"]:
-        """The components whose mean hands are nearest to labeled points, the nearest first.
-
-        Args:
-            labels: Marker of each point, no marker twice.
-            mirrored: Whether the hand is a left one.
-            count: How many, at most.
-            among: The components to choose from; all when not given.
-        """
-        chosen = np.arange(len(self.means)) if among is None else among
-        table = table_of(self) if among is None else means_by_marker(self.means, chosen)
-        errors = procrustes_errors(seen_as_right(points, mirrored), labels, table)
-        return chosen[np.argsort(errors)[:count]]
+        cloud, tables = seen_as_right(points, mirrored), tables_of(self)
+        nearest = np.argsort(procrustes_errors(cloud, labels, tables.by_marker))[:NEAREST]
+        return float(log_density(cloud, labels, nearest, tables))
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
         """The tables by name, for a file; directions in half precision, which is enough for them."""
@@ -121,11 +87,22 @@ class PosePrior:
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
 
 
+class PriorTables(NamedTuple):
+    """The tables of a `PosePrior` for kernels."""
+
+    by_marker: Float[np.ndarray, "M 3 K"]
+    """See `means_by_marker`, of all components."""
+    means: Float32[np.ndarray, "K M 3"]
+    directions: Float32[np.ndarray, "K M 3 R"]
+    spreads: Float32[np.ndarray, "K"]
+    log_weights: Float32[np.ndarray, "K"]
+
+
 @functools.lru_cache(maxsize=8)
-def table_of(prior: PosePrior) -> FloatArray:
-    """See `means_by_marker`, of all components; kept, because every cloud is compared with them."""
-    table: FloatArray = means_by_marker(prior.means, np.arange(len(prior.means)))
-    return table
+def tables_of(prior: PosePrior) -> PriorTables:
+    """The tables of a prior; kept, because every cloud is compared with them."""
+    by_marker = means_by_marker(prior.means, np.arange(len(prior.means)))
+    return PriorTables(by_marker, prior.means, prior.directions, prior.spreads, prior.log_weights)
 
 
 @kernel
@@ -228,18 +205,15 @@ def log_density(
     cloud: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
     chosen: Int[np.ndarray, "C"],
-    means: Float32[np.ndarray, "K M 3"],
-    directions: Float32[np.ndarray, "K M 3 R"],
-    spreads: Float32[np.ndarray, "K"],
-    log_weights: Float32[np.ndarray, "K"],
+    prior: PriorTables,
 ) -> float:
-    """Of centered points by some components; tables as in `PosePrior`."""
+    """Log-density of centered, labeled points [m] by some components."""
     total = -np.inf
     for component in chosen:
-        spread = float(spreads[component])
-        lower = factor_of(labels, directions[component], spread)
-        residual = residual_of(cloud, labels, means[component])
-        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
+        spread, directions = float(prior.spreads[component]), prior.directions[component]
+        lower = factor_of(labels, directions, spread)
+        residual = residual_of(cloud, labels, prior.means[component])
+        log = prior.log_weights[component] + log_normal(residual, labels, directions, lower, spread)
         high = max(total, log)
         total = high + np.log(np.exp(total - high) + np.exp(log - high))
     return total
@@ -375,12 +349,7 @@ _MOST_FRAMES: Final = 200_000
 
 
 def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
-    """The prior of the hands in some frames; None where they are too few, or too few markers.
-
-    Args:
-        markers: Markers of right hands [m], anywhere; frames in which one is missing are left out.
-        rng: Chooses frames and first clusters.
-    """
+    """The prior of right hands in frames with every marker [m]; None for too few frames or markers."""
     markers = markers[np.isfinite(markers).all(axis=(1, 2))]
     if len(markers) > _MOST_FRAMES:
         markers = markers[np.sort(rng.permutation(len(markers))[:_MOST_FRAMES])]
@@ -475,3 +444,104 @@ def _lent(
         around = scatters[near].sum(axis=0) / sizes[near].sum()
         covariances[cluster] = (scatters[cluster] + _LENT * around) / (sizes[cluster] + _LENT)
     return covariances
+
+
+_MAX_FOURS: Final = 3000
+_POSES: Final = 100  # of each size
+_TOLD: Final = 0.98  # share of whole hands whose side is told in a layout unlike its mirror image; mostly all
+_SIZES: Final = ("XS", "S", "M", "L", "XL")
+
+
+class SideClassifier:
+    """Classifies the hands of a layout as left or right, one frame at a time; labelers do not tell.
+
+    Four labeled points span a tetrahedron, and a mirror inverts its orientation. Some groups of four have the
+    same orientation in almost every pose (thumb, knuckles and wrist), others do not. Poses of simulated right
+    hands measure this; each group votes with the log-odds of its orientation.
+    """
+
+    def __init__(self, layout: MarkerLayout, *, rng: np.random.Generator) -> None:
+        fours = np.array(list(combinations(range(layout.num_markers), 4)))
+        if len(fours) > _MAX_FOURS:
+            fours = fours[rng.choice(len(fours), size=_MAX_FOURS, replace=False)]
+        markers = np.concatenate([_right_hands(layout, size, rng) for size in _SIZES])
+        mean = _mean_orientation(markers, fours)
+        self._fours: NDArray[np.int64] = fours
+        self._votes: NDArray[np.float64] = np.arctanh(mean.clip(-0.999, 0.999))
+        self._num_markers = layout.num_markers
+
+    def classify(self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"]) -> tuple[Side, float]:
+        """The side of one hand, and the clearness of the vote [0, 1]; 0 for fewer than four markers."""
+        markers = np.full((self._num_markers, 3), np.nan)
+        markers[labels[labels >= 0]] = points[labels >= 0]
+        vote, most = _vote(markers, self._fours, self._votes)
+        return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
+
+    def recognized(self, hands: Float[np.ndarray, "T M 3"], side: Side) -> Bool[np.ndarray, "T"]:
+        """Whether each hand of a side is classified as one of it, by its true labels; NaN where missing."""
+        labels = np.arange(self._num_markers)
+        return np.array([self.classify(hand, labels)[0] == side for hand in hands], dtype=np.bool_)
+
+
+def is_mirror_like(layout: MarkerLayout) -> bool:
+    """Whether a layout is nearly its own mirror image, so that the side of a whole hand is not always told.
+
+    That is by its true labels; where they are unknown, sides are exchanged more often.
+    """
+    if any(one.bone.startswith("thumb") for one in layout.markers):
+        return False  # a thumb tells, without a third of a second
+    rng = np.random.default_rng(0)
+    classifier = SideClassifier(layout, rng=rng)
+    return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _TOLD)
+
+
+def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Markers of a right hand of a size in random poses."""
+    from gloves.fit import attach_markers
+    from handsim.hand.model import HandModel, join_qpos
+    from poses.shapes import sample_valid_angles
+
+    hand = HandModel.named(size)
+    qpos = join_qpos(sample_valid_angles(hand, _POSES, rng=rng))
+    markers, _ = attach_markers(layout, hand).markers(hand, hand.forward_kinematics(qpos))
+    return markers
+
+
+@kernel
+def _mean_orientation(
+    hands: Float[np.ndarray, "T M 3"], fours: Int[np.ndarray, "F 4"]
+) -> NDArray[np.float64]:
+    """Mean over hands of the sign of the volume of each group of four (F,); markers in [m]."""
+    mean = np.zeros(len(fours))
+    for hand in range(len(hands)):
+        for number in range(len(fours)):
+            volume = _volume(hands[hand], fours[number])
+            mean[number] += 1.0 if volume > 0.0 else -1.0 if volume < 0.0 else 0.0
+    return mean / len(hands)
+
+
+@kernel
+def _vote(
+    markers: Float[np.ndarray, "M 3"], fours: Int[np.ndarray, "F 4"], votes: Float[np.ndarray, "F"]
+) -> tuple[float, float]:
+    """The sum of the votes of all groups of four, and the greatest sum that they could have."""
+    vote, most = 0.0, 0.0
+    for number in range(len(fours)):
+        volume = _volume(markers, fours[number])
+        if volume > 0.0:
+            vote += votes[number]
+            most += abs(votes[number])
+        elif volume < 0.0:
+            vote -= votes[number]
+            most += abs(votes[number])
+    return vote, most
+
+
+@kernel
+def _volume(markers: Float[np.ndarray, "M 3"], four: Int[np.ndarray, "4"]) -> float:
+    """Six times the signed volume [m^3] of the tetrahedron of four markers."""
+    x, y, z = markers[four[0], 0], markers[four[0], 1], markers[four[0], 2]
+    ax, ay, az = markers[four[1], 0] - x, markers[four[1], 1] - y, markers[four[1], 2] - z
+    bx, by, bz = markers[four[2], 0] - x, markers[four[2], 1] - y, markers[four[2], 2] - z
+    cx, cy, cz = markers[four[3], 0] - x, markers[four[3], 1] - y, markers[four[3], 2] - z
+    return float((ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz)

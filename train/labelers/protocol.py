@@ -73,14 +73,7 @@ def label_in_batches(
 ) -> list[Labeling]:
     """Check frames and label them in batches of similar size, so that padding stays small.
 
-    Args:
-        label: Labels a batch of frames; the last one holds the most points, and at least one.
-
-    Returns:
-        Labelings in the order of the frames.
-
-    Raises:
-        ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
+    `label` gets batches whose last frame holds the most points, and at least one.
     """
     clouds = check_clouds(frames)
     order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
@@ -95,11 +88,7 @@ def label_in_batches(
 
 
 def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.float64]]:
-    """The points of every frame [m], after a check.
-
-    Raises:
-        ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
-    """
+    """The points of every frame [m], after the checks that `Labeler.label_frames` names."""
     clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
     check_unit(clouds, only_wide=True)
     return clouds
@@ -157,11 +146,7 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
 
 
 def label_on(threads: int) -> None:
-    """Have labelers use this many threads from now on; it is one when this is never called.
-
-    Raises:
-        ArgumentError: `threads` is less than 1.
-    """
+    """Have labelers use this many threads from now on; it is one when this is never called."""
     check_count("threads", threads, 1, MOST_THREADS)
     _threads.set(threads)
 
@@ -192,15 +177,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class OwnLabeler:
-    """A user's `Labeler` behind checks.
-
-    Args:
-        labeler: A labeler; `module:name` of one or of a class of them; or an entry point of the group
-            `handsim.labelers`.
-
-    Raises:
-        ArgumentError: There is none of that name, or it lacks `marker_names` or `label_frames`.
-    """
+    """A user's `Labeler`, as an object or by its name, behind checks of what it is and returns."""
 
     def __init__(self, labeler: Labeler | str) -> None:
         name = plugin_name(labeler)
@@ -217,13 +194,7 @@ class OwnLabeler:
         self.marker_names: tuple[str, ...] = tuple(map(str, names))
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
-        """Label the points (N, 3) [m] of every frame.
-
-        Raises:
-            ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points; or
-                the labeler returns something that does not fit it.
-            HandSimError: The labeler raised an error.
-        """
+        """Label the points (N, 3) [m] of every frame, see `Labeler`."""
         clouds = check_clouds(frames)
         returned = call_plugin(self._labeler.label_frames, self._name, _NOUN, clouds)
         if not isinstance(returned, list) or len(returned) != len(clouds):
@@ -233,10 +204,7 @@ class OwnLabeler:
     def _checked(self, labeling: Any, count: int) -> Labeling:
         owner = f"{_NOUN} '{self._name}'"
         try:
-            labels, confidence = (
-                np.asarray(labeling.labels),
-                np.asarray(labeling.confidence, dtype=np.float64),
-            )
+            labels, confidence = np.asarray(labeling.labels), np.asarray(labeling.confidence, np.float64)
         except (AttributeError, TypeError, ValueError) as error:
             raise ArgumentError(f"{owner} returns {type(labeling).__name__}, expected a Labeling") from error
         if labels.shape != (count,) or labels.dtype.kind not in "iu" or confidence.shape != (count,):

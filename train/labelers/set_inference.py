@@ -38,12 +38,7 @@ _P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
 
 
 class TrainedSetLabeler:
-    """The set labeler with weights, ready to use.
-
-    Args:
-        weights: Its weights; later changes of them have no effect.
-        prior: What it knows of hands as wholes.
-    """
+    """The set labeler with weights, later changes of which have no effect, and a prior of hands."""
 
     def __init__(
         self,
@@ -107,11 +102,7 @@ class _Ends(NamedTuple):
 
 
 class CloudScorer:
-    """Scores of one cloud without padding.
-
-    Args:
-        weights: Its weights, of the names and shapes of `weight_shapes`.
-    """
+    """Scores of one cloud without padding, by weights of the names and shapes of `weight_shapes`."""
 
     def __init__(self, config: SetLabelerConfig, weights: Weights) -> None:
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
@@ -143,11 +134,7 @@ class CloudScorer:
     def score(
         self, points: Float[np.ndarray, "N 3"]
     ) -> tuple[Float32[np.ndarray, "N M+1"], Float32[np.ndarray, "M N+1"]]:
-        """Log-probabilities as in `train.labelers.networks.LabelScores`.
-
-        Args:
-            points: One point or more [m].
-        """
+        """Log-probabilities of one point or more [m], as in `train.labelers.networks.LabelScores`."""
         return _score(
             np.ascontiguousarray(points, dtype=np.float64),
             self._centers,

@@ -154,11 +154,7 @@ def load_labeler(
 
 @functools.lru_cache(maxsize=32)
 def labeler_at_once(layout: MarkerLayout) -> Labeler:
-    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn.
-
-    Raises:
-        LayoutError: A marker misses the skin.
-    """
+    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn."""
     shipped = _shipped_labeler(layout)
     if shipped is not None:
         return shipped
@@ -205,7 +201,7 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler for any layout, after a warning that it is this one."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
-    from train.labelers.side import is_mirror_like  # kernels
+    from train.labelers.pose_prior import is_mirror_like  # kernels
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
@@ -244,11 +240,7 @@ def shipped_labelers() -> tuple[str, ...]:
 
 
 def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
-    """A trained network and its model card.
-
-    Raises:
-        WeightsError: Unknown, damaged, or not a labeler's weights.
-    """
+    """A trained network and its model card."""
     stored = _read(*_files(str(name_or_path)))
     return stored.network(), stored.card
 
@@ -400,12 +392,7 @@ def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
 
 
 class OnnxLabeler:
-    """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it.
-
-    Raises:
-        HandSimError: onnxruntime is not installed.
-        WeightsError: The file is missing, damaged, or not a labeler.
-    """
+    """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it."""
 
     def __init__(self, path: Path) -> None:
         try:

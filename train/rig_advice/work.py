@@ -17,7 +17,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, CaptureError, PoseError
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE

@@ -1,11 +1,15 @@
-"""The simulated capture room: what shines, which cameras see it, and the take that comes of it."""
+"""The simulated capture room: what shines, which cameras see it, and the take that comes of it.
+
+How often cameras drop out and how many reflections flash is fitted to the four test captures of Han et al.
+2018: to Table 3 and to the ghost ratios of Table 4 (docs/room_numbers.md says what was fitted to what).
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,25 +34,31 @@ from gloves.optics.visibility import (
 )
 from gloves.takes.take import RigidBody, Take
 from handsim.hand.shape import PALM
+from handsim.settings import Limits, Settings
 from handsim.space.rig import CameraRig, check_outside
 from handsim.space.transforms import transform_poses
 from train.simulation.scenes import SceneMotion, SimulatedKind
 
+SKIN_CHUNK: Final = 16
+"""Frames whose skins are posed at once: so few stay in the processor's cache."""
+_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
+_MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
+
 
 @dataclass(frozen=True, slots=True)
-class RoomConfig:
+class RoomConfig(Settings):
     """What the cameras and the surfaces of the room do to what is seen."""
 
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     """Noise, losses and triangulation of the optical system."""
     strays: StrayConfig = field(default_factory=StrayConfig)
     """Stray reflections carried by every hand and by the object."""
-    reflectance: float = 0.5
+    reflectance: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of the mirror images in shiny patches that are bright enough."""
 
 
 @dataclass(frozen=True, slots=True)
-class OpticsOptions:
+class OpticsOptions(Settings):
     """The fields of `OpticsConfig`; those that are not given are the ones fitted to the kind of capture."""
 
     noise: float | None = None
@@ -79,11 +89,7 @@ class OpticsOptions:
     """Points nearer to each other than this are one [m]."""
 
     def applied(self, optics: OpticsConfig) -> OpticsConfig:
-        """An optical system with these options in the place of its own.
-
-        Raises:
-            ArgumentError: A number is out of range.
-        """
+        """An optical system with these options in the place of its own, if they are in range."""
         given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
         return dataclasses.replace(optics, **given)
 
@@ -101,54 +107,42 @@ class TwinSettings:
     """Which of many random captures of this kind is the twin: the one nearest to the paper's figures."""
 
 
-def _room(strays: float, **optics: Any) -> RoomConfig:
-    return RoomConfig(
-        optics=OpticsConfig(min_rays_to_start=2, **optics),
-        strays=StrayConfig(number=strays),
+def _twin(
+    paper: tuple[int, int, float, float],
+    ghost_ratio: float,
+    strays: float,
+    losses: tuple[float, float, float, int],
+    draw: int,
+) -> TwinSettings:
+    """A twin, given Table 3's row and how often blobs and pictures are lost."""
+    blob_loss, dropout, length, cameras = losses
+    optics = OpticsConfig(
+        min_rays_to_start=2,
+        blob_loss=blob_loss,
+        dropout=dropout,
+        dropout_length=length,
+        dropout_cameras=cameras,
     )
-
-
-def _losses(blob_loss: float, dropout: float, length: float, cameras: int) -> dict[str, float]:
-    return {
-        "blob_loss": blob_loss,
-        "dropout": dropout,
-        "dropout_length": length,
-        "dropout_cameras": cameras,
-    }
+    room = RoomConfig(optics=optics, strays=StrayConfig(number=strays))
+    return TwinSettings(GapCounts(*paper), ghost_ratio, room, draw)
 
 
 TWINS: Final[dict[str, TwinSettings]] = {
-    "single-hand": TwinSettings(
-        GapCounts(4785, 44, 2.11, 1.35), 0.0001, _room(0.0, **_losses(0.01, 0.016, 2.2, 6)), draw=8
-    ),
-    "hand-hand": TwinSettings(
-        GapCounts(3312, 331, 4.01, 3.30), 0.1063, _room(7.0, **_losses(0.002, 0.35, 1.5, 4)), draw=8
-    ),
-    "hand-pen": TwinSettings(
-        GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.17, 1.4, 6)), draw=15
-    ),
-    "hand-controller": TwinSettings(
-        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
-    ),
+    "single-hand": _twin((4785, 44, 2.11, 1.35), 0.0001, 0.0, (0.01, 0.016, 2.2, 6), draw=8),
+    "hand-hand": _twin((3312, 331, 4.01, 3.30), 0.1063, 7.0, (0.002, 0.35, 1.5, 4), draw=8),
+    "hand-pen": _twin((4511, 481, 3.39, 2.31), 0.0755, 3.0, (0.002, 0.17, 1.4, 6), draw=15),
+    "hand-controller": _twin((2645, 382, 2.65, 1.62), 0.0450, 1.7, (0.115, 0.0, 1.0, 1), draw=2),
 }
-_ALIKE: Final[dict[str, str]] = {
-    "real-like": "hand-hand",
-    "free": "single-hand",
-}  # kinds whose rooms are alike
+_SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
 
 
 def usual_room(kind: SimulatedKind) -> RoomConfig:
     """The room of the paper's capture of a kind, or of the one most like it."""
-    return RoomConfig() if kind == "calibration" else TWINS[_ALIKE.get(kind, kind)].room
-
-
-_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
-SKIN_CHUNK: Final = 16
-"""Frames whose skins are posed at once: so few stay in the processor's cache."""
+    return RoomConfig() if kind == "calibration" else TWINS[_SAME_ROOM.get(kind, kind)].room
 
 
 class SceneSight:
-    """What a rig can see of hands and an object in motion."""
+    """Where the markers of a scene in motion are, and which cameras of a rig have a free view of each."""
 
     def __init__(self, scene: SceneMotion, rig: CameraRig) -> None:
         self.scene, self.rig = scene, rig
@@ -164,14 +158,12 @@ class SceneSight:
         ]
         for part, moved in zip(parts, self.scene.skin, strict=False):
             part[0][:] += moved
-        if self.scene.moving_object is not None:
-            rigid_object, pose = (
-                self.scene.moving_object.rigid_object,
-                self.scene.moving_object.motion.T_world_body,
-            )
+        held = self.scene.moving_object
+        if held is not None:
+            pose, thing = held.motion.T_world_body, held.rigid_object
             rotation = pose[:, :3, :3]
-            centers = np.einsum("tij,qj->tqi", rotation, rigid_object.markers) + pose[:, None, :3, 3]
-            parts.append((centers, np.einsum("tij,qj->tqi", rotation, rigid_object.marker_normals)))
+            centers = np.einsum("tij,qj->tqi", rotation, thing.markers) + pose[:, None, :3, 3]
+            parts.append((centers, np.einsum("tij,qj->tqi", rotation, thing.marker_normals)))
         centers, normals = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         return centers, normals
 
@@ -180,25 +172,27 @@ class SceneSight:
         """Segments [m] and radii [m] of all hands' capsules in the world."""
         capsules = [hand.fit.model.capsules for hand in self.scene.hands]
         posed = [part.posed(bones) for part, bones in zip(capsules, self.T_world_bone, strict=True)]
-        radii = [part.radii for part in capsules]
-        return np.concatenate(posed, axis=1), np.concatenate(radii)
+        return np.concatenate(posed, axis=1), np.concatenate([part.radii for part in capsules])
 
     @cached_property
     def obstacles(self) -> list[tuple[MeshTree, Float[np.ndarray, "T 4 4"]]]:
         """Meshes of the rigid objects that hide markers, and their poses `T_world_body`."""
-        if self.scene.moving_object is None:
+        held = self.scene.moving_object
+        if held is None:
             return []
-        rigid_object = self.scene.moving_object.rigid_object
-        tree = MeshTree(rigid_object.vertices, rigid_object.faces)
-        return [(tree, self.scene.moving_object.motion.T_world_body)]
+        return [(MeshTree(held.rigid_object.vertices, held.rigid_object.faces), held.motion.T_world_body)]
+
+    def free_of_hands(self, points: Float[np.ndarray, "T S 3"]) -> Bool[np.ndarray, "T S C"]:
+        """Which cameras have points [m] in view where no capsule of a hand stands between."""
+        free = self.rig.in_view(points) & free_rays(points, self.rig.positions, *self.capsules)
+        return np.asarray(free)
 
     def visible_markers(
         self, radii: Float[np.ndarray, "P"], *, rng: np.random.Generator
     ) -> Bool[np.ndarray, "T P C"]:
         """Which cameras have a free view of each marker, past every skin and the object.
 
-        Args:
-            radii: Radius around each marker's center in which the visible spot lies [m].
+        The visible spot lies within these radii [m] of each marker's center.
         """
         markers, normals = self.markers
         seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
@@ -231,20 +225,14 @@ def _random_offsets(
     """Random offsets in balls around the sources of the second axis, of these radii [m]."""
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
-    scale = (
-        radii.astype(np.float32)[:, None]
-        * np.cbrt(rng.random(shape, dtype=np.float32))
-        / np.maximum(length, 1e-12)
-    )
+    scale = radii.astype(np.float32)[:, None] * np.cbrt(rng.random(shape, dtype=np.float32))
+    scale /= np.maximum(length, 1e-12)
     offsets *= scale[..., None]
     return offsets
 
 
-_MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
-
-
 class LightSources(NamedTuple):
-    """All that shines in a room."""
+    """All that shines in a room: markers, their mirror images in shiny objects, and stray reflections."""
 
     positions: Float[np.ndarray, "T S 3"]
     """[m] in the world."""
@@ -257,11 +245,7 @@ class LightSources(NamedTuple):
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
-    """All that shines, and which cameras have a free view of it.
-
-    Raises:
-        ArgumentError: A camera stands in the hands.
-    """
+    """All that shines, and which cameras have a free view of it."""
     markers, _ = sight.markers
     check_outside(sight.rig, markers)
     labels = np.arange(markers.shape[1])
@@ -276,8 +260,9 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
         LightSources(markers, visible, labels, radii),
         *mirror_images(sight, radii, config.reflectance, rng=rng),
         *stray_reflections(sight, config, rng=rng),
-        *markers_of_others(sight),
     ]
+    if sight.scene.others is not None:
+        parts.append(_without_label(sight.scene.others, sight.free_of_hands(sight.scene.others)))
     all_positions, all_visible, all_labels, all_radii = zip(*parts, strict=True)
     return LightSources(
         np.concatenate(all_positions, 1),
@@ -287,16 +272,16 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
     )
 
 
-def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
-    """Radii of the hands' markers, and then of the object's [m].
+def _without_label(positions: Float[np.ndarray, "T S 3"], visible: Bool[np.ndarray, "T S C"]) -> LightSources:
+    """Sources of the usual size that are no markers of a hand."""
+    count = positions.shape[1]
+    return LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))
 
-    Args:
-        scene: Hands in their gloves, and perhaps an object.
-        optics: May give the radius of all gloves' markers.
-    """
-    radii = [
-        np.full(hand.fit.layout.num_markers, optics.radius_of(hand.fit.layout.radius)) for hand in scene.hands
-    ]
+
+def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
+    """Radii of the hands' markers, and then of the object's [m]; the optics may give those of all gloves."""
+    layouts = [hand.fit.layout for hand in scene.hands]
+    radii = [np.full(layout.num_markers, optics.radius_of(layout.radius)) for layout in layouts]
     if scene.moving_object is not None:
         radii.append(np.full(len(scene.moving_object.rigid_object.markers), MARKER_RADIUS))
     return np.concatenate(radii)
@@ -305,11 +290,9 @@ def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, 
 def mirror_images(
     sight: SceneSight, radii: Float[np.ndarray, "P"], reflectance: float, *, rng: np.random.Generator
 ) -> list[LightSources]:
-    """Mirror images of all markers in the object's shiny patches, those that a camera ever sees.
+    """Mirror images of markers of these radii [m] in the object's shiny patches, those that a camera sees.
 
-    Args:
-        radii: Radii of all markers [m].
-        reflectance: Share of the images that are bright enough.
+    A share of `reflectance` of them is bright enough.
     """
     markers, _ = sight.markers
     parts: list[LightSources] = []
@@ -328,21 +311,11 @@ def mirror_images(
     return parts
 
 
-def markers_of_others(sight: SceneSight) -> list[LightSources]:
-    """Markers that belong to no hand, where no hand stands between them and a camera."""
-    others, rig = sight.scene.others, sight.rig
-    if others is None:
-        return []
-    visible = rig.in_view(others) & free_rays(others, rig.positions, *sight.capsules)
-    count = others.shape[1]
-    return [LightSources(others, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))]
-
-
 def stray_reflections(
     sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator
 ) -> list[LightSources]:
-    """Strays carried by hands and object, where nothing stands between them and a camera."""
-    scene, rig = sight.scene, sight.rig
+    """Strays carried by hands and object, where no hand stands between them and a camera."""
+    scene = sight.scene
     carriers = [
         (bones[:, PALM], np.array([0.6 * hand.fit.model.skeleton.lengths[PALM], 0.0, 0.0]))
         for hand, bones in zip(scene.hands, sight.T_world_bone, strict=True)
@@ -352,11 +325,9 @@ def stray_reflections(
     parts = []
     for pose, middle in carriers:
         positions, visible = sample_strays(
-            pose, middle, config.strays, rate=scene.rate, num_cameras=len(rig.positions), rng=rng
+            pose, middle, config.strays, rate=scene.rate, num_cameras=len(sight.rig.positions), rng=rng
         )
-        visible &= rig.in_view(positions) & free_rays(positions, rig.positions, *sight.capsules)
-        count = positions.shape[1]
-        parts.append(LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS)))
+        parts.append(_without_label(positions, visible & sight.free_of_hands(positions)))
     return parts
 
 
@@ -368,16 +339,7 @@ def record_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """What the optical system puts out of hands and an object in motion, with the truth.
-
-    Args:
-        scene: What moves: T frames of one or more gloved hands and perhaps an object.
-        rig: C cameras around them.
-        settings: Kept in the take as they are.
-
-    Raises:
-        ArgumentError: A camera stands in the hands.
-    """
+    """What the optical system puts out of a scene in motion, with the truth and these settings."""
     sources = sample_light_sources(SceneSight(scene, rig), config, rng=rng)
     return pack_take(scene, sources, rig, config, settings, rng=rng)
 
@@ -391,12 +353,7 @@ def pack_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """A take of points triangulated from light sources, in columns and with IDs that do not tell the marker.
-
-    Args:
-        sources: What shines.
-        settings: Kept in the take as they are.
-    """
+    """A take of points triangulated from light sources; columns and IDs do not tell the marker."""
     optics = config.optics
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng

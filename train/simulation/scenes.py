@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.fit import GlovedHand, GloveFit, wear
+from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout
-from handsim._checks import check_count
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import BodyMotion, HandMotion
-from handsim.hand.shape import ADULTS, BONES, EVERYBODY, NUM_JOINTS, SIDES, Population, sample_shape
+from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
+from handsim.hand.shape import BONES, EVERYBODY, NUM_JOINTS, SIDES
+from handsim.settings import Limits, Settings
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import quaternion_matrix
@@ -33,9 +31,10 @@ from poses.motion import (
     wrist_path,
 )
 from poses.object_motion import keep_apart, point_pen, pointing_path, sample_object_motion
-from poses.shapes import gesture, make_valid, resting_angles
+from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
+from train.simulation.training_frames import sample_hands, wear_gloves
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -45,65 +44,11 @@ SimulatedKind = Literal[
 ]
 """These, hands like real ones, the exercises that a user is calibrated by, and hands that move freely."""
 SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
-NO_REST: Final = "person: fingers overlap at rest"
-"""Reason for which a person is drawn again."""
-_MAX_PEOPLE: Final = 1000
-
-
-def sample_hands(
-    population: Population, *, redrawn: Counter[str] | None = None, rng: np.random.Generator
-) -> tuple[HandModel, ...]:
-    """A random person's left and right hand, whose fingers do not overlap at rest.
-
-    Those who were drawn again are counted in `redrawn`, by reason.
-    """
-    for _ in range(_MAX_PEOPLE):
-        shape = sample_shape(population, side=SIDES[0], rng=rng)
-        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
-        try:
-            resting_angles(models[0])
-        except PoseError:
-            if redrawn is not None:
-                redrawn[NO_REST] += 1
-            continue
-        return models
-    raise ArgumentError(
-        f"the fingers of all {_MAX_PEOPLE} people drawn from the population overlap at rest, expected a "
-        f"population with smaller spreads than {population}"
-    )
-
-
-def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
-    """Right and left hand of a random adult, for takes."""
-    shape = sample_shape(ADULTS, side="right", rng=rng)
-    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
-
-
-def wear_gloves(
-    layout: MarkerLayout,
-    models: Sequence[HandModel],
-    *,
-    along: float,
-    around: float,
-    rng: np.random.Generator,
-) -> tuple[GloveFit, ...]:
-    """The same glove on each hand, its markers slipped a little.
-
-    Args:
-        along: Standard deviation of the slip along the bones [bone lengths].
-        around: Standard deviation of the slip around the bones [rad].
-
-    Raises:
-        LayoutError: A marker misses the skin however it slips.
-    """
-    return tuple(
-        GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
-    )
-
-
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""
+
 _HAND_OFFSET: Final = 0.22  # from the middle to a hand that touches nothing [m]
+_VOLUME: Final = 0.1  # half side of the cube that the wrist of such a hand stays in [m]
 _RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # where a right hand makes room
 _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # standard deviation about each axis [rad]
@@ -140,9 +85,6 @@ class SceneMotion:
         """The same motion this many times as fast: of so many frames only the first is kept.
 
         Displacements by the skin and markers of others are not kept.
-
-        Args:
-            times: Whole number from 1.
         """
         hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
         held = self.moving_object
@@ -155,39 +97,19 @@ class SceneMotion:
 def sample_scene_motion(
     kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """Random motion of a right and a left hand, and of the object that the right hand holds.
-
-    Args:
-        fits: A right and a left hand in their gloves.
-        num_frames: Frames at `RATE`.
-
-    Raises:
-        PoseError: These hands cannot do this: they do not grasp the object, say.
-    """
+    """Random motion of a right and a left hand, and of the object that the right hand holds."""
     right, left = fits
     if kind == "hand-hand":
-        return _two_hands(right, left, num_frames, rng)
+        both = sample_two_hand_motion(
+            right.model, left.model, num_frames / RATE, pause=_PAUSE_BETWEEN_CONTACTS, rng=rng
+        )
+        return SceneMotion(_gloved(fits, both, num_frames))
     if kind == "single-hand":
-        motions = (
+        free = (
             _free_hand(right.model, _FREE_SCRIPT, _HAND_OFFSET, num_frames, rng),
             _free_hand(left.model, _FREE_SCRIPT, -_HAND_OFFSET, num_frames, rng),
         )
-        return SceneMotion(_gloved(fits, motions, num_frames))
-    return _hand_with_object(kind, right, left, num_frames, rng)
-
-
-def _two_hands(right: GloveFit, left: GloveFit, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """Hands that meet and part."""
-    motions = sample_two_hand_motion(
-        right.model, left.model, num_frames / RATE, pause=_PAUSE_BETWEEN_CONTACTS, rng=rng
-    )
-    return SceneMotion(_gloved((right, left), motions, num_frames))
-
-
-def _hand_with_object(
-    kind: Kind, right: GloveFit, left: GloveFit, num_frames: int, rng: np.random.Generator
-) -> SceneMotion:
-    """The right hand holds a pen that points at the left hand's markers, or a controller."""
+        return SceneMotion(_gloved(fits, free, num_frames))
     rigid_object = named_object("pen" if kind == "hand-pen" else "controller")
     holding, body = sample_object_motion(right.model, rigid_object, num_frames / RATE, rng=rng)
     held = HandMotion(holding.qpos[:num_frames], RATE), BodyMotion(body.T_world_body[:num_frames], RATE)
@@ -198,7 +120,7 @@ def _hand_with_object(
     else:
         direction = np.tile(_RETREAT_DIRECTION, (num_frames, 1))
         holding, body = keep_apart(right.model, left.model, rigid_object, held, other, direction)
-    return SceneMotion(_gloved((right, left), (holding, other), num_frames), MovingObject(rigid_object, body))
+    return SceneMotion(_gloved(fits, (holding, other), num_frames), MovingObject(rigid_object, body))
 
 
 def _free_hand(
@@ -206,7 +128,7 @@ def _free_hand(
 ) -> HandMotion:
     """One hand in the air, palm mostly down, that touches nothing; `offset` is its side of the room [m]."""
     qpos = scripted_motion(model, script, num_frames / RATE, rng=rng).qpos[:num_frames].copy()
-    config = WristConfig(center=(offset, 0.0, 1.1), volume=0.1, turning=_WRIST_ROTATION)
+    config = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_ROTATION)
     qpos[:, :3], qpos[:, 3:7] = wrist_path(num_frames, RATE, config, rng=rng)
     return HandMotion(qpos, RATE)
 
@@ -217,8 +139,7 @@ def _gloved(
     return tuple(GlovedHand(fit, motion.qpos[:num_frames]) for fit, motion in zip(fits, motions, strict=True))
 
 
-_OFFSETS: Final = (0.22, -0.22)  # of the hands from the room's middle [m], so that they do not meet
-_VOLUME: Final = 0.1  # half side of the cube that a wrist stays in [m]
+# A calibration capture.
 _MAX_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")
 _JITTER: Final = np.deg2rad(8.0)
@@ -227,39 +148,29 @@ _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationTakeConfig:
-    """What the user does, and the cameras that see it."""
+class CalibrationTakeConfig(Settings):
+    """What the user of a calibration capture does, and the cameras that see it."""
 
-    free: float = 40.0
+    free: Annotated[float, Limits(0.0, above=True)] = 40.0
     """Free motion [s]."""
-    rounds: int = 3
+    rounds: Annotated[int, Limits(0)] = 3
     """How often the thumb goes to each of the other fingertips in turn."""
     rig: CameraRig | str = "figure5"
     """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
-    turning: float = 0.7
+    turning: Annotated[float, Limits(0.0)] = 0.7
     """Standard deviation of the wrist's rotation about each axis [rad]."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.free < np.inf:
-            raise ArgumentError(f"free is {self.free:g} s, expected a positive time")
-        check_count("rounds", self.rounds, 0)
 
 
 def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
-
-    Raises:
-        ArgumentError: There are no hands or more than two.
-        PoseError: A hand finds no way from its touches to free motion.
-    """
-    if not 1 <= len(hands) <= len(_OFFSETS):
+    """The motion of one hand or both in a calibration capture; without rounds, free motion alone."""
+    if not 1 <= len(hands) <= len(SIDES):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
     frames = min(len(part) for part in angles)
     moving = []
-    for fit, part, offset in zip(hands, angles, _OFFSETS, strict=False):
+    for fit, part, offset in zip(hands, angles, (_HAND_OFFSET, -_HAND_OFFSET), strict=False):
         wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
         position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
@@ -270,11 +181,7 @@ def sample_calibration_scene(
 def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
-
-    Raises:
-        PoseError: This hand finds no way from its touches to free motion.
-    """
+    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion."""
     touches = [pose for _ in range(config.rounds) for pose in _touch_fingers(model, rng)]
     free = _free_motion(model, config.free, rng)
     if not touches:
@@ -307,8 +214,11 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
     return poses
 
 
+# Hands like real ones. The figures are those of the published captures of Han et al. 2018 (docs/room.md):
+# markers are 1.5 mm per axis from any hand that moves as ours does, three tenths of that variance repeat in
+# similar poses, and half of the captures move about twice as far from frame to frame as simulated hands do.
 NUM_FRAMES: Final = 3000
-"""Frames of such a take when no number is given."""
+"""Frames of a take of such hands, or of free ones, when no number is given."""
 NOISE: Final = 0.00125
 """Standard deviation of the markers' independent noise per axis [m]."""
 FLESH: Final = 0.0008
@@ -319,16 +229,7 @@ _SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # of a glove, as in training 
 
 
 def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
-    """Two hands of anybody, children included, that meet and part.
-
-    Args:
-        layout: The glove on both hands.
-        num_frames: Frames at `train.simulation.scenes.RATE`.
-
-    Raises:
-        LayoutError: The glove does not fit.
-        PoseError: The person drawn cannot bring the hands together.
-    """
+    """Two hands of anybody, children included, that meet and part, in skin that moves."""
     models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
     fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
@@ -348,19 +249,16 @@ def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray
     return moved
 
 
+# Markers of others: they move as bodies do, rigidly with a bone, a thing or a person.
 MOST_OTHERS: Final = 60
 """Markers of others at most."""
 _STRAIGHT: Final = 0.6  # share of the hand's own direction in the forearm's
 _SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, to the side and above them
 _WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
-_ALONG_FOREARM: Final = ((0.12, 0.0, 0.03), (0.26, 0.03, 0.02), (0.2, -0.03, 0.02))
+_ELBOW: Final = (0.26, 0.03, 0.02)
+_FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
 _THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
-_HEAD: Final = (
-    (0.09, 0.0, 0.25),
-    (-0.09, 0.0, 0.25),
-    (0.0, 0.08, 0.27),
-    (0.0, -0.08, 0.2),
-)  # [m] on its middle
+_HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
 _BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
 _PERSON: Final = 1.2  # [m] to the one beside
 _SWAY: Final = 0.03  # [m]
@@ -371,9 +269,6 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
     """So many markers of others [m], those nearest to the hands first.
 
     Wrists, elbows and shoulders come first, then a thing in a hand, then head and back, then another person.
-
-    Args:
-        count: Markers.
     """
     wrists = np.stack([hand.qpos[:, :3] for hand in scene.hands], axis=1)
     ahead = np.stack(
@@ -391,14 +286,14 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
         shoulder = middle + trunk @ [-back, lateral, above] + sway
         arms.append(_arm(wrists[:, number], ahead[:, number], shoulder))
         bodies.append(shoulder[:, None])
-    thing = wrists[:, :1] + np.einsum(
-        "tij,kj->tki", ahead[:, 0], np.array(_THING) + rng.normal(0.0, 0.01, (4, 3))
-    )
+    places = np.array(_THING) + rng.normal(0.0, 0.01, (4, 3))
+    thing = wrists[:, :1] + np.einsum("tij,kj->tki", ahead[:, 0], places)
     torso = middle + np.array([*_HEAD, *_BACK]) @ trunk.T + trunk @ [-back, 0.0, above] + sway[:, None]
     own = [*[part[:, :3] for part in arms], *bodies, *[part[:, 3:] for part in arms], thing, torso]
     markers = np.concatenate(own, axis=1)
     left = max(0, count - markers.shape[1])
-    place = middle + _PERSON * (trunk @ [np.cos(angle := rng.uniform(0.0, 2.0 * np.pi)), np.sin(angle), 0.0])
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    place = middle + _PERSON * (trunk @ [np.cos(angle), np.sin(angle), 0.0])
     person = _path(scene, place, 0.1, rng)[:, None] + rng.uniform(-1.0, 1.0, (left, 3)) * _BODY_SIZE
     return np.concatenate([markers, person], axis=1)[:, :count]
 
@@ -414,10 +309,8 @@ def _arm(
     across = np.cross(ahead[..., 2], along)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     frame = np.stack([-along, across, np.cross(along, across)], axis=2)
-    elbow, *between = _ALONG_FOREARM[1], _ALONG_FOREARM[0], _ALONG_FOREARM[2]
-    places = np.array([*_WRIST, elbow, *between])
-    markers: Float[np.ndarray, "T 5 3"] = wrist[:, None] + np.einsum("tij,kj->tki", frame, places)
-    return markers
+    places = np.array([*_WRIST, _ELBOW, *_FOREARM])
+    return np.asarray(wrist[:, None] + np.einsum("tij,kj->tki", frame, places))
 
 
 def _path(

@@ -11,7 +11,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from handsim.errors import CaptureError
-from tests.gloves.captures.test_text_formats import (
+from tests.gloves.captures.test_formats import (
     DEVICES,
     LABELED,
     QUOTED,

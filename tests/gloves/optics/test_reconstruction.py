@@ -147,13 +147,13 @@ def test_the_same_seed_gives_the_same_points() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "sentence"),
     [
-        ("noise", -1.0, "noise is -1, expected a finite number"),
-        ("blob_loss", 2.0, "blob_loss is 2, expected a chance"),
-        ("min_rays", 1, "expected 2 <= min_rays"),
-        ("marker_radius", 0.0, "marker_radius is 0, expected a positive finite number"),
-        ("dropout_length", 0.0, "dropout_length is 0 and dropout_cameras 1, expected at least 1 picture"),
-        ("dropout_cameras", -1, "dropout_cameras -1, expected at least 1 picture, and 0 cameras"),
-        ("min_angle", np.nan, "min_angle is nan, expected 0 to 90 degrees"),
+        ("noise", -1.0, "noise is -1, expected a number of at least 0"),
+        ("blob_loss", 2.0, "blob_loss is 2, expected a number from 0 to 1"),
+        ("min_rays", 4, "expected 2 <= min_rays <= min_rays_to_start"),
+        ("marker_radius", 0.0, "marker_radius is 0, expected a number above 0"),
+        ("dropout_length", 0.0, "dropout_length is 0, expected a number of at least 1"),
+        ("dropout_cameras", -1, "dropout_cameras is -1, expected 0 or more"),
+        ("min_angle", np.nan, "min_angle is nan, expected a number from 0 to 90"),
     ],
 )
 def test_nonsense_is_refused(field: str, value: float, sentence: str) -> None:

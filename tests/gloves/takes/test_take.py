@@ -31,8 +31,7 @@ from gloves.takes.take import (
     load_take,
 )
 from handsim.errors import ArgumentError, CaptureError
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
-from handsim.hand.motion import is_steady
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, is_steady, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.transforms import random_quaternions
 

@@ -28,13 +28,13 @@ from tests.waiting import LONG
 from train.simulation import generation
 from train.simulation.generation import make_dataset
 from train.simulation.takes import simulate_take
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
 ROOT = Path(__file__).resolve().parents[3]
 ROWS = 100
 PRELOAD = f"from train.simulation import generation\ngeneration.ROWS_PER_SHARD = {ROWS}\n"
-CONFIG = DatasetConfig(
+CONFIG = GenerateSettings(
     num_frames=12 * ROWS - 30,
     seed=5,
     frames_per_hand=50,

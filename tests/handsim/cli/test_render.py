@@ -10,6 +10,7 @@ import pytest
 import tyro
 
 from handsim.cli import render as command
+from handsim.cli.parsing import registry
 from handsim.cli.render import RenderOptions
 from handsim.errors import HandSimError
 from render.config import RenderConfig
@@ -20,7 +21,7 @@ from render.skin.look import TONES
 
 
 def parsed(*words: str) -> RenderConfig:
-    return tyro.cli(RenderOptions, args=words).config()
+    return tyro.cli(RenderOptions, args=words, registry=registry()).config()
 
 
 def test_no_option_gives_the_default_configuration() -> None:
@@ -41,7 +42,7 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
         "--vary frame --depth-sensor none --no-color-sensor --motion-blur --painter opengl --every 3 "
         "--frames-per-shard 5 --seed 7 --workers 1"
     )
-    tyro.cli(command.render, args=line.split())
+    tyro.cli(command.render, args=line.split(), registry=registry())
     take, out, formats, config, workers = given[0]
     assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
     assert dataclasses.astuple(config.view) == ("rig", "sr300", 2, 0.4, (0.5, 0.6), "eight", None)

@@ -101,7 +101,7 @@ def test_the_optics_are_options_of_the_command(tmp_path, capsys):
     capsys.readouterr()
     assert main([*command, "--optics.noise", "-1"]) == 1
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "noise is -1, expected a finite number that is not negative" in said
+    assert said.count("\n") == 1 and "noise is -1, expected a number of at least 0" in said
 
 
 @pytest.mark.parametrize("name", ["take.tsv", "take.npz", "take"])

@@ -12,7 +12,7 @@ from train.data.batches import Corruption, paper_corruption
 from train.loop import _rate
 from train.settings import EPOCHS, CNNConfig, TrainSettings, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 FRAMES = 16
 
@@ -20,7 +20,7 @@ FRAMES = 16
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return out
 
 

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from gloves.takes.take import posed_motion
 from handsim.errors import CaptureError
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
@@ -20,10 +21,7 @@ from handsim.motion_files.motion import (
     corner_normals,
     joint_poses,
     joint_radii,
-    posed_bodies,
-    posed_hands,
     read_joint_csv,
-    seconds_of,
     split_vertices,
     write_bvh,
     write_joint_csv,
@@ -35,17 +33,17 @@ from handsim.space.transforms import MIRROR
 
 
 def test_the_last_pose_is_held(motion):
-    left = list(posed_hands(motion))[1]
+    left = posed_motion(motion).hands[1]
     assert left.side == "left" and np.flatnonzero(~left.present).tolist() == [0, 1, 5, 6]
     np.testing.assert_array_equal(left.qpos[left.present], motion.qpos[left.present, 1])
     np.testing.assert_array_equal(left.qpos[[0, 1, 5, 6]], motion.qpos[[2, 2, 4, 4], 1])
-    pen = next(posed_bodies(motion))
+    pen = posed_motion(motion).bodies[0]
     assert pen.shape is not None and np.flatnonzero(~pen.present).tolist() == [7, 8]
     np.testing.assert_array_equal(pen.T_world_body[[7, 8]], pen.T_world_body[[6, 6]])
 
 
 def test_changes_are_where_something_appears_or_goes(motion):
-    left = list(posed_hands(motion))[1]
+    left = posed_motion(motion).hands[1]
     assert changes(left.present).tolist() == [0, 2, 5, 7]
 
 
@@ -74,7 +72,7 @@ def rows_of(path):
         write = write_joint_parquet
 
     def read(motion):
-        write(path, motion)
+        write(path, posed_motion(motion))
         if path.suffix == ".csv":
             with path.open(newline="") as file:
                 return list(csv.DictReader(file))
@@ -90,7 +88,7 @@ def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path, name):
     rows = rows_of(tmp_path / name)(motion)
     assert len(rows) == 2 * motion.num_frames
     for number, row in enumerate(rows):
-        frame, hand = number // 2, list(posed_hands(motion))[number % 2]
+        frame, hand = number // 2, posed_motion(motion).hands[number % 2]
         assert (int(row["frame"]), row["hand"]) == (frame, hand.side)
         assert float(row["time_s"]) == pytest.approx(motion.times[frame], abs=1e-6)
         if not hand.present[frame]:
@@ -106,7 +104,7 @@ def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path, name):
 
 def test_what_was_written_is_read(motion, tmp_path):
     path = tmp_path / "poses.csv"
-    write_joint_csv(path, motion)
+    write_joint_csv(path, posed_motion(motion))
     table = read_joint_csv(path)
     assert table.sides == ("right", "left")
     np.testing.assert_allclose(table.times, motion.times, atol=1e-6)
@@ -114,7 +112,7 @@ def test_what_was_written_is_read(motion, tmp_path):
 
 
 def test_columns_may_come_in_any_order_and_be_more_or_fewer(motion, tmp_path):
-    write_joint_csv(tmp_path / "poses.csv", motion)
+    write_joint_csv(tmp_path / "poses.csv", posed_motion(motion))
     with (tmp_path / "poses.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     names = [name for name in reversed(rows[0]) if not name.startswith(("thumb_tip", "index_MCP_x"))]
@@ -138,7 +136,7 @@ def test_columns_may_come_in_any_order_and_be_more_or_fewer(motion, tmp_path):
 )
 def test_what_cannot_be_read_is_told(motion, tmp_path, old, new, words):
     path = tmp_path / "poses.csv"
-    write_joint_csv(path, motion)
+    write_joint_csv(path, posed_motion(motion))
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
@@ -149,7 +147,7 @@ def test_what_cannot_be_read_is_told(motion, tmp_path, old, new, words):
 
 def test_header_and_angles(motion, tmp_path):
     path = tmp_path / "hands.mot"
-    write_mot(path, motion)
+    write_mot(path, posed_motion(motion))
     lines = path.read_text().splitlines()
     end = lines.index("endheader")
     stated = dict(line.split("=") for line in lines[1:end])
@@ -158,7 +156,7 @@ def test_header_and_angles(motion, tmp_path):
     assert lines[0] == "hands" and stated["version"] == "1" and stated["inDegrees"] == "yes"
     assert (int(stated["nRows"]), int(stated["nColumns"])) == table.shape == (len(table), len(names))
     columns = dict(zip(names, table.T, strict=True))
-    np.testing.assert_allclose(columns["time"], seconds_of(motion), atol=1e-8)
+    np.testing.assert_allclose(columns["time"], posed_motion(motion).seconds, atol=1e-8)
     for number, hand in enumerate(motion.hands):
         qpos, present = motion.qpos[:, number], np.isfinite(motion.qpos[:, number, 0])
         angles = np.stack([columns[f"{hand.side}_{joint}"] for joint in JOINT_NAMES], axis=1)
@@ -217,10 +215,10 @@ def read_bvh(path):
 
 
 def test_joints_are_where_ours_are(motion, tmp_path):
-    write_bvh(tmp_path / "hands.bvh", motion)
+    write_bvh(tmp_path / "hands.bvh", posed_motion(motion))
     positions, rate, _, _ = read_bvh(tmp_path / "hands.bvh")
     assert abs(rate - 60.0) < 1e-5
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         bones, tips = (
             hand.model.forward_kinematics(hand.qpos),
             hand_keypoints(hand.model, hand.qpos),
@@ -233,16 +231,16 @@ def test_joints_are_where_ours_are(motion, tmp_path):
 
 
 def test_a_hand_without_a_pose_keeps_the_last_one(motion, tmp_path):
-    write_bvh(tmp_path / "hands.bvh", motion)
+    write_bvh(tmp_path / "hands.bvh", posed_motion(motion))
     place = read_bvh(tmp_path / "hands.bvh")[0]["left_index_distal"]
     for frame, shown in ((0, 2), (1, 2), (5, 4), (6, 4)):
         np.testing.assert_array_equal(place[frame], place[shown])
 
 
 def test_things_are_where_ours_are(motion, tmp_path):
-    write_bvh(tmp_path / "hands.bvh", motion)
+    write_bvh(tmp_path / "hands.bvh", posed_motion(motion))
     positions, _, rotations, _ = read_bvh(tmp_path / "hands.bvh")
-    for thing, name in zip(posed_bodies(motion), ("pen", "my_wand"), strict=True):
+    for thing, name in zip(posed_motion(motion).bodies, ("pen", "my_wand"), strict=True):
         np.testing.assert_allclose(positions[name], thing.T_world_body[:, :3, 3], atol=1e-7)
         turn = 100.0 * BACK.T
         expected = turn @ thing.T_world_body[:, :3, :3] @ turn.T
@@ -250,13 +248,13 @@ def test_things_are_where_ours_are(motion, tmp_path):
 
 
 def test_zero_rotations_are_the_flat_hand(motion, tmp_path):
-    write_bvh(tmp_path / "hands.bvh", motion)
+    write_bvh(tmp_path / "hands.bvh", posed_motion(motion))
     path = tmp_path / "rest.bvh"
     head, _ = (tmp_path / "hands.bvh").read_text().split("MOTION\n")
     columns = head.count("rotation") + head.count("position")
     path.write_text(head + "MOTION\nFrames: 1\nFrame Time: 1\n" + "0 " * columns + "\n")
     positions = read_bvh(path)[0]
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         rest = hand.model.rest_transforms
         for number, bone in enumerate(BONE_NAMES):
             np.testing.assert_allclose(positions[f"{hand.side}_{bone}"][0], rest[number, :3, 3], atol=1e-7)
@@ -264,7 +262,7 @@ def test_zero_rotations_are_the_flat_hand(motion, tmp_path):
 
 def test_angles_do_not_jump(motion, tmp_path):
     """No channel turns by more than half a turn between frames, also where it passes 180 degrees."""
-    write_bvh(tmp_path / "hands.bvh", motion.poses_alone(960.0))
+    write_bvh(tmp_path / "hands.bvh", posed_motion(motion.poses_alone(960.0)))
     assert np.abs(np.diff(read_bvh(tmp_path / "hands.bvh")[3], axis=0)).max() < 180.0 + 1e-6
 
 
@@ -360,13 +358,13 @@ def test_radii_reach_the_skin(hand):
 
 def test_file(motion, tmp_path):
     path = tmp_path / "hands.openxr.json"
-    write_openxr(path, motion)
+    write_openxr(path, posed_motion(motion))
     content = json.loads(path.read_text())
     assert tuple(content["joints"]) == OPENXR_JOINTS and len(content["frames"]) == motion.num_frames
     up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for frame, stored in enumerate(content["frames"]):
         assert stored["time"] == motion.times[frame]
-        for hand in posed_hands(motion):
+        for hand in posed_motion(motion).hands:
             rows = stored["hands"][hand.side]
             assert (rows is not None) == hand.present[frame]
             if rows is not None:

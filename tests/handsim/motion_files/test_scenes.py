@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gloves.fit import attach
 from gloves.layout import load_layout
-from gloves.takes.take import Take
+from gloves.takes.take import Take, posed_motion
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.motion_files.motion import posed_bodies, posed_hands, seconds_of
 from handsim.motion_files.scenes import write_glb, write_usd
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -107,30 +106,30 @@ class Glb:
 
 @pytest.fixture
 def glb(motion, tmp_path):
-    write_glb(tmp_path / "hands.glb", motion)
+    write_glb(tmp_path / "hands.glb", posed_motion(motion))
     return Glb(tmp_path / "hands.glb")
 
 
 def test_skins_move_as_ours(glb, motion):
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         for frame in np.flatnonzero(hand.present):
-            found, _, _ = glb.skinned(f"{hand.side}_hand", seconds_of(motion)[frame])
+            found, _, _ = glb.skinned(f"{hand.side}_hand", posed_motion(motion).seconds[frame])
             expected = hand.model.skin(hand.qpos[frame : frame + 1])[0] @ UP.T
             np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 def test_a_hand_without_a_pose_is_a_point(glb, motion):
-    left = list(posed_hands(motion))[1]
+    left = posed_motion(motion).hands[1]
     for frame in np.flatnonzero(~left.present):
-        found, _, _ = glb.skinned("left_hand", seconds_of(motion)[frame])
+        found, _, _ = glb.skinned("left_hand", posed_motion(motion).seconds[frame])
         assert np.ptp(found, axis=0).max() < 1e-6
-    assert np.ptp(glb.skinned("right_hand", seconds_of(motion)[5])[0], axis=0).max() > 0.1
+    assert np.ptp(glb.skinned("right_hand", posed_motion(motion).seconds[5])[0], axis=0).max() > 0.1
 
 
 def test_things_move_as_ours(glb, motion):
-    for thing in posed_bodies(motion):
+    for thing in posed_motion(motion).bodies:
         for frame in range(motion.num_frames):
-            pose = glb.worlds(seconds_of(motion)[frame])[glb.named(thing.name)]
+            pose = glb.worlds(posed_motion(motion).seconds[frame])[glb.named(thing.name)]
             expected = (
                 np.zeros((3, 3)) if not thing.present[frame] else UP @ thing.T_world_body[frame, :3, :3]
             )
@@ -144,7 +143,7 @@ def test_things_move_as_ours(glb, motion):
 
 
 def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         _, parts, indices = glb.skinned(f"{hand.side}_hand", 0.0)
         mesh = trimesh.Trimesh(parts["POSITION"], indices.reshape(-1, 3), process=False)
         assert mesh.is_watertight and mesh.volume > 0
@@ -201,16 +200,16 @@ def test_a_single_frame_is_a_pose_without_an_animation(tmp_path):
     model = HandModel.named("S", side="left")
     flat = join_qpos(np.zeros((1, 20)))[:, None]
     take = Take.of_poses([attach(load_layout("dense19"), model)], flat, rate=1.0)
-    write_glb(tmp_path / "one.glb", take)
+    write_glb(tmp_path / "one.glb", posed_motion(take))
     glb = Glb(tmp_path / "one.glb")
     assert "animations" not in glb.json
     np.testing.assert_allclose(glb.skinned("left_hand", 0.0)[0], model.surface.vertices @ UP.T, atol=1e-6)
 
 
 def test_a_take_with_y_up_keeps_its_axes(motion, tmp_path):
-    write_glb(tmp_path / "y.glb", motion, up="y")
+    write_glb(tmp_path / "y.glb", posed_motion(motion), up="y")
     found, _, _ = Glb(tmp_path / "y.glb").skinned("right_hand", 0.0)
-    right = next(posed_hands(motion))
+    right = posed_motion(motion).hands[0]
     np.testing.assert_allclose(found, right.model.skin(right.qpos[:1])[0], atol=2e-6)
     assert trimesh.load(tmp_path / "y.glb").geometry  # another reader opens it
 
@@ -221,14 +220,14 @@ def stage(request, motion, tmp_path):
     assert pxr
     from pxr import Usd
 
-    write_usd(tmp_path / f"hands.{request.param}", motion)
+    write_usd(tmp_path / f"hands.{request.param}", posed_motion(motion))
     return Usd.Stage.Open(str(tmp_path / f"hands.{request.param}"))
 
 
 def test_usd_skins_the_hands_as_we_do(stage, motion):
     from pxr import Usd, UsdGeom, UsdSkel
 
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         cache = UsdSkel.Cache()
         cache.Populate(UsdSkel.Root(stage.GetPrimAtPath(f"/hands/{hand.side}")), Usd.PrimDefaultPredicate)
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/hands/{hand.side}/{hand.side}_hand"))
@@ -250,7 +249,7 @@ def test_things_units_and_axes(stage, motion):
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 60.0
     assert stage.GetStartTimeCode() == 0.0 and stage.GetEndTimeCode() == pytest.approx(12.0)
-    for thing, name in zip(posed_bodies(motion), ("pen", "my_wand"), strict=True):
+    for thing, name in zip(posed_motion(motion).bodies, ("pen", "my_wand"), strict=True):
         prim = UsdGeom.Xformable(stage.GetPrimAtPath(f"/hands/things/{name}"))
         for frame in range(motion.num_frames):
             found = np.array(prim.ComputeLocalToWorldTransform(frame)).T
@@ -277,7 +276,7 @@ def test_meshes_have_materials_and_skeletons_the_names_of_their_hands(stage, mot
         side = name.partition("_")[0]
         for path in skeleton.GetJointsAttr().Get():
             assert all(part.startswith(f"{side}_") for part in path.split("/"))
-    for hand in posed_hands(motion):
+    for hand in posed_motion(motion).hands:
         kinds = {str(prim.GetName()) for prim in stage.GetPrimAtPath(f"/hands/{hand.side}").GetChildren()}
         assert kinds == {f"{hand.side}_{kind}" for kind in ("hand", "skeleton", "motion")} | {"skin"}
 
@@ -292,5 +291,5 @@ def test_without_usd_core_the_extra_is_named(motion, tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(HandSimError, match=r"\.usdc needs usd-core; run `pip install 'handsim\[usd\]'`"):
-        write_usd(tmp_path / "hands.usdc", motion)
+        write_usd(tmp_path / "hands.usdc", posed_motion(motion))
     assert list(tmp_path.iterdir()) == []

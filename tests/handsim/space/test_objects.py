@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from handsim.errors import ArgumentError, ObjectError
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion
 from handsim.space.objects import MARKER_RADIUS, RigidObject, load_object, named_object, object_names
 
 

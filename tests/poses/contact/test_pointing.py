@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim.errors import PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.space.objects import named_object
-from poses.grasps import object_penetration, wrist_poses
+from handsim.space.transforms import pose_matrices
+from poses.grasps import object_penetration
 from poses.object_motion import (
     DISTANCE,
     PATH,
@@ -145,7 +145,8 @@ def test_a_hand_leads_the_pen_without_touching_the_other(rng):
     # What the fingers do, and how the pen lies in the hand, is as it was.
     np.testing.assert_array_equal(motion.qpos[:, 7:], held[0].qpos[:, 7:])
     before, after = (
-        np.linalg.inv(wrist_poses(hand.qpos)) @ thing.T_world_body for hand, thing in (held, (motion, body))
+        np.linalg.inv(pose_matrices(hand.qpos[:, :7])) @ thing.T_world_body
+        for hand, thing in (held, (motion, body))
     )
     np.testing.assert_allclose(after, before, atol=1e-9)
     assert two_hands_penetration(right, left, motion.qpos, other.qpos).max() <= 0.001

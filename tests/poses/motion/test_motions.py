@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.motion import HandMotion
+from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.hand.shape import SIDES, sample_shape
 from poses.motion import (
     MotionConfig,

@@ -110,7 +110,7 @@ def test_sleeves_begin_where_they_are_told(rng: np.random.Generator) -> None:
 
 
 def test_impossible_looks_are_told() -> None:
-    with pytest.raises(HandSimError, match="lightness 120"):
+    with pytest.raises(HandSimError, match="lightness is 120"):
         SkinLook(lightness=120.0)
     with pytest.raises(HandSimError, match="roughness is 2"):
         SkinLook(roughness=2.0)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side, sample_shape
 from handsim.hand.skin import vertex_normals
@@ -147,13 +146,6 @@ def test_an_arm_bends_at_its_elbow_and_stays_one_surface(side: Side, rng: np.ran
         assert end @ towards > 0.98 * REACH and np.linalg.norm(end) < REACH + 0.05
         before = skin_atlas().corners < skin_atlas().num_hand
         np.testing.assert_array_equal(bent[before], mesh.posed(qpos).vertices[before])
-
-
-def test_impossible_forearms_are_told() -> None:
-    with pytest.raises(HandSimError, match="forearm of 5 m"):
-        Forearm(length=5.0)
-    with pytest.raises(HandSimError, match="girth"):
-        Forearm(girth=0.0)
 
 
 def test_texture_places_lie_on_texels_of_their_own_tile() -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import SIDES, Side
 from poses.shapes import gesture
@@ -138,8 +137,3 @@ def test_gloves_repeat_and_are_dark(rng: np.random.Generator) -> None:
     first, again = (sample_glove_look(rng=np.random.default_rng(8)) for _ in range(2))
     skin = skin_texture(SkinLook())
     assert glove_texture(first, skin).color.tobytes() == glove_texture(again, skin).color.tobytes()
-
-
-def test_a_glove_without_a_cuff_is_told() -> None:
-    with pytest.raises(HandSimError, match="cuff"):
-        GloveLook(cuff=0.0)

@@ -165,7 +165,7 @@ def test_a_truth_has_no_doubt_and_residuals_of_its_noise(truth, tmp_path):
     page, (frames, _, _, doubts) = written(tmp_path, truth)
     assert doubts == [] and "No label is probably wrong or missing" in page and "nothing to calibrate" in page
     for side, hand in zip(truth.sides, truth.hands, strict=True):
-        off = truth.observed(side) - hand.markers(truth.qpos[:, truth.hand(side)])[0]
+        off = truth.observed(side) - hand.markers(truth.qpos[:, truth.hand_index(side)])[0]
         rms = 1e3 * np.sqrt(np.nanmean(np.square(off).sum(axis=2), axis=1))
         rows = [row for row in frames if row["hand"] == side]
         np.testing.assert_allclose(numbers(rows, "residual_rms_mm"), rms, rtol=1e-5)

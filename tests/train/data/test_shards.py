@@ -13,7 +13,7 @@ from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset, MappedRows, row_dtype
 from train.settings import TrainSettings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 
 def shards_of(sizes):
@@ -46,7 +46,7 @@ def test_spans_numbers_and_fields_are_those_of_the_rows_in_memory(sizes, data):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 

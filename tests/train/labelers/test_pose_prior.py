@@ -1,4 +1,4 @@
-"""The pose prior: what it says of hands, and how it is learned."""
+"""The pose prior: what it says of hands and how it is learned; left and right hands."""
 
 from __future__ import annotations
 
@@ -11,8 +11,23 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from gloves.fit import attach_markers
+from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout
 from handsim.errors import WeightsError
-from train.labelers.pose_prior import PosePrior, align_all, learn_pose_prior
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import DIGITS
+from handsim.space.transforms import quaternion_matrix, random_quaternions
+from poses.shapes import sample_valid_angles
+from train.labelers.pose_prior import (
+    PosePrior,
+    SideClassifier,
+    align_all,
+    is_mirror_like,
+    learn_pose_prior,
+    procrustes_errors,
+    seen_as_right,
+    tables_of,
+)
 
 MARKERS, RANK = 7, 5
 
@@ -64,15 +79,12 @@ def test_the_nearest_components_are_those_that_scipy_aligns_best(rng):
     many, labels = prior(rng, 30), np.arange(MARKERS)
     for left in (False, True):
         points = rng.normal(scale=0.05, size=(MARKERS, 3))
-        seen = points * ([-1.0, 1.0, 1.0] if left else 1.0)
-        off = seen - seen.mean(axis=0)
+        off = seen_as_right(points, left)
         misses = [
             Rotation.align_vectors(mean - mean.mean(axis=0), off)[1] for mean in many.means.astype(float)
         ]
-        near = many.nearest(points, labels, mirrored=left, count=9)
-        np.testing.assert_array_equal(near, np.argsort(misses)[:9])
-        among = many.log_density(points, labels, mirrored=left, among=near)
-        assert among == many.log_density(points, labels, mirrored=left)  # four of them count
+        errors = procrustes_errors(off, labels, tables_of(many).by_marker)
+        np.testing.assert_array_equal(np.argsort(errors)[:9], np.argsort(misses)[:9])
 
 
 def test_three_points_fit_any_hand(rng):
@@ -164,3 +176,65 @@ def test_alignment_is_scipys(seed, flat):
         np.testing.assert_allclose(
             np.linalg.norm(found[0] - found[1]), np.linalg.norm(hand[0] - hand[1]), rtol=1e-6
         )
+
+
+@pytest.fixture(scope="module", params=["dense19", "sparse13"])
+def classifier(request):
+    layout = load_layout(request.param)
+    return layout, SideClassifier(layout, rng=np.random.default_rng(0))
+
+
+def hands(layout, side, rng, count=60):
+    hand = HandModel.named("M", side=side)
+    qpos = join_qpos(sample_valid_angles(hand, count, rng=rng), quaternion=random_quaternions(count, rng=rng))
+    return attach_markers(layout, hand).markers(hand, hand.forward_kinematics(qpos))[0]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_unknown_poses_are_told_also_with_markers_missing(classifier, side, rng):
+    layout, tells = classifier
+    right = whole = 0
+    for points in hands(layout, side, rng):
+        whole += tells.classify(points, np.arange(len(points)))[0] == side
+        here = rng.permutation(len(points))[3:]
+        right += tells.classify(points[here], here)[0] == side
+    assert whole >= 58
+    assert right >= 55
+
+
+def test_a_mirror_turns_the_answer_and_nothing_else_matters(classifier, rng):
+    layout, tells = classifier
+    (points,) = hands(layout, "right", rng, count=1)
+    side, clear = tells.classify(points, np.arange(len(points)))
+    moved = points @ quaternion_matrix(random_quaternions(1, rng=rng))[0].T + [1.0, -2.0, 0.5]
+    order = rng.permutation(len(points))
+    assert tells.classify(moved[order], order) == (side, pytest.approx(clear))
+    mirrored, as_clear = tells.classify(points * (1.0, 1.0, -1.0), np.arange(len(points)))
+    assert {side, mirrored} == {"left", "right"}
+    assert as_clear == pytest.approx(clear)
+
+
+def test_too_few_points_say_nothing(classifier, rng):
+    _, tells = classifier
+    points = rng.normal(size=(5, 3))
+    for labels in ([0, 1, 2, -1, -1], [-1] * 5):
+        assert tells.classify(points, np.array(labels)) == ("right", 0.0)
+    assert tells.classify(np.zeros((0, 3)), np.zeros(0, dtype=int)) == ("right", 0.0)
+
+
+@pytest.mark.parametrize("name", list_layouts())
+def test_no_shipped_layout_is_like_its_mirror_image(name):
+    assert not is_mirror_like(load_layout(name))
+
+
+def test_a_symmetric_layout_without_a_thumb_is_like_its_mirror_image():
+    tips = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS[1:]]
+    back = [
+        MarkerPlace(f"back{along}{across}", "palm", along, 0.0, across)
+        for along in (0.3, 0.7)
+        for across in (0.2, -0.2)
+    ]
+    layout = MarkerLayout("symmetric", (*tips, *back), 0.0032)
+    assert is_mirror_like(layout)
+    thumb = MarkerPlace("thumb", "thumb_distal", 0.7, 0.0)
+    assert not is_mirror_like(dataclasses.replace(layout, markers=(*tips, *back, thumb)))

@@ -19,7 +19,7 @@ from train.data.shards import Dataset, row_dtype
 from train.reports import dataset_page as report
 from train.simulation import generation
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
@@ -30,7 +30,7 @@ def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "ROWS_PER_SHARD", 150)
-        make_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
+        make_dataset(GenerateSettings(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
     return Dataset(out)
 
 

@@ -30,7 +30,7 @@ from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
 from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import DatasetConfig
+from train.simulation.training_frames import GenerateSettings
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
@@ -44,7 +44,7 @@ def pictures(page: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
+    make_dataset(GenerateSettings(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
     return Dataset(out)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion
 from handsim.space.camera import look_at
 from handsim.space.rig import named_rig
 from handsim.space.transforms import pose_matrices

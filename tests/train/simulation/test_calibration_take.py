@@ -11,7 +11,7 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel
 from poses.shapes import is_valid
 from poses.touch import FINGERS, is_touching
-from train.simulation import calibration_take
+from train.simulation import scenes
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 from train.simulation.takes import simulate_calibration
 
@@ -41,27 +41,27 @@ def test_a_take_of_both_hands_has_its_truth(rng):
 
 
 def test_only_touches_out_of_reach_are_left_out(rng, monkeypatch):
-    model, touching_angles = HandModel.named("M"), calibration_take.touching_angles
+    model, touching_angles = HandModel.named("M"), scenes.touching_angles
 
     def without_the_ring_finger(model, finger, start):
         if finger == "ring":
             raise PoseError("out of reach")
         return touching_angles(model, finger, start)
 
-    monkeypatch.setattr(calibration_take, "touching_angles", without_the_ring_finger)
+    monkeypatch.setattr(scenes, "touching_angles", without_the_ring_finger)
     angles = calibration_angles(model, SHORT, rng=rng)
     assert is_touching(model, angles, "index").any()
 
     def broken(model, finger, start):
         raise ArgumentError("start has shape (3,), expected (..., 20)")
 
-    monkeypatch.setattr(calibration_take, "touching_angles", broken)
+    monkeypatch.setattr(scenes, "touching_angles", broken)
     with pytest.raises(ArgumentError, match="start has shape"):
         calibration_angles(model, SHORT, rng=rng)
 
 
 def test_bad_values_are_told(rng):
-    with pytest.raises(ArgumentError, match="expected a positive time"):
+    with pytest.raises(ArgumentError, match="free is 0, expected a number above 0"):
         CalibrationTakeConfig(free=0.0)
     with pytest.raises(ArgumentError, match="expected 0 or more"):
         CalibrationTakeConfig(rounds=-1)

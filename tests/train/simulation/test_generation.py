@@ -27,20 +27,19 @@ from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
-from train.simulation import frame_scenes, generation, people
+from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
-from train.simulation.scenes import NO_REST
-from train.simulation.training_frames import NO_GRASP, NO_TOUCH, DatasetConfig, SceneMix
+from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH, GenerateSettings, SceneMix
 
-CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
 import sys
 from pathlib import Path
 from train.simulation import generation
-from train.simulation.training_frames import (DatasetConfig)
+from train.simulation.training_frames import (GenerateSettings)
 generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
-    config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+    config = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
     generation.make_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
@@ -153,9 +152,9 @@ def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):
     def no_touch(*args, **kwargs):
         raise PoseError("no valid pose of these two hands was found")
 
-    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", no_touch)
-    monkeypatch.setattr(frame_scenes, "settle_hold", no_touch)
-    config = DatasetConfig(
+    monkeypatch.setattr(training_frames, "sample_two_hand_poses", no_touch)
+    monkeypatch.setattr(training_frames, "settle_hold", no_touch)
+    config = GenerateSettings(
         num_frames=600,
         frames_per_hand=20,
         population=Population(girth_spread=0.2),
@@ -174,8 +173,8 @@ def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monk
     def broken(*args, **kwargs):
         raise ArgumentError("qpos has shape (3,), expected (..., 27)")
 
-    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", broken)
-    config = DatasetConfig(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
+    monkeypatch.setattr(training_frames, "sample_two_hand_poses", broken)
+    config = GenerateSettings(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
     with pytest.raises(ArgumentError, match="qpos has shape"):
         make_dataset(config, tmp_path / "set", workers=1)
 
@@ -184,9 +183,9 @@ def test_people_are_not_drawn_for_ever(rng, monkeypatch):
     def no_rest(model):
         raise PoseError("this hand's fingers overlap at rest")
 
-    monkeypatch.setattr(people, "resting_angles", no_rest)
+    monkeypatch.setattr(training_frames, "resting_angles", no_rest)
     with pytest.raises(ArgumentError, match="the fingers of all 1000 people drawn"):
-        people.sample_hands(Population(), rng=rng)
+        training_frames.sample_hands(Population(), rng=rng)
 
 
 def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
@@ -229,13 +228,13 @@ def test_a_damaged_shard_is_named(finished, tmp_path):
 def test_bad_settings_leave_nothing_behind(tmp_path, change, error, sentence):
     out = tmp_path / "set"
     with pytest.raises(error, match=sentence):
-        make_dataset(DatasetConfig(num_frames=10, **change), out)
+        make_dataset(GenerateSettings(num_frames=10, **change), out)
     assert not out.exists()
 
 
 def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     rig = mixed_rig()
-    config = DatasetConfig(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
+    config = GenerateSettings(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
     make_dataset(config, tmp_path / "set", workers=1)
     dataset = Dataset(tmp_path / "set")
     assert as_rig(dataset.manifest.config["rig"]) == rig
@@ -316,8 +315,8 @@ def test_a_set_that_the_disk_has_no_space_for_is_refused(tmp_path):
 
 
 MANIFESTS = {
-    "marker_names": (5, "marker_names is not a list of different names"),
-    "num_frames": (float("nan"), "num_frames is not a whole number of at least 1"),
+    "marker_names": (5, "marker_names is 5, expected a tuple"),
+    "num_frames": (float("nan"), "num_frames is nan, expected a whole number"),
     "files": ({"../../etc/passwd": "0"}, "files is not a table of names of files in this folder"),
     "config": (None, "config is not a table"),
     "redrawn": ([1], "redrawn is not a table of counts"),
@@ -364,7 +363,7 @@ OPTION_ERRORS = {
     "--volume nan": "volume is nan, expected a number from 0 to 10",
     "--slip-around nan": "slip_around is nan, expected a number from 0 to 90",
     "--population.children 5": "children is 5, expected a number from 0 to 1",
-    "--blob-loss 0 1.5": "blob_loss is (0.0, 1.5), expected chances from 0 to 1",
+    "--blob-loss 0 1.5": "blob_loss is 1.5, expected a number from 0 to 1",
     "--seed -1": "seed is -1, expected 0 or more",
 }
 

@@ -23,7 +23,7 @@ LAYOUT = MarkerLayout(
     ),
     radius=0.004,
 )
-ALONE = {"together": 0.0, "holding": 0.0}
+ALONE = {"alone": 1.0}
 
 
 def fists(model, num_poses, *, rng):
@@ -92,7 +92,7 @@ def test_a_sampler_that_no_process_can_import_is_told_when_several_were_asked_fo
         ({"sampler": 5}, "sampler is 5, expected a function (model, num_poses, *, rng)"),
         ({"sampler": degrees}, "holds an angle of 45 rad; are these degrees?"),
         ({"scenes": {"togeter": 1}}, "unknown setting of scenes 'togeter' (did you mean 'together'?)"),
-        ({"scenes": 3}, "scenes is 3, expected a SceneMix or a mapping of its settings"),
+        ({"scenes": 3}, "scenes is 3, expected a SceneMix"),
         ({"volum": 1.0}, "unknown setting of a training set 'volum' (did you mean 'volume'?)"),
         ({"num_frames": "many"}, "num_frames is 'many', expected a whole number"),
     ],

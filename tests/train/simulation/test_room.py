@@ -17,8 +17,7 @@ from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.visibility import MAX_FACING
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel
-from handsim.hand.motion import BodyMotion
+from handsim.hand.model import BodyMotion, HandModel
 from handsim.space.camera import look_at
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import named_rig

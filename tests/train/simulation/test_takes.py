@@ -25,7 +25,7 @@ from tests.rigs import mixed_rig
 from train.simulation import takes
 from train.simulation.room import TWINS, OpticsOptions
 from train.simulation.scenes import KINDS, RATE
-from train.simulation.takes import WRIST_VOLUME, TakeConfig, record_config, simulate_take
+from train.simulation.takes import WRIST_VOLUME, SimulateSettings, simulate_take
 
 FRAMES = 200
 SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
@@ -103,8 +103,8 @@ def test_the_pen_points_at_markers_of_the_other_hand():
 
 
 def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
-    config = TakeConfig(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
-    first, again = record_config(config), record_config(config)
+    config = SimulateSettings(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
+    first, again = simulate_take(settings=config), simulate_take(settings=config)
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.hand_labels == (range(13), range(13, 26))
@@ -138,13 +138,13 @@ def test_the_gloves_radius_reaches_the_optics(tmp_path):
     """Balls of 16 mm merge where fingers lie side by side, and are told in the take's settings."""
     missing = {}
     for radius in (3.2, 8.0):
-        config = TakeConfig(kind="hand-hand", num_frames=120, glove=thick_glove(tmp_path, radius))
-        take = record_config(config)
+        config = SimulateSettings(kind="hand-hand", num_frames=120, glove=thick_glove(tmp_path, radius))
+        take = simulate_take(settings=config)
         assert take.settings["room"]["optics"]["marker_radius"] == radius * 1e-3
         missing[radius] = 1.0 - take.markers_present().mean()
     assert missing[8.0] > 2.0 * missing[3.2]
     own = dataclasses.replace(config, optics=OpticsOptions(marker_radius=0.0032))
-    assert 1.0 - record_config(own).markers_present().mean() < missing[8.0]
+    assert 1.0 - simulate_take(settings=own).markers_present().mean() < missing[8.0]
 
 
 def test_the_optics_have_options():
@@ -155,8 +155,8 @@ def test_the_optics_have_options():
     clear = simulate_take(num_frames=60)
     assert blind.markers_present().mean() < 0.8 < clear.markers_present().mean()
     assert blind.settings["room"]["optics"]["blob_loss"] == 0.9 and "optics" not in clear.settings
-    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a chance"):
-        TakeConfig(optics=OpticsOptions(blob_loss=2.0))
+    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a number from 0 to 1"):
+        SimulateSettings(optics=OpticsOptions(blob_loss=2.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -188,7 +188,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"kind": "hand-pn"}, "unknown kind of capture 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
+        ({"kind": "hand-pn"}, "unknown kind 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
         ({"num_frames": 0}, "num_frames is 0, expected at least 1"),
         ({"num_frames": -5}, "num_frames is -5, expected at least 1"),
         ({"seed": -1}, "seed is -1, expected 0 or more"),
@@ -196,7 +196,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 )  # fmt: skip
 def test_a_mistake_is_one_sentence(arguments, words):
     with pytest.raises(ArgumentError) as caught:
-        TakeConfig(**arguments)
+        SimulateSettings(**arguments)
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -222,7 +222,7 @@ def test_the_whole_hand_controller_twin_is_near_table_3():
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_one_hand_alone(kind, side):
     take = simulate_take(kind=kind, num_frames=FRAMES, hands=(side,))
-    assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == (side,)
+    assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == [side]
     assert take.num_frames == len(take.qpos) == FRAMES
     assert set(np.unique(take.labels)) <= {-1, *range(19)}
     assert np.isfinite(take.observed(take.hand_labels[0])).all(axis=-1).mean() > 0.8
@@ -246,6 +246,6 @@ def test_hands_that_belong_together_are_not_parted(kind):
     with pytest.raises(
         ArgumentError, match="hands are left, expected right and left, or one of them for the"
     ):
-        TakeConfig(kind=kind, hands=("left",))
-    with pytest.raises(ArgumentError, match="unknown hand 'both'"):
-        TakeConfig(hands=("both",))
+        SimulateSettings(kind=kind, hands=("left",))
+    with pytest.raises(ArgumentError, match="unknown hands 'both'"):
+        SimulateSettings(hands=("both",))

@@ -7,11 +7,11 @@ from pathlib import Path
 from upath import UPath
 
 from handsim.files.inputs import checksum
-from train.simulation.training_frames import DatasetConfig, SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 ROWS = 100
 ALONE = SceneMix(alone=1.0, together=0.0, holding=0.0)
-CONFIG = DatasetConfig(num_frames=4 * ROWS - 30, seed=5, frames_per_hand=50, scenes=ALONE)
+CONFIG = GenerateSettings(num_frames=4 * ROWS - 30, seed=5, frames_per_hand=50, scenes=ALONE)
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -42,11 +42,11 @@ ROOT = Path(__file__).resolve().parents[4]
 RUN = f"""
 import sys
 from train.simulation import generation
-from train.simulation.training_frames import (DatasetConfig)
+from train.simulation.training_frames import (GenerateSettings)
 from train.simulation.training_frames import SceneMix
 
 generation.ROWS_PER_SHARD = {ROWS}
-config = DatasetConfig(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
+config = GenerateSettings(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
 generation.make_dataset(config, sys.argv[1], workers=1)
 """
 
