@@ -23,8 +23,7 @@ from gloves.takes.points import Status
 from gloves.takes.take import Take, load_take
 from handsim._checks import shown_value
 from handsim.errors import ArgumentError
-from handsim.hand.model import NUM_KEYPOINTS
-from handsim.hand.shape import NUM_JOINTS, Side
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
 
 AnyCapture = Capture | Take | str | Path
