@@ -25,7 +25,7 @@ from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.labelers.networks import labeler_of
 from train.loop import TrainingState, start_fabric
-from train.settings import KINDS, TrainSettings, usual_settings
+from train.settings import KINDS, TrainSettings, batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings
 
@@ -72,7 +72,7 @@ def race(
     make_dataset(GenerateSettings(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
-    recipe = config.batch_recipe(len(names))
+    recipe = batch_recipe(config, len(names))
     print(f"{(time.perf_counter() - start) / 60:5.1f} min: {frames} frames generated")
     state = TrainingState(config, start_fabric(config, folder), rows)
     beaten: dict[str, dict[str, float]] = {name: {} for name in tests}

@@ -26,11 +26,19 @@ from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from handsim.space.rig import load_rig
-from track.glove_advice.joint_spread import NOISE
-from track.glove_advice.layout_score import LayoutScore, score_layout
-from track.glove_advice.observed_hands import ObservedHand, observe_poses
-from track.glove_advice.trials import CAPTURES, FRAMES, METHODS, WORK, mean_trial, try_layout
+from track.glove_score import (
+    CAPTURES,
+    FRAMES,
+    METHODS,
+    NOISE,
+    WORK,
+    LayoutScore,
+    mean_trial,
+    score_layout,
+    try_layout,
+)
 from track.kinematics.pose_solver import PoseSolver
+from train.forecast.rig_forecast import ObservedHand, observe_poses
 from train.labelers.layout_labeler import fine_tuned_labeler, learned_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler

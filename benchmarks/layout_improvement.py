@@ -19,7 +19,7 @@ from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
-from track.glove_advice.trials import METHODS
+from track.glove_score import METHODS
 from train.labelers.layout_labeler import learned_labeler
 
 HARD = ("tips8", "symmetric8", "sides11", "palmar12")  # of the layouts whose score is compared with captures

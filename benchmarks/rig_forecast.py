@@ -24,9 +24,8 @@ from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
 from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, named_rig
-from train.rig_advice.forecast import Forecast, forecast, light_work
-from train.rig_advice.planning import plan_rig
-from train.rig_advice.work import sample_work
+from train.forecast.rig_forecast import Forecast, forecast, light_work, sample_work
+from train.forecast.rig_plan import plan_rig
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
@@ -107,8 +106,8 @@ def rigs() -> list[CameraRig]:
 def planned_rig(count: int) -> CameraRig:
     """So many cameras on the truss, where `handsim rig plan` has them."""
     name = f"planned{count}"
-    options = {"mounts": ("truss",), "volume": SIDES, "center": CENTER, "camera": CAMERA, "glove": GLOVE}
-    return plan_rig(count, FRAME, name=name, **options).rig
+    where = {"mounts": ("truss",), "volume": tuple(SIDES), "center": ROOM_CENTER}
+    return plan_rig(count, FRAME, name=name, camera=CAMERA, glove=GLOVE, **where).rig
 
 
 def hung_rig(count: int) -> CameraRig:

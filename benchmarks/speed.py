@@ -62,12 +62,12 @@ from poses.shapes import sample_valid_angles
 from track.tracker import Tracker, warm_up
 from train.data.batches import Corruption, corrupt, draw_batch
 from train.data.shards import Dataset
-from train.devices import start_fabric
+from train.fabric import start_fabric
 from train.labelers.networks import labeler_of, new_network
 from train.labelers.protocol import Labeler, torch_threads
 from train.labelers.storage import OnnxLabeler, export_onnx, load_labeler, load_network
 from train.loop import TrainingState
-from train.settings import CNNConfig, usual_settings
+from train.settings import CNNConfig, batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 from train.simulation.takes import simulate_take
@@ -291,7 +291,7 @@ def training(speeds: Speeds) -> None:
         make_dataset(GenerateSettings(num_frames=2000), Path(folder) / "set")
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
-        rng, recipe = np.random.default_rng(0), config.batch_recipe(rows["markers"].shape[1])
+        rng, recipe = np.random.default_rng(0), batch_recipe(config, rows["markers"].shape[1])
 
         def images(seconds: float) -> float:
             """Images a second over a while."""

@@ -1,22 +1,89 @@
-"""Pages on takes, training sets, gloves and rigs."""
+"""Pages on takes, training sets, gloves and rigs: HTML files without scripts, and the pictures in them."""
 
 from __future__ import annotations
 
+import base64
 import importlib
+import io
 import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
+from handsim.files.outputs import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
 
 # By names, because the packages that make pages lie above this one.
 _WRITERS: Final = {
-    "gloves.takes.take.Take": "track.reports.take_page:write_take_page",
+    "gloves.takes.take.Take": "track.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
-    "track.glove_advice.layout_score.LayoutScore": "track.glove_advice.score_page:write_score_page",
-    "train.rig_advice.rig_score.RigScore": "train.rig_advice.rig_page:write_rig_page",
+    "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
+    "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
+
+
+class Paint:
+    """The colors of all pictures."""
+
+    INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
+    BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
+
+
+NOTHING: Final = "-"
+"""The cell of a table where there is no number."""
+_PICTURES: Final[dict[str, Any]] = {
+    "font.size": 9.0,
+    "text.color": Paint.INK,
+    "axes.labelcolor": Paint.SOFT,
+    "axes.labelsize": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.edgecolor": Paint.LINE,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": Paint.LINE,
+    "ytick.color": Paint.LINE,
+    "xtick.labelcolor": Paint.SOFT,
+    "ytick.labelcolor": Paint.SOFT,
+    "figure.facecolor": Paint.CARD,  # the page's card, light on dark pages too, so that no frame shows
+    "savefig.facecolor": Paint.CARD,
+    "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
+}
+_STYLE: Final = """
+:root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;
+  --line: #d9dde3; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #f4f5f7; --line: #3a3f48; }
+}
+body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: var(--paper);
+  color: var(--ink); font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: 1.9rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 2.6rem 0 .4rem; }
+p { max-width: 46rem; margin: .4rem 0 1rem; } .lead, figcaption, .note { color: var(--soft); }
+figure { margin: 1rem 0 1.6rem; }
+.card { display: block; background: var(--card); border: 1px solid var(--line); border-radius: .6rem;
+  padding: .6rem; }
+img { display: block; max-width: 100%; max-height: 44rem; margin: 0 auto; }
+div.card img { max-height: none; }
+figcaption, .note { font-size: .92rem; margin-top: .4rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line); text-align: right; }
+th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
+@media print {
+  :root { color-scheme: light; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --line: #d9dde3; }
+  @page { margin: 14mm; }
+  body { max-width: none; padding: 0; font-size: .8rem; }
+  h2, h2 + p, tr:first-child { break-after: avoid; } figure, tr { break-inside: avoid; }
+}
+"""
+_Drawn = ParamSpec("_Drawn")
 
 
 def write_page(path: str | Path, thing: Any) -> None:
@@ -42,3 +109,106 @@ def write_page(path: str | Path, thing: Any) -> None:
         )
     module, _, name = target.partition(":")
     getattr(importlib.import_module(module), name)(Path(path), thing)
+
+
+def coordinates(point: Iterable[float], separator: str = " ") -> str:
+    """A point with two decimals."""
+    return separator.join(f"{round(float(one), 2) + 0.0:.2f}" for one in point)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One heading with the text, pictures and table below it."""
+
+    title: str
+    text: str
+    """HTML."""
+    pictures: Sequence[tuple[str, str]] = ()
+    """File beside the page, or the picture itself as a `data:` URI, and caption."""
+    table: Sequence[Sequence[str]] = ()
+    """Rows of cells, the header first."""
+    notes: Sequence[str] = ()
+
+
+def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead: str) -> None:
+    """Write a page of sections, with a title and the lead below it; it loads nothing from the network."""
+    body = "\n".join(_html(section) for section in sections)
+    page = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
+        f"{body}\n</body>\n</html>\n"
+    )
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, "utf-8", errors="replace")  # names of files need not be text
+
+
+def html_list(sentences: Sequence[str], kind: str = "ol") -> str:
+    """Sentences as an HTML list."""
+    return f"<{kind}>{''.join(f'<li>{escape(one)}</li>' for one in sentences)}</{kind}>"
+
+
+def _html(section: Section) -> str:
+    parts = [f"<h2>{escape(section.title)}</h2>", f"<p>{section.text}</p>"]
+    for file, caption in section.pictures:
+        name, text = escape(file), escape(caption)
+        image = f'<img src="{name}" alt="{text}">'
+        # Browsers refuse to open a data: URI from a link.
+        inside = name.startswith("data:")
+        card = f'<div class="card">{image}</div>' if inside else f'<a class="card" href="{name}">{image}</a>'
+        parts.append(f"<figure>{card}<figcaption>{text}</figcaption></figure>")
+    if section.table:
+        rows = [
+            f"<tr>{''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)}</tr>"
+            for row, tag in zip(section.table, ["th"] + ["td"] * (len(section.table) - 1), strict=True)
+        ]
+        parts.append("<table>\n" + "\n".join(rows) + "\n</table>")
+    parts += [f'<p class="note">{escape(note)}</p>' for note in section.notes]
+    return "\n".join(parts)
+
+
+def picture(
+    size: tuple[float, float],
+    draw: Callable[Concatenate[Figure, _Drawn], None],
+    *args: _Drawn.args,
+    **options: _Drawn.kwargs,
+) -> str:
+    """A figure of this size [inch], drawn by a function, as SVG in a `data:` URI.
+
+    The same numbers give the same bytes. matplotlib is imported here, and pyplot never.
+    """
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    drawn = io.BytesIO()
+    with style.context(["default", _PICTURES]):  # whatever the user's own settings are
+        figure = Figure(figsize=size, layout="constrained")
+        draw(figure, *args, **options)
+        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(drawn.getvalue()).decode()
+
+
+def color_scale(worst: float, best: float) -> ScalarMappable:
+    """Colors for numbers from the worst to the best; `to_rgba` gives the color of one."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colors = [Paint.WARM, Paint.AMBER, Paint.PALE, Paint.BLUE]
+    scale = LinearSegmentedColormap.from_list("scale", colors if worst < best else colors[::-1])
+    return ScalarMappable(Normalize(min(worst, best), max(worst, best)), scale)
+
+
+def color_bar(figure: Figure, colors: ScalarMappable, label: str, **place: Any) -> Axes:
+    """Draw the bar that explains colors, without an outline."""
+    bar = figure.colorbar(colors, **place)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
+    return bar.ax
+
+
+def annotate(
+    panel: Axes, text: str, point: tuple[float, float], shift: tuple[float, float], **style: Any
+) -> None:
+    """Write beside a point of a panel, shifted by some [points]."""
+    panel.annotate(text, point, shift, textcoords="offset points", **style)

@@ -166,11 +166,12 @@ def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | N
 
 
 def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None) -> Any:
-    """A value of one type; a path may be a string, and a function is anything that can be called."""
+    """A value of one type; a path may be a string, and a protocol is anything with its public members."""
     if kind is Path and isinstance(value, str):
         return Path(value)
     if getattr(kind, "_is_protocol", False):
-        if "__call__" in vars(kind) and not callable(value):
+        members = [name for name in vars(kind) if not name.startswith("_")] or ["__call__"]
+        if not all(hasattr(value, member) for member in members):
             raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
     elif isinstance(kind, type) and get_origin(kind) is None:
         check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())

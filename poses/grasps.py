@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handsim._checks import check_array, check_choice
-from handsim.errors import ArgumentError, PoseError
+from handsim._checks import check_choice
+from handsim.errors import PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
 from handsim.hand.shape import (
@@ -24,7 +24,6 @@ from handsim.hand.shape import (
     DIGITS,
     JOINTS,
     NUM_JOINTS,
-    NUM_QPOS,
     PALM,
     bones_of,
     shape_from_measures,
@@ -53,14 +52,6 @@ _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting
 _CONTACT_TIME: Final = (0.005, 1.0)
 _GUIDE_TIME: Final = (0.03, 1.0)  # of a soft constraint that holds the object while fingers close
 _FAR: Final = 0.5  # [m], beyond which distances are not needed
-_GEOMS: Final = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
-}
 
 
 class GraspScene:
@@ -134,13 +125,9 @@ def object_penetration(
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch."""
-    qpos = check_array("qpos", qpos, (None, NUM_QPOS))
-    poses = check_array("T_world_object", T_world_object, (None, 4, 4))
-    if len(qpos) != len(poses):
-        raise ArgumentError(
-            f"qpos has {len(qpos)} frames and T_world_object {len(poses)}, expected equal numbers"
-        )
-    return grasp_scene(model, obj).depth(qpos[:, 7:], np.linalg.inv(pose_matrices(qpos[:, :7])) @ poses)
+    return grasp_scene(model, obj).depth(
+        qpos[:, 7:], np.linalg.inv(pose_matrices(qpos[:, :7])) @ T_world_object
+    )
 
 
 def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
@@ -179,7 +166,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
     for number, part in enumerate(obj.parts):
         geom = body.add_geom(
             name=f"object_{number}",
-            type=_GEOMS[part.kind],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}"),
             pos=part.T_object_part[:3, 3],
             quat=rotation_quaternions(part.T_object_part[None, :3, :3])[0],
             condim=4,

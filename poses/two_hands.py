@@ -11,8 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handsim._checks import check_choice
-from handsim.errors import ArgumentError, PoseError
+from handsim.errors import PoseError
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, HandMotion, join_qpos
@@ -100,14 +99,6 @@ def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> 
     low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
     share = (beats - low)[:, None]
     return np.asarray(keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low]))
-
-
-def check_names(names: tuple[str, ...]) -> None:
-    """Raise an `ArgumentError` that lists the valid names when one is unknown, or when there is none."""
-    if not names:
-        raise ArgumentError(f"no interactions were named; valid names: {', '.join(INTERACTIONS)}")
-    for name in names:
-        check_choice(name, INTERACTIONS, noun="interaction")
 
 
 def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
@@ -473,10 +464,6 @@ def sample_two_hand_motion(
     another person's.
     """
     names = INTERACTIONS if interactions is None else tuple(interactions)
-    check_names(names)
-    _check_sides(right, left)
-    if not 0.0 < duration < np.inf:
-        raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
     frames = round(duration * RATE) + 1
     passages = _next_passages(right, left, None, names, pause, rng=rng)
     while sum(map(len, passages)) < frames:
@@ -490,9 +477,6 @@ def sample_two_hand_poses(
     right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
     """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid."""
-    _check_sides(right, left)
-    if count < 1:
-        raise ArgumentError(f"the count of poses is {count}, expected a positive number")
     passages: list[Passage] = []
     missing = count
     for _ in range(_MOST_DRAWS):
@@ -557,16 +541,6 @@ def _in_world(
     return (
         join_qpos(whole.right, position=middle - across, quaternion=rotation_quaternions(rotations)),
         join_qpos(
-            whole.left,
-            position=middle + across,
-            quaternion=rotation_quaternions(rotations @ whole.rotation),
+            whole.left, position=middle + across, quaternion=rotation_quaternions(rotations @ whole.rotation)
         ),
     )
-
-
-def _check_sides(right: HandModel, left: HandModel) -> None:
-    sides = right.shape.side, left.shape.side
-    if sides != ("right", "left"):
-        raise ArgumentError(
-            f"the hands are a {sides[0]} and a {sides[1]} one, expected a right and a left one"
-        )

@@ -37,7 +37,7 @@ from render.depth_sensor import sample_depth_noise
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
-from render.formats.writer import CONFIG, FORMATS, NEED_COLORS, format_folder, open_writer
+from render.formats.writer import CONFIG, FORMATS, WRITERS, format_folder, open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import enclose, photo_files
@@ -96,6 +96,8 @@ def configured(
     config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
 ) -> RenderConfig:
     """A configuration with the camera and the settings that were named beside it."""
+    config = RenderConfig() if config is None else config
+    check_type("config", config, RenderConfig, "a RenderConfig")
     config = RenderConfig.of(config, settings)
     if camera is None:
         return config
@@ -293,7 +295,7 @@ def render_take(
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
     cameras = drawing.viewpoints.cameras(0)
     check_names("cameras", cameras)
-    for one in cameras if {"freihand", "interhand"} & set(formats) else ():
+    for one in cameras if not all(WRITERS[name].any_lens for name in formats) else ():
         centered_K(one)  # refuses other lenses before a folder is begun
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
@@ -434,7 +436,7 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
         check_type("a format", name, str, "its name", FORMATS)
         check_choice(name, FORMATS, noun="format", error=HandSimError)
-        if name in NEED_COLORS and "rgb" not in config.passes:
+        if WRITERS[name].needs_colors and "rgb" not in config.passes:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")

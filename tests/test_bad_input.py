@@ -19,7 +19,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import load_layout
 from gloves.takes.archives import write_archive
-from handsim.app import progress
+from handsim.app import messages
 from handsim.cli.main import main
 from train.simulation.takes import simulate_take
 
@@ -212,7 +212,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_mistake_is_one_sentence(name, folder, capsys, monkeypatch):
     # However slow the machine is, no line of progress comes before the sentence.
-    monkeypatch.setattr(progress, "_lines", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(messages, "_lines", lambda *_: contextlib.nullcontext())
     before = {path.name for path in folder.iterdir()}
     assert main(CASES[name]) == 1
     said = capsys.readouterr().err

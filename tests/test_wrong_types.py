@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -12,8 +13,6 @@ import pytest
 from gloves import Capture
 from handsim import HandModel, HandSimError
 from train import Corruption
-from train.simulation.takes import SimulateSettings
-from train.simulation.training_frames import GenerateSettings
 
 PACKAGES = ("handsim", "poses", "gloves", "train")
 WRONG = (5, None, [1, 2], {"a": 1}, object(), 2.5, "no such thing", b"bytes", HandSimError)
@@ -51,8 +50,6 @@ VALID: dict[str, dict[str, object]] = {
     "train.train_labeler": {"dataset": "set", "out": "run"},
 }  # fmt: skip
 """Public functions with arguments that would do; each is then exchanged for wrong ones."""
-SETTINGS = {"train.generate_dataset": GenerateSettings, "train.simulate_take": SimulateSettings}
-"""What the options of functions are."""
 
 
 def functions() -> dict[str, object]:
@@ -81,8 +78,7 @@ CASES = [
 def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     function = functions()[name]
-    parameters = inspect.signature(function).parameters
-    default = parameters[argument].default if argument in parameters else usual(name, argument)
+    default = default_of(function, argument)
     if wrong is default or (wrong is None and default is None):
         pytest.skip("the default")
     if is_right(name, argument, wrong):
@@ -94,10 +90,13 @@ def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, m
     assert not list(tmp_path.iterdir()), "nothing is written"
 
 
-def usual(name, argument):
-    """The default of a setting, which is one of the function's options."""
-    (field,) = [field for field in dataclasses.fields(SETTINGS[name]) if field.name == argument]
-    return field.default
+def default_of(function, argument: str) -> object:
+    """The default of an argument, or of the field of settings that it stands for."""
+    parameters = inspect.signature(function).parameters
+    if argument in parameters:
+        return parameters[argument].default
+    settings, _ = get_args(get_type_hints(function)["settings"])
+    return next(field.default for field in dataclasses.fields(settings) if field.name == argument)
 
 
 def is_right(name, argument, wrong) -> bool:

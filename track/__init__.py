@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from track.frames import TrackedBody as TrackedBody
     from track.frames import TrackedFrame as TrackedFrame
     from track.frames import TrackedHand as TrackedHand
-    from track.glove_advice.improvement import Worth as Worth
-    from track.glove_advice.improving import ImprovedGlove as ImprovedGlove
-    from track.glove_advice.improving import improve_glove as improve_glove
-    from track.glove_advice.layout_score import LayoutScore as LayoutScore
-    from track.glove_advice.scoring import score_glove as score_glove
-    from track.glove_advice.trials import Trial as Trial
+    from track.glove_improvement import ImprovedGlove as ImprovedGlove
+    from track.glove_improvement import Worth as Worth
+    from track.glove_improvement import improve_glove as improve_glove
+    from track.glove_score import LayoutScore as LayoutScore
+    from track.glove_score import Trial as Trial
+    from track.glove_score import score_glove as score_glove
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.live_message import LiveBody as LiveBody
@@ -58,5 +58,7 @@ if TYPE_CHECKING:
     from track.tracker import Tracker as Tracker
     from track.user import User as User
     from track.user import load_user as load_user
+    from train.forecast.settings import ImproveGloveSettings as ImproveGloveSettings
+    from train.forecast.settings import ScoreGloveSettings as ScoreGloveSettings
 
 __getattr__, __dir__ = lazy_exports(__name__)

@@ -5,24 +5,27 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
+from rich.console import Console
 
+from gloves.fit import GloveFit
 from gloves.takes.archives import check_unused, growing_path
-from gloves.takes.take import Take
+from gloves.takes.take import Take, load_take
 from handsim.app.messages import LiveStatus
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
 from track.frames import FARTHEST, StreamedFrame, TrackedFrame
 from track.recorder import Recorder
+from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
-from track.sinks import SinkGroup
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
+from track.tracker import warm_up
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them
@@ -47,74 +50,129 @@ _OF_THEM: Final = {
 """Counts of some of them, in words."""
 
 
-class _Now:
-    """How far a stream is kept up with: its rate, lags and what was dropped in the last second."""
+class FrameOutput(Protocol):
+    """Takes tracked frames somewhere as they are made: a `SinkGroup`, or a page that shows them."""
 
-    def __init__(self) -> None:
-        self.lags: deque[float] = deque(maxlen=_LAGS)
-        """From the arrival of each frame to its output [s], once it was caught up with the stream."""
-        self.first_lags: list[float] = []
-        """Those before: of frames that came while hands were measured."""
-        self._begin, self._received, self._dropped = monotonic(), 0, 0
-        self._words = ""
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames that were dropped, by where they should have gone."""
 
-    def add(self, frame: StreamedFrame, forgiven_until: float) -> None:
-        """Take on a frame that has been sent on; until some time [s] a lag is that of the start."""
-        if frame.silent:
-            return
-        now = monotonic()
-        lag = now - frame.arrived
-        if not self.lags and lag > MOST_LAG and now < forgiven_until:
-            self.first_lags.append(lag)
-        else:
-            self.lags.append(lag)
+    def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
+        """Take on the tracker's hands and bodies."""
 
-    def tick(self, counts: dict[str, int]) -> bool:
-        """Once a second sum up what became of it; returns whether frames were dropped."""
-        now = monotonic()
-        span = now - self._begin
-        if span < _TOLD:
-            return False
-        received = counts["received_frames"] - self._received
-        dropped = counts["dropped_frames"] - self._dropped
-        newest = [*self.first_lags, *self.lags][-max(received, 1) :]
-        lag = float(np.median(newest)) if newest else 0.0
-        share = f"{100.0 * dropped / max(received, dropped, 1):.0f} % dropped, " if dropped else ""
-        self._words = f"{received / span:.0f} Hz, {share}{1e3 * lag:.0f} ms behind"
-        self._begin, self._received, self._dropped = now, counts["received_frames"], counts["dropped_frames"]
-        return dropped > 0
+    def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Take a frame, without waiting."""
 
-    def __str__(self) -> str:
-        """The last second in words; empty before."""
-        return self._words
+    def notes(self) -> tuple[str, ...]:
+        """What to print at the end, one line each."""
 
 
 class LiveTake(NamedTuple):
-    """What was recorded of a stream."""
+    """What was tracked of a stream."""
 
-    take: Take
-    """The take; of a long stream, parts of it."""
+    take: Take | None
+    """The take; of a long stream, parts of it; None where nothing was recorded."""
     num_frames: int
     """Number of all frames."""
     notes: tuple[str, ...]
-    """What is to be told, one line each."""
+    """What to print at the end, one line each."""
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether `take` is all of it."""
-        return self.take.num_frames == self.num_frames
+    def whole_take(self, path: Path) -> Take:
+        """All of a take that was recorded; that of a long stream is read from its file."""
+        take = self.take
+        return load_take(path) if take is None or take.num_frames < self.num_frames else take
 
 
-def measured_setup(
-    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, *, seconds: float | None = None
-) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
-    """The setup with the hands as measured in the first frames of a stream, and all its frames.
+def track_live(
+    address: str,
+    setup: TrackerSetup,
+    outputs: Sequence[FrameOutput] = (),
+    *,
+    out: Path | None = None,
+    seconds: float | None = None,
+    on_frame: OnFrame = lambda frame, tracked: None,
+) -> LiveTake:
+    """Track a stream, and record it, until time is up, the stream ends, or a signal ends it.
+
+    At the first signal the take is written, without the frames that still wait. The recording is kept as it
+    is at the second one.
 
     Args:
-        setup: What the tracker is made of; a stream is not waited for if its hands are known.
-        status: Says what is waited for.
-        seconds: How long to wait [s], ten seconds at most.
+        address: The stream, see `open_source`.
+        setup: What the tracker is made of; its hands may be measured in the first second.
+        outputs: Take every frame before it is recorded.
+        out: The take's file, beside which the recording is until its end; nothing is recorded when None.
+        seconds: How long to track [s], by this machine's clock from the first frame's arrival; None for as
+            long as frames come.
+        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
+
+    Raises:
+        CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
+        Stopped: A signal came before the tracking began, or a second one after that.
     """
+    if out is not None:
+        check_unused(growing_path(out))
+    with Console(stderr=True).status("getting ready"):
+        warm_up(setup.user, setup.labeler)
+    until = math.inf  # [s], when it is over by this machine's clock
+    interrupted = InterruptFlag()
+    with (
+        open_source(address, ended=lambda: interrupted() or monotonic() >= until) as stream,
+        LiveStatus() as status,
+        ExitStack() as stack,
+    ):
+        setup, frames = _measured_setup(stream, setup, status, seconds)
+        tracker = setup.tracker()
+        for output in outputs:
+            output.start(tracker.hands, tracker.bodies)
+        stack.enter_context(interrupt_flag(interrupted))  # from here on the frames so far are kept
+        recorder = None
+        if out is not None:
+            recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
+            stack.enter_context(_recording_kept(recorder))
+            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+        status.show("waiting for the first frame")
+        pace, asked, count = _Pace(), False, 0
+        for frame in frames:
+            if seconds is not None and not frame.silent:
+                until = min(until, frame.arrived + seconds)
+            if interrupted() or frame.arrived > until:
+                break
+            tracked = tracker.step(frame.points, frame.ids, frame.time)
+            for output in outputs:
+                output.send(frame, tracked)
+            pace.add(frame, stream.forgiven_until)
+            if recorder is not None:
+                recorder.add(frame, tracked)
+            count += not frame.silent
+            on_frame(frame, tracked)
+            dropping = pace.tick(stream.counts)
+            if frame.silent or dropping or status.due:
+                unsent = sum(sum(output.counts.values()) for output in outputs)
+                line = _status_line(frame, tracked, stream.counts, unsent, pace)
+                status.show(line, now=frame.silent or dropping)
+            if not asked and (doubt := _unit_doubt(stream)):
+                asked = True
+                status.say(doubt)
+        stream.end(until)
+        counts, take, step = stream.counts, None, 1
+        if recorder is not None:
+            status.show(f"writing {out}", now=True)
+            kept = f"writing {out}; {recorder.part} is kept until then"
+            take, step = recorder.finish(counts, told=lambda: status.show(kept))
+    after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
+    counts["frames_after_end"] = max(0, after - count)
+    notes = [*_notes(counts, step, pace, stream.order.interval)]
+    for output in outputs:
+        notes += output.notes()
+    doubt = _unit_doubt(stream)
+    return LiveTake(take, count, (*notes, doubt) if doubt else tuple(notes))
+
+
+def _measured_setup(
+    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None
+) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
+    """The setup with the hands as measured in the first frames of a stream, and all its frames."""
     gc.freeze()  # to look through all that was loaded took the collector a quarter of a second now and then
     if not setup.is_auto:
         stream.forgive()
@@ -123,94 +181,6 @@ def measured_setup(
     setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
     status.say(f"size of the hands: {setup.user}")
     return setup, _first_and_others(first, stream)
-
-
-@contextmanager
-def recording_kept(recorder: Recorder) -> Iterator[None]:
-    """An interrupt that ends the block closes the recording as it is, and says where it is kept."""
-    try:
-        with interrupts_bare():
-            yield
-    except KeyboardInterrupt as stop:
-        recorder.close()
-        raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
-
-
-def track_live(
-    address: str,
-    out: Path,
-    setup: TrackerSetup,
-    *,
-    seconds: float | None = None,
-    sinks: SinkGroup,
-    on_frame: OnFrame,
-) -> LiveTake:
-    """Track and record a stream until time is up, the stream ends, or a signal ends it.
-
-    At the first signal the take is written, without the frames that still wait. The recording is kept as it
-    is at the second one.
-
-    Args:
-        address: The stream, see `open_source`.
-        out: The take's file; until its end the recording is beside it.
-        setup: What the tracker is made of; its hands may be measured in the first second.
-        seconds: How long to record [s], by this machine's clock from the first frame's arrival; None for as
-            long as it comes.
-        sinks: Take every frame before it is recorded.
-        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
-
-    Raises:
-        CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
-        Stopped: A signal came before the recording began, or a second one after that.
-    """
-    check_unused(growing_path(out))
-    until = [math.inf]  # [s], when it is over by this machine's clock
-    interrupted = InterruptFlag()
-
-    def over() -> bool:
-        return interrupted() or monotonic() >= until[0]
-
-    with open_source(address, ended=over) as stream, LiveStatus() as status:
-        setup, frames = measured_setup(stream, setup, status, seconds=seconds)
-        tracker = setup.tracker()
-        sinks.start(tracker.hands, tracker.bodies)
-        with (
-            interrupt_flag(interrupted),  # the frames so far are kept
-            Recorder(out, tracker, {"capture": address, **setup.settings}) as recorder,
-            recording_kept(recorder),
-        ):
-            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
-            status.show("waiting for the first frame")
-            kept_up, asked = _Now(), False
-            for frame in frames:
-                if seconds is not None and not frame.silent:
-                    until[0] = min(until[0], frame.arrived + seconds)
-                if interrupted() or frame.arrived > until[0]:
-                    break
-                tracked = tracker.step(frame.points, frame.ids, frame.time)
-                sinks.send(frame, tracked)
-                kept_up.add(frame, stream.forgiven_until)
-                recorder.add(frame, tracked)
-                on_frame(frame, tracked)
-                dropping = kept_up.tick(stream.counts)
-                if frame.silent or dropping or status.due:
-                    line = _status_line(frame, tracked, stream.counts, sinks.counts, kept_up)
-                    status.show(line, now=frame.silent or dropping)
-                if not asked and (doubt := _unit_doubt(stream)):
-                    asked = True
-                    status.say(doubt)
-            stream.end(until[0])
-            counts = stream.counts
-            status.show(f"writing {out}", now=True)
-            take, step = recorder.finish(
-                counts,
-                told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
-            )
-        after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
-        counts["frames_after_end"] = max(0, after - recorder.num_frames)
-        notes = (*_notes(counts, step, kept_up, stream.order.interval), *sinks.notes())
-        doubt = _unit_doubt(stream)
-        return LiveTake(take, recorder.num_frames, (*notes, doubt) if doubt else notes)
 
 
 def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterator[StreamedFrame]:
@@ -242,37 +212,81 @@ def _first_frames(
     return frames
 
 
-def _notes(counts: dict[str, int], step: int, now: _Now, interval: float) -> tuple[str, ...]:
-    """What is to be told of a stream at its end; `interval` is from frame to frame [s]."""
+@contextmanager
+def _recording_kept(recorder: Recorder) -> Iterator[None]:
+    """An interrupt that ends the block closes the recording as it is, and says where it is kept."""
+    try:
+        with interrupts_bare():
+            yield
+    except KeyboardInterrupt as stop:
+        recorder.close()
+        raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
+
+
+class _Pace:
+    """How far a stream is kept up with: its rate, lags and what was dropped in the last second."""
+
+    def __init__(self) -> None:
+        self.lags: deque[float] = deque(maxlen=_LAGS)
+        """From the arrival of each frame to its output [s], once it was caught up with the stream."""
+        self.first_lags: list[float] = []
+        """Those before: of frames that came while hands were measured."""
+        self.words = ""
+        """The last second in words; empty before."""
+        self._begin, self._received, self._dropped = monotonic(), 0, 0
+
+    def add(self, frame: StreamedFrame, forgiven_until: float) -> None:
+        """Take on a frame that has been sent on; before `forgiven_until` its lag counts as start-up lag."""
+        if frame.silent:
+            return
+        now = monotonic()
+        lag = now - frame.arrived
+        is_first = not self.lags and lag > MOST_LAG and now < forgiven_until
+        (self.first_lags if is_first else self.lags).append(lag)
+
+    def tick(self, counts: dict[str, int]) -> bool:
+        """Once a second sum up what became of it; returns whether frames were dropped."""
+        now = monotonic()
+        span = now - self._begin
+        if span < _TOLD:
+            return False
+        received = counts["received_frames"] - self._received
+        dropped = counts["dropped_frames"] - self._dropped
+        newest = [*self.first_lags, *self.lags][-max(received, 1) :]
+        lag = float(np.median(newest)) if newest else 0.0
+        share = f"{100.0 * dropped / max(received, dropped, 1):.0f} % dropped, " if dropped else ""
+        self.words = f"{received / span:.0f} Hz, {share}{1e3 * lag:.0f} ms behind"
+        self._begin, self._received, self._dropped = now, counts["received_frames"], counts["dropped_frames"]
+        return dropped > 0
+
+
+def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> Iterator[str]:
+    """What to print of a stream at its end; `interval` is from frame to frame [s]."""
     told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
     others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
     others = f" ({others})" if others else ""
-    notes = [
-        f"{counts['received_frames']} frames received: {told}{others}; {counts['missing_frames']} missing"
-    ]
-    if now.lags:
-        median, late, most = 1e3 * np.percentile(now.lags, [50, 99, 100])
-        notes.append(
+    yield f"{counts['received_frames']} frames received: {told}{others}; {counts['missing_frames']} missing"
+    if pace.lags:
+        median, late, most = 1e3 * np.percentile(pace.lags, [50, 99, 100])
+        yield (
             f"output {median:.0f} ms behind the arrival of frames (median), {late:.0f} ms in the worst "
             f"hundredth, {most:.0f} ms at most"
         )
-    if now.first_lags:
-        notes.append(
-            f"the first {len(now.first_lags)} frames, which came while hands were measured, were up to "
-            f"{max(now.first_lags):.1f} s behind"
+    if pace.first_lags:
+        yield (
+            f"the first {len(pace.first_lags)} frames, which came while hands were measured, were up to "
+            f"{max(pace.first_lags):.1f} s behind"
         )
-    if counts["missing_at_end"]:
-        lacking = counts["missing_at_end"]
+    if lacking := counts["missing_at_end"]:
         quiet = f"no frame came in the last {lacking * interval:.2f} s"
-        notes.append(f"{quiet}, in which {lacking} could have been sent")
+        yield f"{quiet}, in which {lacking} could have been sent"
     packets = [f"{counts[name]} {what}" for name, what in _PACKETS.items() if counts.get(name)]
     if packets:
-        notes.append(f"packets left out: {', '.join(packets)}")
-    if counts.get("restarts"):
-        notes.append(f"the time of the stream began anew {counts['restarts']} times")
+        yield f"packets left out: {', '.join(packets)}"
+    if counts["restarts"]:
+        yield f"the time of the stream began anew {counts['restarts']} times"
     if step > 1:
-        notes.append(f"the following figures are of one half second in {step}")
-    return tuple(notes)
+        yield f"the following figures are of one half second in {step}"
 
 
 def _unit_doubt(stream: LiveStream) -> str:
@@ -286,11 +300,7 @@ def _unit_doubt(stream: LiveStream) -> str:
 
 
 def _status_line(
-    frame: StreamedFrame,
-    tracked: TrackedFrame,
-    counts: dict[str, int],
-    dropped: dict[str, int],
-    now: _Now,
+    frame: StreamedFrame, tracked: TrackedFrame, counts: dict[str, int], unsent: int, pace: _Pace
 ) -> str:
     """Status of a live stream, in one line."""
     if frame.silent:
@@ -301,15 +311,13 @@ def _status_line(
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]
     words += [f"RMS {1e3 * max(rms):.1f} mm"] if rms else []
-    words += [str(now)] if str(now) else []
-    left_out = sum(
-        counts.get(name, 0) for name in ("late_frames", "frames_with_wild_times", "damaged_packets")
-    )
-    for count, what in (
-        (counts.get("missing_frames", 0), "missing"),
-        (counts.get("dropped_frames", 0), "dropped"),
+    words += [pace.words] if pace.words else []
+    left_out = counts["late_frames"] + counts["frames_with_wild_times"] + counts.get("damaged_packets", 0)
+    for number, what in (
+        (counts["missing_frames"], "missing"),
+        (counts["dropped_frames"], "dropped"),
         (left_out, "left out"),
-        (sum(dropped.values()), "not sent"),
+        (unsent, "not sent"),
     ):
-        words += [f"{count} {what}"] if count else []
+        words += [f"{number} {what}"] if number else []
     return f"frame {frame.number}: {', '.join(words)}; Ctrl-C ends it"

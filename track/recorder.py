@@ -13,7 +13,6 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
-from jaxtyping import Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
@@ -36,7 +35,7 @@ from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
-_MOST_ID: Final = (1 << 31) - 1  # as takes store them
+_MOST_ID: Final = (1 << 31) - 1  # as takes store them; of larger IDs the last 31 bits
 
 
 class TakeRecorder:
@@ -59,15 +58,10 @@ class TakeRecorder:
             self._rows.append(frame_values(frame, tracked))
 
     def take(self, capture: Capture | None = None) -> Take:
-        """The take so far, with the columns and the rate of its capture; of a stream, with the median rate.
-
-        Raises:
-            CaptureError: There are too few frames to determine the rate of a stream.
-        """
-        rows = self._rows
-        if not rows or (capture is None and len(rows) < 2):
-            raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=self._settings)
+        """The take so far, with columns and rate of its capture; of a stream, with the median rate."""
+        if not self._rows or (capture is None and len(self._rows) < 2):
+            raise CaptureError(f"{len(self._rows)} frames came, expected two or more")
+        return Take.of_frames(self._rows, self._hands, self._bodies, capture=capture, settings=self._settings)
 
 
 def settings_of(tracker: Tracker) -> dict[str, Any]:
@@ -77,7 +71,7 @@ def settings_of(tracker: Tracker) -> dict[str, Any]:
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
+    """A frame's rows of the arrays of a take, by their names; those of points have N rows."""
     hands, bodies = tracked.hands, tracked.bodies
     poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
     return {
@@ -92,17 +86,10 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "body_status": np.array([body.status for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
         "points": frame.points,
-        "ids": _short_ids(frame.ids),
+        "ids": np.where(frame.ids < 0, -1, frame.ids & _MOST_ID).astype(np.int32),
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
-
-
-def _short_ids(ids: Int[np.ndarray, "N"]) -> NDArray[np.int32]:
-    """IDs as a take stores them; those beyond 31 bits keep their last ones."""
-    if ids.max(initial=0) > _MOST_ID:
-        ids = np.where(ids < 0, -1, ids & _MOST_ID)
-    return ids.astype(np.int32)
 
 
 class Recorder:

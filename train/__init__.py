@@ -21,23 +21,28 @@ if TYPE_CHECKING:
     from train.data.shards import MappedRows as MappedRows
     from train.evaluation import LabelingReport as LabelingReport
     from train.evaluation import evaluate_labeler as evaluate_labeler
+    from train.forecast.rig_forecast import CameraLoss as CameraLoss
+    from train.forecast.rig_forecast import ErrorEllipsoid as ErrorEllipsoid
+    from train.forecast.rig_forecast import Forecast as Forecast
+    from train.forecast.rig_plan import RigPlan as RigPlan
+    from train.forecast.rig_plan import plan_rig as plan_rig
+    from train.forecast.rig_score import RigScore as RigScore
+    from train.forecast.rig_score import VolumeMap as VolumeMap
+    from train.forecast.rig_score import score_rig as score_rig
+    from train.forecast.settings import PlanRigSettings as PlanRigSettings
+    from train.forecast.settings import ScoreRigSettings as ScoreRigSettings
     from train.labelers.protocol import Labeler as Labeler
     from train.labelers.protocol import Labeling as Labeling
     from train.labelers.storage import load_labeler as load_labeler
     from train.loop import train_labeler as train_labeler
-    from train.rig_advice.forecast import CameraLoss as CameraLoss
-    from train.rig_advice.forecast import ErrorEllipsoid as ErrorEllipsoid
-    from train.rig_advice.forecast import Forecast as Forecast
-    from train.rig_advice.planning import RigPlan as RigPlan
-    from train.rig_advice.planning import plan_rig as plan_rig
-    from train.rig_advice.rig_score import RigScore as RigScore
-    from train.rig_advice.rig_score import VolumeMap as VolumeMap
-    from train.rig_advice.scoring import score_rig as score_rig
     from train.settings import CNNConfig as CNNConfig
+    from train.settings import EvaluateSettings as EvaluateSettings
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
+    from train.simulation.takes import SimulateSettings as SimulateSettings
     from train.simulation.takes import simulate_take as simulate_take
+    from train.simulation.training_frames import GenerateSettings as GenerateSettings
 
 __getattr__, __dir__ = lazy_exports(__name__)
 

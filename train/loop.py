@@ -36,8 +36,8 @@ from train.data.batches import (
     right_hands,
 )
 from train.data.shards import Dataset, Manifest, MappedRows, load_dataset
-from train.devices import lost_peers_told, start_fabric
 from train.evaluation import History, LabelingReport, evaluate_markers, paper_report
+from train.fabric import lost_peers_told, start_fabric
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.networks import (
@@ -51,9 +51,8 @@ from train.labelers.networks import (
 from train.labelers.pose_prior import learn_pose_prior
 from train.labelers.protocol import MOST_THREADS, Labeling, torch_threads
 from train.labelers.storage import save_network
-from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
-from train.reports.run_page import write_run_page
-from train.settings import CNNConfig, Kind, TrainSettings, train_settings
+from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_page
+from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
 _SETTINGS: Final = "train.json"
@@ -192,7 +191,7 @@ class _Run:
         A step is made whole or not at all. Of several processes all end after the same one.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
-        recipe = settings.batch_recipe(len(self.manifest.marker_names))
+        recipe = batch_recipe(settings, len(self.manifest.marker_names))
         saved, flag = time.monotonic(), InterruptFlag()
         with nullcontext() if alone else interrupt_flag(flag, again=False):
             while self._is_unfinished(on_step):

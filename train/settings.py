@@ -116,12 +116,6 @@ class TrainSettings(Settings):
         """The settings of the network of this kind."""
         return self.cnn if self.labeler == "cnn" else self.network
 
-    def batch_recipe(self, num_markers: int) -> BatchRecipe:
-        """How batches are drawn for a layout of this many markers."""
-        occlude = paper_corruption(num_markers).occlude if self.occlude is None else self.occlude
-        corruption = Corruption(occlude, self.ghosts) if self.corruption is None else self.corruption
-        return BatchRecipe(self.batch, corruption, self.jitter, self.rig_share, self.anisotropy)
-
     def for_set(self, num_markers: int, num_frames: int) -> TrainSettings:
         """The same settings for a training set of this size."""
         return dataclasses.replace(
@@ -130,6 +124,14 @@ class TrainSettings(Settings):
             network=dataclasses.replace(self.network, num_labels=num_markers),
             cnn=dataclasses.replace(self.cnn, num_labels=num_markers),
         )
+
+
+def batch_recipe(settings: TrainSettings, num_markers: int) -> BatchRecipe:
+    """How batches are drawn for a layout of this many markers."""
+    occlude = paper_corruption(num_markers).occlude if settings.occlude is None else settings.occlude
+    own = settings.corruption
+    corruption = Corruption(occlude, settings.ghosts) if own is None else own
+    return BatchRecipe(settings.batch, corruption, settings.jitter, settings.rig_share, settings.anisotropy)
 
 
 def usual_settings(labeler: Kind = "set", preset: Preset | None = None) -> TrainSettings:

@@ -19,7 +19,7 @@ from benchmarks.record import Figures, save_figures
 from gloves.captures.capture import count_gaps, run_lengths
 from gloves.captures.formats import find_captures, read_markers
 from gloves.takes.take import Take
-from handsim.app.progress import progress_bar
+from handsim.app.messages import progress_bar
 from handsim.errors import HandSimError
 from train.data.batches import Corruption, paper_corruption
 from train.data.shards import Dataset

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
+BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
-_BLOCK: Final = 512
 _GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # which say where points are; damage to others does not matter
 _MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
 _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
@@ -103,7 +103,7 @@ def _walk(
     groups: dict[int, str] = {}
     found: list[tuple[int, str, memoryview]] = []
     view = memoryview(data)
-    points_at = (int.from_bytes(data[16:18], order) - 1) * _BLOCK
+    points_at = (int.from_bytes(data[16:18], order) - 1) * BLOCK
     end = points_at if points_at > at else len(data)  # of the section
     while at + 2 <= len(data):
         name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
@@ -162,7 +162,6 @@ def _text(raw: bytes) -> str:
         return raw.decode("latin-1")
 
 
-BLOCK: Final = 512
 MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
 _MOST_FILLING: Final = 2 * BLOCK  # bytes behind the last frame
 _SAME_SCALE: Final = 1e-3  # by which the two scales of a file may differ, of themselves

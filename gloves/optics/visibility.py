@@ -9,8 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError
 from handsim.hand.capsules import bounding_spheres
 from handsim.hand.shape import named_shape
 from handsim.hand.skin import build_surface
@@ -141,18 +139,7 @@ class MeshTree:
     """
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
-        self.vertices: NDArray[np.float64] = np.ascontiguousarray(
-            check_array("vertices", vertices, (None, 3))
-        )
-        faces = np.asarray(faces)
-        if self.vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise ArgumentError(
-                f"vertices {self.vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)"
-            )
-        if faces.min() < 0 or faces.max() >= len(self.vertices):
-            raise ArgumentError(
-                f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
-            )
+        self.vertices: NDArray[np.float64] = np.ascontiguousarray(vertices, dtype=np.float64)
         corners = self.vertices[faces]
         order, self.first, self.skip = _build(corners.min(axis=1), corners.max(axis=1))
         self.faces: NDArray[np.int32] = np.ascontiguousarray(faces[order], dtype=np.int32)
@@ -261,16 +248,10 @@ def clear_of_mesh(
     A line that starts inside a closed mesh is not clear. NaN points are never clear. Points [m] are one for
     all cameras, or one for each. Lines that are not needed cost nothing and count as not clear.
     """
-    vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-    starts, ends = _check_lines(points, cameras, needed)
-    expected_shape = (len(needed), *tree.vertices.shape)
-    if vertices.shape != expected_shape:
-        raise ArgumentError(f"vertices has shape {vertices.shape}, expected {expected_shape}")
-    if not np.isfinite(vertices.sum()):
-        raise ArgumentError("vertices holds NaN or infinite values, expected finite numbers")
     nodes, spots = (tree.faces, tree.first, tree.skip), (tree.spots, tree.spots_start)
-    lines = (starts, ends[None], np.asarray(needed, dtype=np.bool_))
-    return np.asarray(clear_lines(vertices, lines, nodes, spots, np.empty_like(tree.boxes)))
+    lines = (_starts(points), np.ascontiguousarray(cameras)[None], needed)
+    mesh = np.ascontiguousarray(vertices, dtype=np.float64)
+    return np.asarray(clear_lines(mesh, lines, nodes, spots, np.empty_like(tree.boxes)))
 
 
 def clear_of_body(
@@ -281,31 +262,17 @@ def clear_of_body(
     needed: Bool[np.ndarray, "T P C"],
 ) -> Bool[np.ndarray, "T P C"]:
     """`clear_of_mesh` for a rigid body: lines are transformed into its frame, the tree is used as built."""
-    poses = check_array("T_world_body", T_world_body, (len(needed), 4, 4))
-    starts, ends = _check_lines(points, cameras, needed)
-    rotations, positions = poses[:, :3, :3], poses[:, None, :3, 3]
-    if not np.allclose(rotations.transpose(0, 2, 1) @ rotations, np.eye(3), atol=1e-6):
-        raise ArgumentError("T_world_body scales or shears, expected rotations and translations alone")
-    starts = np.ascontiguousarray((starts - positions[:, None]) @ rotations[:, None])
-    ends = np.ascontiguousarray((ends - positions) @ rotations)
+    rotations, positions = T_world_body[:, :3, :3], T_world_body[:, None, :3, 3]
+    starts = np.ascontiguousarray((_starts(points) - positions[:, None]) @ rotations[:, None])
+    ends = np.ascontiguousarray((cameras - positions) @ rotations)
     nodes, no_refit = (tree.faces, tree.first, tree.skip), (tree.spots[:0], tree.spots_start)
-    lines = (starts, ends, np.asarray(needed, dtype=np.bool_))
-    return np.asarray(clear_lines(tree.vertices[None], lines, nodes, no_refit, tree.boxes))
+    return np.asarray(clear_lines(tree.vertices[None], (starts, ends, needed), nodes, no_refit, tree.boxes))
 
 
-def _check_lines(
-    points: NDArray[np.float64], cameras: NDArray[np.float64], needed: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Starts (T, P, 1 or C, 3), which may be NaN, and ends (C, 3) of the lines."""
+def _starts(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Starts (T, P, 1 or C, 3) of lines."""
     starts = np.ascontiguousarray(points, dtype=np.float64)
-    ends = np.ascontiguousarray(check_array("cameras", cameras, (None, 3)))
-    shapes = ((*needed.shape[:2], 3), (*needed.shape, 3))
-    if needed.ndim != 3 or starts.shape not in shapes or ends.shape != (needed.shape[2], 3):
-        raise ArgumentError(
-            f"points {starts.shape}, cameras {ends.shape} and needed {needed.shape} do not fit together, "
-            "expected (T, P, 3) or (T, P, C, 3), (C, 3) and (T, P, C)"
-        )
-    return (starts[:, :, None] if starts.ndim == 3 else starts), ends
+    return starts[:, :, None] if starts.ndim == 3 else starts
 
 
 MAX_FACING: Final = np.deg2rad(85.0)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import print_line, progress_bar
 from handsim.files.outputs import check_ending, check_outputs
 from handsim.hand.shape import Side
 from track.config import BOTH, Size

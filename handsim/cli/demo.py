@@ -6,15 +6,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
 from handsim._checks import check_count
-from handsim.app.messages import print_line
-from handsim.app.page import write_page
-from handsim.app.progress import named_steps
+from handsim.app.messages import named_steps, print_line, print_table
 from handsim.files.outputs import atomic_write, written_together
+from handsim.pages import write_sections
 
 
 def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:
@@ -28,7 +23,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
     check_count("num_frames", num_frames, 1)
     check_count("seed", seed, 0)
     out.mkdir(parents=True, exist_ok=True)
-    console, page = Console(), out / "index.html"
+    page = out / "index.html"
     with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, named_steps("starting") as step:
         from handsim.cli.demo_sections import GLOVE, demo_sections
 
@@ -38,7 +33,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
             for picture in sorted(pictures.iterdir()):
                 with atomic_write(out / picture.name) as temporary:
                     shutil.copyfile(picture, temporary)
-            write_page(
+            write_sections(
                 page,
                 sections,
                 title="handsim demo",
@@ -46,11 +41,6 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
                 "trained on simulation alone labels the points that the cameras see.",
             )
     figures = sections[-1]
-    printed = Table(title=f"{num_frames} generated frames, glove {GLOVE}")
-    for number, column in enumerate(figures.table[0]):
-        printed.add_column(Text(column), justify="right" if number else "left")
-    for row in figures.table[1:]:
-        printed.add_row(*row)
-    console.print(printed)
-    console.print(figures.notes[0])
+    print_table(figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
+    print_line(figures.notes[0])
     print_line(f"page: {page.resolve()}")

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float, Int
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim import __version__
-from handsim.app.page import Section
 from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
+from handsim.pages import Section
 from handsim.space.rig import load_rig
 from poses.shapes import gesture
 from render.captions import contact_sheet, write_png

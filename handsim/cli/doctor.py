@@ -60,7 +60,7 @@ def doctor() -> int:
     Returns:
         0 when everything that the commands need is there, else 1.
     """
-    from handsim.app.progress import named_steps
+    from handsim.app.messages import named_steps
 
     with named_steps("drawing a picture and looking for a GPU"):
         findings = examine()
@@ -171,7 +171,7 @@ def check_kernel_cache() -> Finding:
 def check_learned_gloves() -> Finding:
     """Where the labelers of gloves that were learned are kept, and how many there are."""
     try:
-        from train.labelers.storage import learned_folder, learned_gloves
+        from train.labelers.protocol import learned_folder, learned_gloves
     except ImportError:  # a dependency is missing, which is told above
         return Finding("learned gloves", "unknown")
     return Finding("learned gloves", f"{len(learned_gloves())} in {learned_folder()}")

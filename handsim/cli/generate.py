@@ -9,9 +9,8 @@ import numpy as np
 import tyro
 
 from gloves.layout import load_layout
-from handsim.app.messages import print_line
+from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.app.output import place_of
-from handsim.app.progress import named_steps, progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.hand.shape import SIDES
 from handsim.space.rig import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
@@ -42,16 +41,8 @@ def generate(
             docs/cluster.md.
     """
     place = place_of(out)
-    with (
-        progress_bar("frames") as bar,
-        chosen_workers(cluster, workers, bar.say) as chosen,
-    ):
-        manifest = make_dataset(
-            settings,
-            place,
-            workers=chosen,
-            progress=bar,
-        )
+    with progress_bar("frames") as bar, chosen_workers(cluster, workers, bar.say) as chosen:
+        manifest = make_dataset(settings, place, workers=chosen, progress=bar)
     print_line(f"{manifest.num_frames} frames of {settings.glove} in {place}")
     if isinstance(place, Path):
         print_line(f"report in {_report(settings, place)}")

@@ -34,8 +34,7 @@ def label(
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
     from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-    from handsim.app.messages import print_line
-    from handsim.app.progress import progress_bar
+    from handsim.app.messages import print_line, progress_bar
     from handsim.files.outputs import check_outputs
     from track.captures import label_capture
     from train.labelers.protocol import label_on

@@ -157,7 +157,8 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
             default = one.default
         elif one.default_factory is not dataclasses.MISSING:
             default = one.default_factory()
-        fields.append(StructFieldSpec(one.name, _hinted(hints[one.name]), default, told.get(one.name)))
+        kind = _hinted(hints[one.name], aliases=["--frames"] if one.name == "num_frames" else None)
+        fields.append(StructFieldSpec(one.name, kind, default, told.get(one.name)))
     return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
 
 
@@ -179,9 +180,9 @@ def _hint(default: str) -> str:
     return "" if default in ("", "None") else f"(default: {default})"
 
 
-def _hinted(annotation: Any) -> Any:
+def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
     """A type whose help tells a default that is one, and nothing where an option may be left out."""
-    return Annotated[annotation, tyro.conf.arg(help_behavior_hint=_hint)]
+    return Annotated[annotation, tyro.conf.arg(help_behavior_hint=_hint, aliases=aliases)]
 
 
 def _with_hints(command: Command) -> Command:

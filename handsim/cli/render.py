@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final, cast
 
 import tyro
 
-from handsim.app.messages import print_line
+from handsim.app.messages import print_line, progress_bar
 from handsim.app.output import place_of
-from handsim.app.progress import progress_bar
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs

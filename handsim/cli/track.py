@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
-from rich.console import Console
 
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 
 if TYPE_CHECKING:
+    from gloves.takes.take import Take
     from track.captures import OnFrame
     from track.frames import StreamedFrame, TrackedFrame
     from track.live import LiveTake
@@ -60,11 +59,9 @@ def track(
             so on, other points Unlabeled1, Unlabeled2, ...
     """
     from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-    from gloves.takes.take import load_take
     from track.live import track_live
     from track.settings import TrackerSetup
     from track.sinks import open_sinks
-    from track.tracker import warm_up
 
     _check_source(capture, live, seconds, calibrate=calibrate)
     check_take_file(out, live=live is not None)
@@ -82,15 +79,13 @@ def track(
             tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
             setup = TrackerSetup.of(settings)
-            with Console(stderr=True).status("getting ready"):
-                warm_up(setup.user, setup.labeler)
-            tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
+            tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
             if labeled is not None:  # after the recording, which nobody can make again
-                take = tracked.take if tracked.is_whole else load_take(out)
-                write_capture(labeled, take.labeled_capture())
+                write_capture(labeled, tracked.whole_take(out).labeled_capture())
+    assert tracked.take is not None  # it was recorded
     if options.shape is not None and options.glove is None:
         print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _print_take(out, tracked, float(np.median(times)))
+    _print_take(out, tracked.take, tracked.num_frames, tracked.notes, 1e3 * float(np.median(times)))
 
 
 def _track_file(
@@ -131,17 +126,17 @@ def _track_file(
     return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))
 
 
-def _print_take(out: Path, tracked: LiveTake, seconds: float) -> None:
-    """Print what was tracked, and warn of what looks wrong; `seconds` is the time of the median frame."""
+def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], milliseconds: float) -> None:
+    """Print what was tracked, in which time per frame, and warn of what looks wrong."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
 
-    take, frames, user = tracked.take, tracked.num_frames, tracked.take.settings["user"]
+    user = take.settings["user"]
     lines = [f"size of the hands: {user.removeprefix(MEASURED)}"] if user.startswith(MEASURED) else []
     if user.startswith("calibrated on"):
         lines = user.split("; ")
     lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*lines, *tracked.notes, *summarize(take), f"{1e3 * seconds:.2f} ms per frame"):
+    for line in (*lines, *notes, *summarize(take), f"{milliseconds:.2f} ms per frame"):
         print_line(line)
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)

@@ -10,8 +10,7 @@ from typing import Annotated, Final
 
 import tyro
 
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import print_line, progress_bar
 from handsim.cli.parsing import PresetCommand, given_option
 from train.settings import KINDS, PRESETS, EvaluateSettings, Preset, TrainSettings, usual_settings
 

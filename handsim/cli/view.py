@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
 
-from handsim.app.messages import LiveStatus, print_line
-from handsim.app.progress import progress_bar
+from handsim.app.messages import print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
-from handsim.files.signals import InterruptFlag, interrupt_flag
+from handsim.files.signals import interrupt_flag
 from track.streams import LOOPBACK
-from track.viewer.server import address_of, opened_server
+from track.viewer import address_of, opened_server
 
 if TYPE_CHECKING:
     from track.settings import TrackerSetup
@@ -84,7 +81,7 @@ def view(
 def _draw(name: str, content: Content, video: Path) -> None:
     """Draw the video of a recording."""
     from track.viewer.contents import first_look
-    from track.viewer.video import write_video
+    from track.viewer.recordings import write_video
 
     check_outputs((name,), (video,))
     from render.illustrations import write_clip  # OpenCV and the painters
@@ -108,41 +105,14 @@ def _view_live(
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
     from handsim.space.rig import load_rig
-    from track.live import measured_setup, recording_kept
-    from track.recorder import Recorder
-    from track.streams.live_stream import open_source
-    from track.tracker import warm_up
-    from track.viewer.live_view import LiveView
+    from track.live import track_live
+    from track.viewer.timeline import LiveView
 
     cameras = None if rig is None else load_rig(rig)
-    with Console(stderr=True).status("getting ready"):
-        warm_up(setup.user, setup.labeler)
-    ended = InterruptFlag()
-    with (
-        opened_server(host, port, "handsim view") as server,
-        open_source(url, ended=ended) as stream,
-    ):
+    with opened_server(host, port, "handsim view") as server, LiveView(server, cameras) as view:
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
-        with LiveStatus() as status:
-            setup, frames = measured_setup(stream, setup, status)
-        tracker = setup.tracker()
-        with ExitStack() as stack:
-            stack.enter_context(interrupt_flag(ended))
-            recording = None
-            if out is not None:
-                recording = stack.enter_context(Recorder(out, tracker, {"capture": url, **setup.settings}))
-                stack.enter_context(recording_kept(recording))
-            live_view = stack.enter_context(closing(LiveView(server, tracker, cameras)))
-            for frame in frames:
-                if ended():
-                    break
-                tracked = tracker.step(frame.points, frame.ids, frame.time)
-                if recording is not None:
-                    recording.add(frame, tracked)
-                if not frame.silent:
-                    live_view.offer(frame, tracked)
-            if recording is not None:
-                recording.finish(stream.counts)
-        print_line(f"{live_view.frames} frames tracked, {live_view.pictures} of them shown")
-        if recording is not None:
-            print_line(f"{out}: {recording.num_frames} frames")
+        tracked = track_live(url, setup, [view], out=out)
+    for line in view.notes():
+        print_line(line)
+    if out is not None:
+        print_line(f"{out}: {tracked.num_frames} frames")

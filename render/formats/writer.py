@@ -13,7 +13,7 @@ import shutil
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import DatasetError, HandSimError
@@ -43,22 +43,23 @@ class PngWriter(FolderWriter):
     """
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        files = self._add_pictures(folder, frame, name, lossless=True)
-        record = frame_record(frame) | files
+        record = frame_record(frame) | self._add_files(folder, frame, name)
         (folder / f"{frame.key}.json").write_text(to_json(record) + "\n", "utf-8")
         return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
 
+    def _add_files(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, str]:
+        return self._add_pictures(folder, frame, name, lossless=True)
 
-class ExrWriter(FolderWriter):
+
+class ExrWriter(PngWriter):
     """`shard-00000/KEY.exr` with all pictures, and `KEY.json` with all that is known of the frame."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, inside=".")
 
-    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+    def _add_files(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, str]:
         write_exr(folder / f"{frame.key}.exr", frame)
-        (folder / f"{frame.key}.json").write_text(to_json(frame_record(frame)) + "\n", "utf-8")
-        return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
+        return {}
 
 
 class FrameWriter(Protocol):
@@ -74,18 +75,25 @@ class FrameWriter(Protocol):
         """Merge all complete shards into the files that the format requires; may be called again."""
 
 
-WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
-    "webdataset": WebdatasetWriter,
-    "coco": CocoWriter,
-    "yolo": YoloWriter,
-    "freihand": FreihandWriter,
-    "interhand": InterhandWriter,
-    "exr": ExrWriter,
-    "png": PngWriter,
+class Format(NamedTuple):
+    """A format and what it cannot hold."""
+
+    open: Callable[[Path], FrameWriter]
+    needs_colors: bool = False
+    any_lens: bool = True  # or pinhole cameras alone
+    merges: bool = True  # whether several renderings have a place in one folder
+
+
+WRITERS: Final = {
+    "webdataset": Format(WebdatasetWriter),
+    "coco": Format(CocoWriter, needs_colors=True),
+    "yolo": Format(YoloWriter, needs_colors=True),
+    "freihand": Format(FreihandWriter, needs_colors=True, any_lens=False, merges=False),
+    "interhand": Format(InterhandWriter, needs_colors=True, any_lens=False, merges=False),
+    "exr": Format(ExrWriter),
+    "png": Format(PngWriter),
 }
 FORMATS: Final = tuple(WRITERS)
-NEED_COLORS: Final = ("coco", "yolo", "freihand", "interhand")
-"""Formats of color pictures."""
 
 
 def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
@@ -96,12 +104,11 @@ def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """The writer of one of `FORMATS`, into a folder that is made when it is not there."""
     check_choice(name, WRITERS, noun="format", error=HandSimError)
-    return WRITERS[name](Path(folder))
+    return WRITERS[name].open(Path(folder))
 
 
 CONFIG: Final = "render.json"
 """Settings of a rendering, in its folder."""
-_MERGEABLE: Final = ("webdataset", "coco", "yolo", "exr", "png")
 _LARGEST: Final = 1 << 30  # bytes of a picture's file
 _SAMPLE: Final = re.compile(r"(\d+)(\..+)")
 
@@ -135,10 +142,9 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
                 f"{parts[0]}"
             )
     for name in formats:
-        if name not in _MERGEABLE:
-            raise HandSimError(
-                f"renderings of the format {name} cannot be merged; expected {', '.join(_MERGEABLE)}"
-            )
+        if name not in WRITERS or not WRITERS[name].merges:
+            valid = ", ".join(one for one in WRITERS if WRITERS[one].merges)
+            raise HandSimError(f"renderings of the format {name} cannot be merged; expected {valid}")
     if len(parts) < 2 or len({folder.resolve() for folder in parts}) < len(parts):
         raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody
 from handsim.hand.model import keypoint_thickness
 from handsim.hand.skin import vertex_normals
-from render.frames import PARTS_A_HAND, Doubles
+from render.frames import PARTS_A_HAND, Bytes, Doubles, Integers
 from render.painting.rasterizer import Triangles
 from render.skin.look import Forearm, SkinLook, sample_forearm, sample_skin_look
 from render.skin.mesh import PosableSkin
@@ -82,21 +82,15 @@ _BALL_LEVEL: Final = 2
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
-class SphereSurface(NamedTuple):
-    """Balls in a row, each with as many vertices and faces as the next."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    normals: Float[np.ndarray, "V 3"]
-    faces: Int[np.ndarray, "F 3"]
-
-
-def sphere_surface(centers: Float[np.ndarray, "N 3"], radius: float, *, level: int) -> SphereSurface:
-    """Balls around these centers [m]."""
+def sphere_surface(
+    centers: Float[np.ndarray, "N 3"], radius: float, *, level: int
+) -> tuple[Doubles, Doubles, Integers]:
+    """Vertices [m], normals and faces of balls in a row, each with as many of them as the next."""
     ball = _unit_ball(level)
     count, each = len(centers), len(ball.vertices)
     vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
     faces = (ball.faces + each * np.arange(count)[:, None, None]).reshape(-1, 3)
-    return SphereSurface(vertices, np.tile(ball.vertices, (count, 1)), faces)
+    return vertices, np.tile(ball.vertices, (count, 1)), faces
 
 
 @functools.cache
@@ -188,12 +182,10 @@ class HandFigure:
         return self._painted
 
     def _drawn_markers(self, qpos: Doubles, number: int) -> Drawn:
-        balls = sphere_surface(self.markers(qpos), self.fit.layout.radius, level=_BALL_LEVEL)
-        each = len(balls.faces) // len(self._marker_bones)
         parts = (1 + PARTS_A_HAND * number + self._marker_bones).astype(np.uint8)
-        instances = np.full(len(balls.faces), 1 + number, dtype=np.uint8)
-        numbers = np.repeat(self._marker_numbers, each)
-        return _drawn_balls(balls, np.repeat(parts, each), instances, numbers)
+        instances = np.full(len(parts), 1 + number, dtype=np.uint8)
+        radius = self.fit.layout.radius
+        return _drawn_balls(self.markers(qpos), radius, parts, instances, self._marker_numbers)
 
 
 class BodyFigure:
@@ -217,19 +209,16 @@ class BodyFigure:
             white = np.ones((len(vertices), 4), dtype=np.float32)
             drawn.append(Drawn(triangles, white, None, self._material))
         if len(self._markers):
-            balls = sphere_surface(self._markers @ rotation.T + position, _BODY_BALLS, level=_BALL_LEVEL)
-            zeros = np.zeros(len(balls.faces), dtype=np.uint8)
-            drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros))
+            centers, zeros = self._markers @ rotation.T + position, np.zeros(len(self._markers), np.uint8)
+            drawn.append(_drawn_balls(centers, _BODY_BALLS, zeros, zeros + np.uint8(instance), zeros))
         return drawn
 
 
-def _drawn_balls(
-    balls: SphereSurface,
-    parts: UInt8[np.ndarray, "F"],
-    instances: UInt8[np.ndarray, "F"],
-    markers: UInt8[np.ndarray, "F"],
-) -> Drawn:
-    triangles = Triangles(balls.vertices, balls.faces, balls.normals, parts, instances, markers)
-    colors = np.ones((len(balls.vertices), 4), dtype=np.float32)
+def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:
+    """Balls with a part, an instance and a marker (N,) each."""
+    vertices, normals, faces = sphere_surface(centers, radius, level=_BALL_LEVEL)
+    each = len(faces) // len(centers)
+    triangles = Triangles(vertices, faces, normals, *(np.repeat(one, each) for one in ids))
+    colors = np.ones((len(vertices), 4), dtype=np.float32)
     colors[:, :3] = linear(MARKER_COLOR)
     return Drawn(triangles, colors, None, ball_material)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from train.data.shards import row_dtype
-from train.devices import start_fabric
+from train.fabric import start_fabric
 from train.loop import TrainingState
 from train.settings import SetLabelerConfig, TrainSettings
 

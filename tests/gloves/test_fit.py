@@ -1,10 +1,150 @@
+"""Gloves on hands: attachment, and markers that are put on a point of the skin."""
+
 from __future__ import annotations
 
 import dataclasses
 
+import mujoco
+import numpy as np
 import pytest
+import trimesh
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
-from gloves.fit import attach, nearest_markers
+from gloves.fit import _ray, attach, attach_markers, nearest_markers, nominal_fit, place_marker, vary_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from handsim.errors import LayoutError
+from handsim.hand.model import HandModel, build_spec, join_qpos
+from handsim.hand.shape import EVERYBODY, sample_shape
+from handsim.hand.skin import vertex_normals
+from handsim.space.transforms import MIRROR
+from tests.handsim.hand.blending import blend_skin
+
+MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
+
+
+@pytest.mark.parametrize("glove", ["dense19", "sparse13"])
+def test_markers_sit_one_radius_above_the_skin(glove, rng):
+    model = HandModel(sample_shape(EVERYBODY, rng=rng))
+    layout = load_layout(glove)
+    attachment = attach_markers(layout, model)
+    skin = trimesh.Trimesh(model.surface.vertices, model.surface.faces, process=False)
+    _, distance, _ = trimesh.proximity.closest_point_naive(skin, attachment.points)
+    np.testing.assert_allclose(distance, layout.radius, atol=0.0004)
+    np.testing.assert_allclose(np.linalg.norm(attachment.normals, axis=1), 1.0)
+    np.testing.assert_allclose(attachment.bone_weights.sum(axis=1), 1.0)
+
+
+@given(side=st.sampled_from(["left", "right"]), index=st.integers(0, 18), height=st.floats(0.0, 0.05))
+def test_a_stalk_lifts_its_marker_alone_straight_off_the_skin(side, index, height):
+    layout, model = load_layout("dense19"), MODELS[side]
+    markers = list(layout.markers)
+    markers[index] = dataclasses.replace(markers[index], height=height)
+    flat = attach_markers(layout, model)
+    lifted = attach_markers(dataclasses.replace(layout, markers=tuple(markers)), model)
+    expected = flat.points.copy()
+    expected[index] += height * flat.normals[index]
+    np.testing.assert_allclose(lifted.points, expected, atol=1e-12)
+    np.testing.assert_array_equal(lifted.normals, flat.normals)
+    np.testing.assert_array_equal(lifted.bone_weights, flat.bone_weights)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, rng):
+    layout = vary_layout(load_layout("dense19"), along=0.1, around=0.3, rng=rng)
+    model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
+    attachment, skin = attach_markers(layout, model), model.surface
+    corners = skin.vertices[skin.faces]
+    edges1, edges2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    for number, marker in enumerate(layout.markers):
+        origin, direction = _ray(marker, model)
+        ahead = np.broadcast_to(-direction, edges1.shape)
+        systems = np.stack([edges1, edges2, ahead], axis=-1)
+        u, v, distance = np.linalg.solve(systems, (origin - corners[:, 0])[..., None])[..., 0].T
+        outwards = np.cross(edges1, edges2) @ direction > 0.0
+        met = outwards & (np.minimum(u, v) >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
+        exit_point = origin + distance[met].min() * direction
+        below = attachment.points[number] - layout.radius * attachment.normals[number]
+        np.testing.assert_allclose(below, exit_point, atol=1e-12)
+
+
+def test_markers_are_carried_as_the_skin_is(rng):
+    model = HandModel(sample_shape(EVERYBODY, rng=rng))
+    glove = attach_markers(load_layout("dense19"), model)
+    low, high = model.skeleton.ranges.T
+    bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(20, 20))))
+    markers, normals = glove.markers(model, bones)
+    weights = (glove.bone_indices, glove.bone_weights, model.rest_transforms, bones)
+    np.testing.assert_allclose(markers, blend_skin(glove.points, *weights), atol=1e-12)
+    ahead = blend_skin(glove.points + glove.normals, *weights) - markers
+    np.testing.assert_allclose(normals, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), atol=1e-12)
+    np.testing.assert_array_equal(glove.centers(model, bones), markers)
+
+
+def test_left_glove_is_the_mirror_image(rng):
+    shape = sample_shape(side="right", rng=rng)
+    layout = load_layout("dense19")
+    right = attach_markers(layout, HandModel(shape))
+    left = attach_markers(layout, HandModel(shape.with_side("left")))
+    np.testing.assert_allclose(left.points, right.points @ MIRROR, atol=1e-9)
+
+
+def test_markers_move_with_the_hand(rng):
+    model = HandModel.named("M")
+    attachment = attach_markers(load_layout("dense19"), model)
+    qpos = join_qpos(np.zeros((1, 20)), position=np.array([[0.1, 0.2, 0.3]]))
+    markers, normals = attachment.markers(model, model.forward_kinematics(qpos))
+    np.testing.assert_allclose(markers[0], attachment.points + [0.1, 0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(normals[0], attachment.normals, atol=1e-12)
+
+
+def test_sites_stand_where_the_markers_do():
+    model = HandModel.named("L", side="left")
+    attachment = attach_markers(load_layout("dense19"), model)
+    compiled = build_spec(model.skeleton, model.capsules, sites=attachment.sites(model)).compile()
+    data = mujoco.MjData(compiled)
+    mujoco.mj_kinematics(compiled, data)
+    placed = np.array([data.site(name).xpos for name in attachment.layout.names])
+    np.testing.assert_allclose(placed, attachment.points, atol=1e-9)
+    assert compiled.nsite == 19
+
+
+@pytest.mark.parametrize("size", ["XS", "M", "XL"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_markers_at_the_wrist_move_with_the_hand_alone(size, side, rng):
+    angles = {"back": 0.0, "thumb": np.pi / 2, "palm": np.pi, "little": -np.pi / 2}
+    wrist = [
+        MarkerPlace(f"{name}{along}", "palm", along, around)
+        for name, around in angles.items()
+        for along in (-0.15, 0.0)
+    ]
+    model = HandModel.named(size, side=side)
+    glove = attach_markers(MarkerLayout("band", tuple(wrist), 0.004), model)
+    thumbwards, back = glove.normals[:, 1] * (1 if side == "right" else -1), glove.normals[:, 2]
+    assert (thumbwards[[2, 3]] > 0.5).all() and (thumbwards[[6, 7]] < -0.5).all()
+    assert (back[[0, 1]] > 0.5).all() and (back[[4, 5]] < -0.5).all()
+    low, high = model.skeleton.ranges.T
+    bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(5, 20))))
+    centers = glove.centers(model, bones)[:, ::2]  # at 0 the thumb's root pulls at the skin
+    np.testing.assert_allclose(centers, np.broadcast_to(glove.points[::2], centers.shape), atol=5e-4)
+
+
+def test_a_marker_in_the_air_is_told():
+    layout = load_layout("dense19")
+    markers = list(layout.markers)
+    markers[6] = dataclasses.replace(markers[6], along=1.3)
+    with pytest.raises(LayoutError, match=r"marker 'IndexTip' meets no skin from index_distal at along 1\.3"):
+        attach_markers(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
+
+
+def test_slipped_markers_keep_their_bones_and_names(rng):
+    layout = load_layout("dense19")
+    slipped = vary_layout(layout, along=0.1, around=0.2, rng=rng)
+    assert slipped.names == layout.names
+    assert [m.bone for m in slipped.markers] == [m.bone for m in layout.markers]
+    moved = np.array([a.along - b.along for a, b in zip(slipped.markers, layout.markers, strict=True)])
+    assert 0.02 < moved.std() < 0.2
+    assert vary_layout(layout, along=0.0, around=0.0, rng=rng) == layout
 
 
 def test_the_nearest_markers_are_named() -> None:
@@ -16,3 +156,47 @@ def test_the_nearest_markers_are_named() -> None:
     )
     assert (first, second) == (fit.layout.names[2], fit.layout.names[7])
     assert distance == pytest.approx(0.005)
+
+
+LAYOUT = load_layout("dense19")
+PLACEMENT_MODELS = {side: HandModel.named("M", side=side) for side in ("right", "left")}
+
+
+STALKS = dataclasses.replace(
+    LAYOUT, markers=tuple(dataclasses.replace(marker, height=0.01) for marker in LAYOUT.markers)
+)
+
+
+@pytest.mark.parametrize("layout", [LAYOUT, STALKS])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_marker_that_is_put_where_it_is_stays_there(side, layout):
+    fit = nominal_fit(layout, "L", side)
+    for index in range(0, layout.num_markers, 1 if layout is LAYOUT else 5):
+        moved = place_marker(layout, index, fit.model, fit.attachment.points[index])
+        assert moved.markers[index].bone == layout.markers[index].bone
+        assert moved.markers[index].height == layout.markers[index].height
+        assert moved.markers[:index] == layout.markers[:index]
+        assert moved.markers[index + 1 :] == layout.markers[index + 1 :]
+        again = attach_markers(moved, fit.model).points[index]
+        tolerance = 2e-4 if layout is LAYOUT else 5e-4
+        np.testing.assert_allclose(again, fit.attachment.points[index], atol=tolerance)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from(["right", "left"]),
+    st.integers(0, LAYOUT.num_markers - 1),
+    st.integers(0, 10**6),
+    st.floats(0.0, 0.02),
+)
+def test_a_marker_goes_to_the_skin_below_the_point(side, index, place, height):
+    model = PLACEMENT_MODELS[side]
+    surface = model.surface
+    vertex = place % len(surface.vertices)
+    normal = vertex_normals(surface.vertices, surface.faces)[vertex]
+    point = surface.vertices[vertex] + (LAYOUT.radius + height) * normal
+    center = attach_markers(place_marker(LAYOUT, index, model, point), model).points[index]
+    nearest = np.linalg.norm(surface.vertices - point, axis=1).min()
+    assume(nearest > LAYOUT.radius + height - 1e-4)  # no marker fits into the folds between the fingers
+    assert np.linalg.norm(center - point) < height + 0.016  # the wrist's cut is beyond what a layout reaches
+    assert LAYOUT.radius - 1e-3 < np.linalg.norm(surface.vertices - center, axis=1).min() < 0.008

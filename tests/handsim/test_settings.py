@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import ArgumentError
-from handsim.settings import Expected, Limits, Settings
+from handsim.settings import Expected, Limits, Mixture, Settings
 
 
 class Thing:
@@ -20,6 +20,17 @@ class Thing:
 class Group(Settings):
     noise: Annotated[float, Limits(0.0, above=True)] = 1.0
     bits: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Shares(Mixture):
+    one: float = 0.5
+    two: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Mixed(Settings):
+    shares: Shares = field(default_factory=Shares)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,3 +95,15 @@ def test_options_change_settings():
     assert Options.of(Options(num_frames=7), {"kind": "two"}) == Options(num_frames=7, kind="two")
     with pytest.raises(ArgumentError, match=r"settings is {.num_frames.: 7}"):
         Options.of({"num_frames": 7})
+
+
+def test_a_mixture_is_given_whole():
+    assert Mixed(shares={"one": 2.0}).shares == Shares(2.0, 0.0)
+    np.testing.assert_array_equal(Shares(1.0, 3.0).shares, [0.25, 0.75])
+    assert Mixed.from_json(Mixed(shares=Shares(1.0, 0.0)).record()) == Mixed(shares=Shares(1.0, 0.0))
+    with pytest.raises(ArgumentError, match="the sum of one, two is 0, expected a number above 0"):
+        Mixed(shares={"one": 0.0})
+    with pytest.raises(ArgumentError, match="two is -1, expected a number of at least 0"):
+        Shares(1.0, -1.0)
+    with pytest.raises(ArgumentError, match="unknown setting of shares 'three'"):
+        Mixed(shares={"three": 1.0})

@@ -164,7 +164,7 @@ def test_weights_add_up_and_middles_are_where_they_should_be(exposure, readout, 
 def test_what_does_not_move_does_not_change():
     rgb = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     _, weights = shutter_times(0.008, 0.013, 7, HEIGHT)
-    assert (encoded(combine([rgb] * 7, weights)) == rgb).all()
+    assert (shot(combine([rgb] * 7, weights), Exposure()) == rgb).all()
 
 
 def test_blur_keeps_the_light():
@@ -181,7 +181,7 @@ def test_blur_keeps_the_light():
 def test_light_is_averaged_not_srgb_values():
     _, weights = shutter_times(0.01, 0.0, 2, 4)
     black, white = np.zeros((4, 4, 3), np.uint8), np.full((4, 4, 3), 255, np.uint8)
-    assert (encoded(combine([black, white], weights)) == 188).all()
+    assert (shot(combine([black, white], weights), Exposure()) == 188).all()
     np.testing.assert_allclose(combine([black, white], weights), 0.5)
 
 
@@ -205,7 +205,7 @@ def test_frames_may_come_one_by_one():
     times, weights = shutter_times(0.01, 0.01, 5, HEIGHT)
     frames = [bar(50.0 + 1000.0 * time) for time in times]
     assert (combine(iter(frames), weights) == combine(frames, weights)).all()
-    bytes_ = [encoded(frame) for frame in frames]
+    bytes_ = [shot(frame, Exposure()) for frame in frames]
     np.testing.assert_allclose(
         combine(bytes_, weights), combine([linear_of(one) for one in bytes_], weights), atol=1e-6
     )

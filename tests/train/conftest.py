@@ -13,8 +13,8 @@ from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler
 def pages_without_pictures() -> Iterator[None]:
     """A run of a small network draws for longer than it learns; tests of pages draw (tests/train/reports)."""
     with pytest.MonkeyPatch.context() as patch:
-        for page in ("run_page", "dataset_page"):
-            patch.setattr(f"train.reports.{page}.picture", lambda size, draw: "data:,")
+        for page in ("run_page", "dataset_page", "hand_plot"):
+            patch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
         yield
 
 

@@ -20,13 +20,13 @@ from handsim.errors import ArgumentError, WeightsError
 from handsim.files.signals import Stopped
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
-from train.devices import start_fabric
+from train.fabric import start_fabric
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.networks import batch_loss, new_network, prepare_network
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE
-from train.settings import SetLabelerConfig, TrainSettings, usual_settings
+from train.settings import SetLabelerConfig, TrainSettings, batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
 
@@ -188,7 +188,7 @@ def test_parts_of_a_batch_give_the_papers_network_the_loss_of_the_whole(dataset,
 
     def loss(part):
         rng = np.random.default_rng(3)
-        recipe = config.batch_recipe(len(dataset.marker_names))
+        recipe = batch_recipe(config, len(dataset.marker_names))
         batch = draw_batch(dataset.mapped_rows(), recipe, rng=rng)
         with torch.no_grad():
             return float(batch_loss(config, network, batch, fabric.device, rng=rng, part=part))

@@ -1,15 +1,17 @@
-"""What a file or folder is, found by its content, and the view that shows it."""
+"""What a file or folder is, found by its content, and the page that shows it."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from gloves.captures.formats import READABLE, read_capture
+from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import list_layouts, load_layout
 from gloves.takes.archives import is_growing
 from gloves.takes.corrections import corrections_path, told
@@ -18,21 +20,17 @@ from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.inputs import read_toml
 from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_QPOS, SIZES
 from handsim.space.rig import CameraRig, list_rigs, load_rig
 from track.user import load_user
-from track.viewer.corrector import Corrector
-from track.viewer.frame_view import FrameView
-from track.viewer.label_editor import LabelEditor
-from track.viewer.layout_editor import LayoutEditor, edited_path
+from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
-from track.viewer.stage import set_stage, show_rig, show_volume
-from track.viewer.status_panel import StatusPanel
-from track.viewer.timeline import Timeline
-from track.viewer.user_view import UserView
+from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume
+from track.viewer.timeline import StatusPanel, Timeline
 from train.data.shards import Dataset
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import FrameHandle, GuiCheckboxHandle, GuiEvent, ViserServer
 
 ACCEPTED: Final = (
     "a marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture "
@@ -44,6 +42,9 @@ _LOOKED_AT: Final = 30  # frames that decide where the first look goes
 
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the function that it is given says that it shall end."""
+_SPACING: Final = 0.14  # [m] between the middles of two hands
+_HEIGHT: Final = 0.06  # [m] above the ground
+_BEFORE: Final = (150, 150, 150)
 
 
 class Content(NamedTuple):
@@ -241,3 +242,73 @@ def _still(_shown: object) -> Run:
             time.sleep(0.2)
 
     return run
+
+
+class UserView:
+    """Hands of a user's file, flat, side by side; lines lead from the designed markers to the real ones."""
+
+    def __init__(self, server: ViserServer, hands: Sequence[GloveFit]) -> None:
+        self.before = [nominal_hand(hand) for hand in hands]
+        """The hands of the nearest named sizes, in gloves as designed."""
+        self.skins: list[HandSkin] = []
+        """Skin of each hand after and before calibration, in turn."""
+        gui, scene = server.gui, server.scene
+        for node in ("/after", "/before"):
+            root = scene.add_frame(node, show_axes=False)
+            words = "calibrated hands" if node == "/after" else "hands of the nearest size"
+            switch = gui.add_checkbox(words, True)
+            switch.on_update(partial(_switch, root))
+        corners = []
+        for number, (hand, before) in enumerate(zip(hands, self.before, strict=True)):
+            shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
+            self._add_hand(server, f"/after/{hand.side}", hand, shift, None)
+            self._add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE)
+            ends = np.stack([before.attachment.points, hand.attachment.points], axis=1) + shift
+            scene.add_line_segments(
+                f"/moved/{hand.side}",
+                points=ends,
+                colors=(200, 60, 50),
+                thickness=2.0,
+                thickness_units="screen",
+            )
+            corners.append(hand.model.surface.vertices + shift)
+            gui.add_markdown(describe(hand, before))
+        set_stage(server, np.concatenate(corners), ground=0.0)
+
+    def _add_hand(
+        self,
+        server: ViserServer,
+        node: str,
+        hand: GloveFit,
+        shift: np.ndarray,
+        color: tuple[int, int, int] | None,
+    ) -> None:
+        qpos = np.zeros(NUM_QPOS)
+        qpos[:3], qpos[3] = shift, 1.0
+        skin = HandSkin(server, f"{node}/skin", color=color, opacity=None if color is None else 0.35)
+        skin.show(hand.model, qpos)
+        self.skins.append(skin)
+        count = hand.layout.num_markers
+        radius = hand.layout.radius * (1.0 if color is None else 0.5)
+        balls = PointBalls(server, f"{node}/markers", hand.layout.names, most=count, radius=radius)
+        balls.show(hand.attachment.points + shift, np.arange(count), np.ones(count, dtype=np.bool_))
+
+
+def _switch(node: FrameHandle, event: GuiEvent[GuiCheckboxHandle]) -> None:
+    node.visible = event.target.value
+
+
+def nominal_hand(hand: GloveFit) -> GloveFit:
+    """The hand of the named size whose length is nearest, in the same glove as designed."""
+    fits = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
+    return min(fits, key=lambda fit: abs(fit.shape.length - hand.shape.length))
+
+
+def describe(hand: GloveFit, before: GloveFit) -> str:
+    """A hand's measures beside those of the named size, in words."""
+    moved = np.linalg.norm(hand.attachment.points - before.attachment.points, axis=1)
+    return (
+        f"**{hand.side}**: {1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm, "
+        f"nearest size {1e3 * before.shape.length:.0f} x {1e3 * before.shape.breadth:.0f} mm; "
+        f"markers differ by {1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} mm at most"
+    )

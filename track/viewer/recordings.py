@@ -1,27 +1,39 @@
-"""What the viewer shows over time: frames of hands, points and bodies, made one at a time."""
+"""What the viewer shows over time: frames of hands, points and bodies, made one at a time, or as a video."""
 
 from __future__ import annotations
 
+import colorsys
 import itertools
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt8, UInt32
 
 from gloves.captures.capture import Capture
-from gloves.takes.take import STATUSES, RigidBody, Take
+from gloves.fit import GloveFit
+from gloves.takes.take import STATUSES, RigidBody, Take, label_names
+from handsim.callbacks import Progress, no_progress
 from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.rig import CameraRig, as_rig, list_rigs
+from track.frames import StreamedFrame, TrackedFrame
+from track.rigid_body import RigidTemplate
 from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
+GHOST_COLOR: Final = (128, 128, 128)
+"""Of points without a label."""
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
 """Names that optical systems give to trajectories that nobody named."""
 _ROWS_PER_SECOND: Final = 4.0
 """Rows of a training set do not follow each other in time; they are shown at this pace."""
+_LIVE_POINTS: Final = 400  # of a live tracker that are shown at most
+_VIDEO_RATE: Final = 30.0  # [Hz] at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,15 +59,6 @@ class ShownFrame:
     """Lines of sight from markers to the cameras that see them [m]."""
 
 
-class ShownBody(NamedTuple):
-    """A rigid body and its shape; without a shape its axes are drawn."""
-
-    name: str
-    vertices: Float[np.ndarray, "V 3"] | None = None
-    """In its own frame [m]."""
-    faces: Int[np.ndarray, "F 3"] | None = None
-
-
 class Curve(NamedTuple):
     """A number that changes over the frames."""
 
@@ -64,34 +67,23 @@ class Curve(NamedTuple):
 
 
 class Recording(ABC):
-    """T frames, made when they are asked for.
+    """T frames, made when they are asked for."""
 
-    Args:
-        times: Time of each frame [s], increasing.
-        most_points: The largest number of points in a frame.
-        bodies: The rigid bodies, in the order of `ShownFrame.bodies`.
-        doubts: Spans of frames that deserve a look, the most doubtful first.
-        has_filled: Whether there are points that were not seen.
-    """
-
-    def __init__(
-        self,
-        times: Float[np.ndarray, "T"],
-        label_names: tuple[str, ...],
-        *,
-        most_points: int,
-        radius: float = 0.0035,
-        bodies: tuple[ShownBody, ...] = (),
-        rig: CameraRig | None = None,
-        curves: tuple[Curve, ...] = (),
-        doubts: tuple[SuspectSpan, ...] = (),
-        has_hands: bool = True,
-        has_filled: bool = True,
-    ) -> None:
-        self.times, self.label_names, self.most_points = times, label_names, most_points
-        self.radius, self.bodies, self.rig = radius, bodies, rig
-        self.curves, self.doubts = curves, doubts
-        self.has_hands, self.has_filled = has_hands, has_filled
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s], increasing."""
+    label_names: tuple[str, ...]
+    most_points: int
+    """The largest number of points in a frame."""
+    radius = 0.0035
+    """Of a marker [m]."""
+    bodies: tuple[RigidBody, ...] = ()
+    """The rigid bodies, in the order of `ShownFrame.bodies`."""
+    rig: CameraRig | None = None
+    curves: tuple[Curve, ...] = ()
+    suspects: tuple[SuspectSpan, ...] = ()
+    """Spans of frames that deserve a look, the most doubtful first."""
+    has_hands = has_filled = True
+    """Whether there are hands, and points that were not seen."""
 
     @property
     def num_frames(self) -> int:
@@ -112,19 +104,15 @@ class TakeRecording(Recording):
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
         self._models = tuple(hand.model for hand in take.hands)
-        super().__init__(
-            take.times,
-            take.label_names,
-            most_points=int(take.point_list.counts.max()) + take.hand_labels[-1].stop,
-            radius=take.hands[0].layout.radius,
-            bodies=tuple(shown_body(body) for body in take.bodies),
-            rig=rig_of_settings(take.settings.get("rig")) if rig is None else rig,
-        )
+        self.times, self.label_names = take.times, take.label_names
+        self.most_points = int(take.point_list.counts.max()) + take.hand_labels[-1].stop
+        self.radius, self.bodies = take.hands[0].layout.radius, tuple(take.bodies)
+        self.rig = rig_of_settings(take.settings.get("rig")) if rig is None else rig
         self.replace(take)
 
     def replace(self, take: Take) -> None:
         """Show the same frames with other labels and poses."""
-        self._take, self.curves, self.doubts = take, _curves(take), find_suspect_spans(take)
+        self._take, self.curves, self.suspects = take, _curves(take), find_suspect_spans(take)
         self._filled = np.concatenate([take.filled(side) for side in take.sides], axis=1)
         self._markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
 
@@ -144,24 +132,22 @@ class TakeRecording(Recording):
             bodies=take.body_poses[index],
         )
 
-    def _words(self, index: int) -> list[str]:
+    def _words(self, index: int) -> Iterator[str]:
         take = self._take
-        rows: list[tuple[str, int, float, int]] = [
-            (side, take.status[index, hand], take.rms[index, hand], int(self._filled[index, labels].sum()))
-            for hand, (side, labels) in enumerate(zip(take.sides, take.hand_labels, strict=True))
-        ]
-        rows += [
-            (body.name, take.body_status[index, number], take.body_rms[index, number], 0)
-            for number, body in enumerate(take.bodies)
-        ]
-        lines = []
-        for name, status, rms, filled in rows:
-            parts = [f"**{name}** {STATUSES[status]}"]
-            parts += [f"RMS {1e3 * rms:.2f} mm"] if np.isfinite(rms) else []
-            parts += [f"{filled} filled in"] if filled else []
-            lines.append(", ".join(parts))
-        labels = take.point_list.labels[take.point_list.of(index)]
-        return [*lines, f"{len(labels)} points, {(labels < 0).sum()} without label"]
+        for hand, (side, labels) in enumerate(zip(take.sides, take.hand_labels, strict=True)):
+            filled = int(self._filled[index, labels].sum())
+            yield _words_of(side, STATUSES[take.status[index, hand]], take.rms[index, hand], filled)
+        for number, body in enumerate(take.bodies):
+            status = STATUSES[take.body_status[index, number]]
+            yield _words_of(body.name, status, take.body_rms[index, number])
+        there = take.point_list.labels[take.point_list.of(index)]
+        yield f"{len(there)} points, {(there < 0).sum()} without label"
+
+
+def _words_of(name: str, status: object, rms: float, filled: int = 0) -> str:
+    """The state of a hand or a body."""
+    rms_words = f", RMS {1e3 * rms:.2f} mm" if np.isfinite(rms) else ""
+    return f"**{name}** {status}{rms_words}" + (f", {filled} filled in" if filled else "")
 
 
 def _curves(take: Take) -> tuple[Curve, ...]:
@@ -172,33 +158,59 @@ def _curves(take: Take) -> tuple[Curve, ...]:
     return (*curves, Curve("doubt, 0 to 1", 1.0 - frame_confidence(take)))
 
 
-def shown_body(body: RigidBody) -> ShownBody:
-    """A body with its surface, where that is known."""
-    thing = body.shape
-    return ShownBody(body.name) if thing is None else ShownBody(body.name, thing.vertices, thing.faces)
-
-
 def rig_of_settings(rig: object) -> CameraRig | None:
-    """The rig that settings name or hold; None for a path, which is none to follow."""
+    """The rig that settings name or hold; None for a path, which is not followed."""
     return as_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
+
+
+class LiveRecording(Recording):
+    """The frames of a tracker that runs, of which there is only the newest one."""
+
+    def __init__(
+        self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate], rig: CameraRig | None
+    ) -> None:
+        self._models = tuple(hand.model for hand in hands)
+        self._offsets = np.cumsum([0, *(hand.layout.num_markers for hand in hands)])
+        self.times, self.label_names = np.zeros(1), label_names(hands, bodies)
+        self.most_points, self.radius = _LIVE_POINTS, hands[0].layout.radius
+        self.bodies, self.rig = tuple(bodies), rig
+
+    def frame(self, index: int) -> ShownFrame:
+        """An empty one, because nothing has been tracked."""
+        return ShownFrame(0.0)
+
+    def frame_of(self, frame: StreamedFrame, tracked: TrackedFrame) -> ShownFrame:
+        """A tracked frame as it is shown."""
+        filled = [hand.markers[hand.filled] for hand in tracked.hands]
+        labels = [offset + hand.filled for offset, hand in zip(self._offsets, tracked.hands, strict=False)]
+        bodies = [np.concatenate([body.translation, body.rotation]) for body in tracked.bodies]
+        count = len(frame.points)
+        words = [_words_of(hand.side, hand.status, hand.rms) for hand in tracked.hands]
+        words += [f"**{body.name}** {body.status}" for body in tracked.bodies]
+        return ShownFrame(
+            time=frame.time,
+            words=(*words, f"{count} points", *tracked.notes),
+            hands=self._models,
+            qpos=np.array([hand.qpos for hand in tracked.hands]).reshape(-1, NUM_QPOS),
+            points=np.concatenate([frame.points, *filled]),
+            labels=np.concatenate([tracked.labels, *labels]).astype(np.int64),
+            seen=np.repeat([True, False], [count, sum(map(len, filled))]),
+            bodies=np.array(bodies).reshape(-1, 7),
+        )
 
 
 class CaptureRecording(Recording):
     """A marker file: named trajectories in color, the others gray."""
 
+    has_hands = has_filled = False
+
     def __init__(self, capture: Capture, rig: CameraRig | None = None) -> None:
-        self._positions = capture.positions
         named = np.array([_NO_NAME.match(name) is None for name in capture.names])
-        self._labels = np.where(named, np.cumsum(named) - 1, -1)
-        counts = np.isfinite(capture.positions[..., 0]).sum(axis=1)
-        super().__init__(
-            np.arange(capture.num_frames) / capture.rate,
-            tuple(itertools.compress(capture.names, named)),
-            most_points=int(counts.max()),
-            rig=rig,
-            has_hands=False,
-            has_filled=False,
-        )
+        self._positions, self._labels = capture.positions, np.where(named, np.cumsum(named) - 1, -1)
+        self.times = np.arange(capture.num_frames) / capture.rate
+        self.label_names = tuple(itertools.compress(capture.names, named))
+        self.most_points = int(np.isfinite(capture.positions[..., 0]).sum(axis=1).max())
+        self.rig = rig
 
     def frame(self, index: int) -> ShownFrame:
         """One of the frames."""
@@ -225,13 +237,10 @@ class DatasetRecording(Recording):
         self._dataset = dataset
         self._starts = np.cumsum([0, *map(len, dataset.shards)])
         self._model: tuple[tuple[int, int], HandModel] | None = None
-        markers, ghosts = len(dataset.marker_names), dataset.shards[0].dtype["ghosts"].shape[0]
-        super().__init__(
-            np.arange(self._starts[-1]) / _ROWS_PER_SECOND,
-            dataset.marker_names,
-            most_points=markers + ghosts,
-            rig=rig_of_settings(dataset.manifest.config.get("rig")) if rig is None else rig,
-        )
+        self.times = np.arange(self._starts[-1]) / _ROWS_PER_SECOND
+        self.label_names = dataset.marker_names
+        self.most_points = len(dataset.marker_names) + dataset.shards[0].dtype["ghosts"].shape[0]
+        self.rig = rig_of_settings(dataset.manifest.config.get("rig")) if rig is None else rig
 
     def frame(self, index: int) -> ShownFrame:
         """One of the rows."""
@@ -240,7 +249,6 @@ class DatasetRecording(Recording):
         observed = np.isfinite(row["observed"][:, 0])
         markers = np.where(observed[:, None], row["observed"], row["markers"])
         ghosts = row["ghosts"][np.isfinite(row["ghosts"][:, 0])]
-        labels = np.concatenate([np.arange(len(markers)), np.full(len(ghosts), -1)])
         model = self._hand(shard, int(row["hand"]))
         return ShownFrame(
             time=float(self.times[index]),
@@ -251,7 +259,7 @@ class DatasetRecording(Recording):
             hands=(model,),
             qpos=row["qpos"].astype(np.float64)[None],
             points=np.concatenate([markers, ghosts]).astype(np.float64),
-            labels=labels,
+            labels=np.concatenate([np.arange(len(markers)), np.full(len(ghosts), -1)]),
             seen=np.concatenate([observed, np.ones(len(ghosts), dtype=np.bool_)]),
             rays=self._rays(row["markers"], row["cameras"]),
         )
@@ -259,8 +267,7 @@ class DatasetRecording(Recording):
     def _hand(self, shard: int, number: int) -> HandModel:
         """The hand of a row; rows that follow each other mostly share it."""
         if self._model is None or self._model[0] != (shard, number):
-            shape = self._dataset.hands(shard)[number]
-            self._model = ((shard, number), HandModel(shape))
+            self._model = ((shard, number), HandModel(self._dataset.hands(shard)[number]))
         return self._model[1]
 
     def _rays(self, markers: np.ndarray, cameras: UInt32[np.ndarray, "M"]) -> np.ndarray:
@@ -269,3 +276,67 @@ class DatasetRecording(Recording):
         numbers = np.arange(len(self.rig.positions), dtype=np.uint32)
         marker, camera = np.nonzero((cameras[:, None] >> numbers) & 1)
         return np.stack([markers[marker], self.rig.positions[camera]], axis=1).astype(np.float64)
+
+
+def label_colors(names: Sequence[str]) -> UInt8[np.ndarray, "K 3"]:
+    """A color for each label, and last that of points without one.
+
+    Markers of one name on two hands ("right:ThumbTip") have the same color.
+    """
+    bare = [name.rsplit(":", 1)[-1] for name in names]
+    order = {name: number for number, name in enumerate(dict.fromkeys(bare))}
+    # Hues in the order of the glove, so that neighbors differ little and digits differ much; two brightnesses
+    # tell neighbors apart.
+    colors = [
+        colorsys.hsv_to_rgb(0.92 * order[name] / max(len(order), 1), 1.0, 0.9 if order[name] % 2 else 0.6)
+        for name in bare
+    ]
+    labeled = np.round(255 * np.array(colors).reshape(-1, 3)).astype(np.uint8)
+    return np.concatenate([labeled, np.array([GHOST_COLOR], dtype=np.uint8)])
+
+
+def write_video(
+    path: Path,
+    recording: Recording,
+    shown: Float[np.ndarray, "N 3"],
+    *,
+    write_clip: Callable[..., None],
+    progress: Progress = no_progress,
+) -> int:
+    """Write what a recording shows, at its own pace; returns the number of pictures.
+
+    Args:
+        path: The file, .mp4.
+        shown: Points [m] that the view holds.
+        write_clip: What draws and encodes the pictures, from `render.illustrations`.
+        progress: Called after each picture.
+
+    Raises:
+        ArgumentError: The file's name ends otherwise.
+        FileError: It cannot be written.
+    """
+    rate, frames = chosen_frames(recording.times)
+    palette = label_colors(recording.label_names) / 255.0
+
+    def pictures() -> Iterator[tuple[Any, ...]]:
+        for number, index in enumerate(frames, start=1):
+            frame = recording.frame(index)
+            hands = list(zip(frame.hands, frame.qpos, strict=True))
+            points, labels = frame.points[frame.seen], frame.labels[frame.seen]
+            yield hands, points, palette[labels], f"frame {index}, {frame.time:.2f} s"
+            progress(number, len(frames))
+
+    there = shown[np.isfinite(shown).all(axis=1)]
+    write_clip(path, pictures(), rate=rate, shown=there, radius=recording.radius)
+    return len(frames)
+
+
+def chosen_frames(times: Float[np.ndarray, "T"]) -> tuple[float, list[int]]:
+    """The rate of a video [Hz], and the frame of each of its pictures: the last one up to its time."""
+    if len(times) < 2:
+        return _VIDEO_RATE, [0]
+    rate = min(_VIDEO_RATE, 1.0 / float(np.median(np.diff(times))))
+    count = int(np.floor((times[-1] - times[0]) * rate + 1e-6)) + 1
+    moments = times[0] + np.arange(count) / rate
+    frames = np.searchsorted(times, moments + 1e-6, side="right") - 1
+    return rate, [int(frame) for frame in frames]

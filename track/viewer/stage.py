@@ -1,19 +1,39 @@
-"""Where things stand in the page: light, a ground grid, z upwards, and the first look."""
+"""What stands in the page: light, ground and first look, cameras, skins, points and bodies.
+
+Only what changed is sent to the page.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from jaxtyping import Float
+import trimesh
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from gloves.takes.take import RigidBody
+from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_QPOS
 from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rotation_quaternions
+from track.viewer.recordings import Recording, ShownFrame, label_colors
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import (
+        BatchedMeshHandle,
+        FrameHandle,
+        LabelHandle,
+        LineSegmentsHandle,
+        MeshHandle,
+        MeshSkinnedHandle,
+        SceneNodePointerEvent,
+        ViserServer,
+    )
 
+    from handsim.hand.shape import Side
 
 _FROM: Final = np.array([0.62, -0.62, 0.48])  # direction of the first look, from its target
 _NEAREST: Final = 0.22  # [m] between the eye and its target, at least
@@ -22,6 +42,11 @@ _SPACING: Final = 0.2  # [m] between the points whose cameras are counted
 _MOST_POINTS: Final = 40_000
 _FRUSTUM: Final = 0.12  # [m]
 _FEW, _MANY = np.array([214, 96, 60]), np.array([40, 120, 180])
+SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
+"""A right and a left hand look different."""
+_FILLED: Final = 0.45  # size of a marker that was not seen
+_BODY_COLOR: Final = (120, 124, 132)
+_RAY_COLOR: Final = (235, 170, 60)
 
 
 def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: float | None = None) -> None:
@@ -130,3 +155,287 @@ def box_edges(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> NDAr
     pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
     edges: NDArray[np.float64] = (low + corners * (high - low))[np.array(pairs)]
     return edges
+
+
+class HandSkin:
+    """The skin of one hand; the mesh stands in the wrist's frame, its bones in that mesh.
+
+    So a hand that moves as a whole sends two small messages, and a bone that keeps its place none.
+
+    Args:
+        name: Of the node in the scene.
+        color: Of the skin, 0 to 255; that of the hand's side when None.
+        opacity: Less than 1 for skin that one sees through.
+    """
+
+    def __init__(
+        self,
+        server: ViserServer,
+        name: str,
+        *,
+        color: tuple[int, int, int] | None = None,
+        opacity: float | None = None,
+    ) -> None:
+        self._server, self._name, self._color, self._opacity = server, name, color, opacity
+        self._model: HandModel | None = None
+        self.mesh: MeshSkinnedHandle | None = None
+        """The mesh in the page, once there is a hand."""
+
+    def show(self, model: HandModel, qpos: Float[np.ndarray, "27"]) -> None:
+        """Show a pose.
+
+        Args:
+            model: The hand; another one than before is sent anew.
+            qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; hidden where NaN.
+        """
+        if not np.isfinite(qpos).all():
+            if self.mesh is not None and self.mesh.visible:
+                self.mesh.visible = False
+            return
+        if self.mesh is None or model is not self._model:
+            self.mesh, self._model = self._send(model), model
+        local = np.zeros((1, NUM_QPOS))
+        local[0, 3], local[0, 7:] = 1.0, qpos[7:]
+        positions, quaternions = _poses(model.forward_kinematics(local)[0])
+        for bone, position, quaternion in zip(self.mesh.bones, positions, quaternions, strict=True):
+            bone.position, bone.wxyz = position, quaternion
+        self.mesh.position = qpos[:3]
+        self.mesh.wxyz = qpos[3:7] / np.linalg.norm(qpos[3:7])
+        if not self.mesh.visible:
+            self.mesh.visible = True
+
+    def _send(self, model: HandModel) -> MeshSkinnedHandle:
+        surface = model.surface
+        weights = np.zeros((len(surface.vertices), len(model.rest_transforms)))
+        np.add.at(
+            weights, (np.arange(len(weights))[:, None], surface.bone_indices), surface.bone_weights
+        )  # at most four bones move a vertex, which is also the page's limit
+        positions, quaternions = _poses(model.rest_transforms)
+        return self._server.scene.add_mesh_skinned(
+            self._name,
+            surface.vertices,
+            surface.faces,
+            bone_wxyzs=quaternions,
+            bone_positions=positions,
+            skin_weights=weights,
+            color=self._color or SKIN_COLORS[model.shape.side],
+            opacity=self._opacity,
+        )
+
+
+def _poses(transforms: Float[np.ndarray, "L 4 4"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (L, 3) and quaternions (L, 4), wxyz."""
+    return transforms[:, :3, 3], rotation_quaternions(transforms[:, :3, :3])
+
+
+class PointBalls:
+    """Up to `most` balls at once, all in one message a frame.
+
+    Args:
+        name: Of the node in the scene.
+        most: Number of balls.
+        radius: Of a ball [m].
+    """
+
+    def __init__(
+        self, server: ViserServer, name: str, label_names: tuple[str, ...], *, most: int, radius: float
+    ) -> None:
+        self._server, self._name, self._names = server, name, label_names
+        self._palette = label_colors(label_names)  # the last row is that of label -1
+        self._texts: dict[int, LabelHandle] = {}
+        self._chosen: frozenset[int] = frozenset()
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        count = max(most, 1)
+        self._positions = np.zeros((count, 3), dtype=np.float32)
+        self._scales = np.zeros(count, dtype=np.float32)
+        self._colors = np.zeros((count, 3), dtype=np.uint8)
+        self._points, self._labels = np.empty((0, 3)), np.empty(0, dtype=np.int64)
+        self.balls = server.scene.add_batched_meshes_simple(
+            name,
+            np.asarray(ball.vertices),
+            np.asarray(ball.faces),
+            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (count, 1)),
+            batched_positions=self._positions,
+            batched_scales=self._scales,
+            batched_colors=self._colors,
+            lod="off",
+            cast_shadow=False,
+        )
+        """All balls; those that are not in use have no size."""
+
+    def show(
+        self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], seen: Bool[np.ndarray, "N"]
+    ) -> None:
+        """Show these points [m]; those that were not seen are small."""
+        count = min(len(points), len(self._positions))
+        self._points, self._labels = points[:count], labels[:count]
+        positions, scales, colors = self._positions.copy(), np.zeros_like(self._scales), self._colors.copy()
+        positions[:count] = self._points
+        scales[:count] = np.where(seen[:count], 1.0, _FILLED)
+        colors[:count] = self._palette[self._labels]
+        if not np.array_equal(positions, self._positions):
+            self.balls.batched_positions = self._positions = positions
+        if not np.array_equal(scales, self._scales):
+            self.balls.batched_scales = self._scales = scales
+        if not np.array_equal(colors, self._colors):
+            self.balls.batched_colors = self._colors = colors
+        self._show_names()
+
+    def name(self, labels: frozenset[int]) -> None:
+        """Show the names of these labels, and no others, where their points are."""
+        self._chosen = labels
+        self._show_names()
+
+    def nearest(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> int | None:
+        """The index of the shown point that is nearest to a ray; None where there are none."""
+        if not len(self._points):
+            return None
+        unit = direction / np.linalg.norm(direction)
+        offsets = self._points - origin
+        away = np.linalg.norm(offsets - (offsets @ unit)[:, None] * unit, axis=1)
+        return int(away.argmin())
+
+    def label_at(self, index: int) -> int:
+        """The label of a shown point."""
+        return int(self._labels[index])
+
+    def _show_names(self) -> None:
+        places = {int(label): point for label, point in zip(self._labels, self._points, strict=True)}
+        for label in self._chosen & places.keys():
+            if label not in self._texts:
+                self._texts[label] = self._server.scene.add_label(
+                    f"{self._name}/names/{label}",
+                    self._names[label].rsplit(":", 1)[-1],  # the hand is seen
+                    font_screen_scale=0.7,
+                    anchor="bottom-left",
+                )
+            self._texts[label].position = places[label]
+        for label, text in self._texts.items():
+            shown = label in self._chosen and label in places
+            if text.visible != shown:
+                text.visible = shown
+
+
+class FrameView:
+    """The scene of a recording, with switches of what is shown."""
+
+    def __init__(self, server: ViserServer, recording: Recording) -> None:
+        self._server, self._recording = server, recording
+        self._cameras_node = server.scene.add_frame("/cameras", show_axes=False)
+        self._hands_node = server.scene.add_frame("/hands", show_axes=False)
+        self.skins: list[HandSkin] = []
+        """The skins of the hands, in their order."""
+        self.balls = PointBalls(
+            server,
+            "/points",
+            recording.label_names,
+            most=recording.most_points,
+            radius=recording.radius,
+        )
+        """The points."""
+        self.bodies = [_add_body(server, body) for body in recording.bodies]
+        """The rigid bodies, in their order."""
+        self._rays: LineSegmentsHandle | None = None
+        self._clicked: frozenset[int] = frozenset()
+        self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points among the frame's
+        self.on_pick: Callable[[int], None] = lambda index: None
+        """Called with the index of a point of the frame that was clicked."""
+        self._frame: ShownFrame | None = None
+        self._lock = threading.RLock()  # switches are pressed in threads of viser's pool
+        self._add_switches()
+        if recording.rig is not None:
+            show_rig(server, recording.rig)
+        self.balls.balls.on_click(self._click)
+
+    def show(self, frame: ShownFrame) -> None:
+        """Show a frame; all of it appears at once."""
+        with self._lock, self._server.atomic():
+            while len(self.skins) < len(frame.hands):
+                self.skins.append(HandSkin(self._server, f"/hands/{len(self.skins)}"))
+            for skin, model, qpos in zip(self.skins, frame.hands, frame.qpos, strict=True):
+                skin.show(model, qpos)
+            for body, pose in zip(self.bodies, frame.bodies, strict=True):
+                there = bool(np.isfinite(pose).all())
+                if there:
+                    body.position, body.wxyz = pose[:3], pose[3:]
+                if body.visible != there:
+                    body.visible = there
+            self._frame = frame
+            self._update_points()
+            self._update_rays()
+
+    def _add_switches(self) -> None:
+        with self._server.gui.add_folder("Show"):
+            self._names = self._server.gui.add_checkbox("names", False, hint="A click on a point names it.")
+            self._ghosts = self._server.gui.add_checkbox("unlabeled points", True)
+            self._filled = self._server.gui.add_checkbox(
+                "filled-in markers", True, visible=self._recording.has_filled
+            )
+            self._hands = self._server.gui.add_checkbox("skin", True, visible=self._recording.has_hands)
+            cameras = self._server.gui.add_checkbox("cameras", True, visible=self._recording.rig is not None)
+            center = self._server.gui.add_button("Look at the hands", color="gray", hint="C")
+            rays = self._recording.frame(0).rays if self._recording.num_frames else np.empty((0, 2, 3))
+            self._sight = self._server.gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
+        for switch in (self._names, self._ghosts, self._filled, self._sight):
+            switch.on_update(lambda _: self._refresh())
+        center.on_click(self._look)
+        self._server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
+        cameras.on_update(lambda _: setattr(self._cameras_node, "visible", cameras.value))
+        self._hands.on_update(lambda _: setattr(self._hands_node, "visible", self._hands.value))
+
+    def _look(self, event: Any) -> None:
+        """Move the eye of the page that asks, so that the hands are in the middle; it keeps its direction."""
+        frame, client = self._frame, event.client
+        if frame is None or client is None:
+            return
+        points = np.concatenate([frame.qpos[:, :3], frame.points[frame.labels >= 0]])
+        points = points[np.isfinite(points).all(axis=1)]
+        points = points if len(points) else frame.points
+        if len(points):
+            camera = client.camera
+            camera.position = camera.position + points.mean(axis=0) - camera.look_at
+
+    def _refresh(self) -> None:
+        with self._lock, self._server.atomic():
+            self._update_points()
+            self._update_rays()
+
+    def _update_points(self) -> None:
+        if self._frame is None:
+            return
+        frame = self._frame
+        kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
+        self._kept = np.flatnonzero(kept)
+        self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
+        every = frozenset(range(len(self._recording.label_names)))
+        self.balls.name(every if self._names.value else self._clicked)
+
+    def _update_rays(self) -> None:
+        rays = self._frame.rays if self._frame is not None and self._sight.value else np.empty((0, 2, 3))
+        if self._rays is not None:
+            if np.array_equal(self._rays.points, rays.astype(np.float32)):
+                return
+            self._rays.remove()
+            self._rays = None
+        if len(rays):
+            self._rays = self._server.scene.add_line_segments(
+                "/rays", points=rays, colors=_RAY_COLOR, thickness=1.0, thickness_units="screen"
+            )
+
+    def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
+        """Name the clicked marker, or leave it without a name again."""
+        index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))
+        if index is None:
+            return
+        if (label := self.balls.label_at(index)) >= 0:
+            self._clicked ^= {label}
+            self._refresh()
+        self.on_pick(int(self._kept[index]))
+
+
+def _add_body(server: ViserServer, body: RigidBody) -> MeshHandle | FrameHandle:
+    """A body's surface, where that is known, or its axes."""
+    name, thing = f"/bodies/{body.name.replace('/', '_')}", body.shape
+    if thing is None:
+        return server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002)
+    return server.scene.add_mesh_simple(name, thing.vertices, thing.faces, color=_BODY_COLOR, opacity=0.6)

@@ -1,18 +1,28 @@
-"""The timeline: which frame is shown, by slider, keys, playing and rows of doubtful frames."""
+"""Time in the page: a recording is played, with texts and plots beside it, or a live tracker is shown."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from handsim.callbacks import Closing
+from track.frames import StreamedFrame, TrackedFrame
+from track.rigid_body import RigidTemplate
+from track.viewer.recordings import LiveRecording, Recording, ShownFrame
+from track.viewer.stage import FrameView, set_stage
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import GuiButtonHandle, GuiFolderHandle, GuiUplotHandle, ViserServer, uplot
+
+    from handsim.space.rig import CameraRig
 
 PICTURES: Final = 60.0
 """Pictures per second while playing, at most [Hz]."""
@@ -21,6 +31,10 @@ _SLIDER: Final = 0.1  # [s] between two moves of the slider while playing
 _IDLE: Final = 0.2  # [s] between two looks at whether the viewer shall end
 
 Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "pagedown"]
+_EVERY: Final = 0.1  # [s] between two texts while frames follow each other quickly
+_COLUMNS: Final = 600  # of a plot
+_STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
+_TEXT_EVERY: Final = 0.2  # [s]
 
 
 class Timeline:
@@ -151,3 +165,164 @@ class Timeline:
 
 def _call(action: Callable[[], None], _event: object) -> None:
     action()
+
+
+class StatusPanel:
+    """Text of the shown frame, plots, and rows that lead to doubtful frames."""
+
+    def __init__(self, server: ViserServer, recording: Recording) -> None:
+        self._server, self._recording, self._due = server, recording, 0.0
+        self.text = server.gui.add_markdown("")
+        """The state of the frame."""
+        self._go_to: Callable[[int], None] = lambda frame: None
+        self._rows: GuiFolderHandle | None = None
+        self._buttons: list[GuiButtonHandle] = []
+        self._plots: list[tuple[GuiUplotHandle, list[int]]] = []
+
+    def add_doubts(self, go_to: Callable[[int], None]) -> None:
+        """Add the rows of doubtful frames, if there are any.
+
+        Args:
+            go_to: Called with a frame whose row was clicked.
+        """
+        self._go_to = go_to
+        if self._recording.suspects:
+            self._rows = self._server.gui.add_folder("Doubtful frames")
+            self._add_rows(self._rows)
+
+    def add_plots(self) -> None:
+        """Add the plots, if there is anything to plot."""
+        server, recording = self._server, self._recording
+        if recording.curves and recording.num_frames > 1:
+            with server.gui.add_folder("Over time", expand_by_default=True):
+                groups: dict[bool, list[int]] = {}
+                for number, curve in enumerate(recording.curves):
+                    groups.setdefault(curve.name.endswith("]"), []).append(number)
+                plots = []
+                for numbers in groups.values():
+                    series: list[uplot.Series] = [{"label": "time [s]"}]
+                    for number, stroke in zip(numbers, _STROKES, strict=False):
+                        name = recording.curves[number].name
+                        series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
+                    plot = server.gui.add_uplot(
+                        _columns(recording, numbers), tuple(series), scales={"x": {"time": False}}, aspect=2.2
+                    )
+                    plots.append((plot, numbers))
+                self._plots = plots
+
+    def renew(self) -> None:
+        """Show the rows and the plots of a recording that was changed."""
+        if self._rows is not None:
+            for row in self._buttons:
+                row.remove()
+            self._add_rows(self._rows)
+        for plot, numbers in self._plots:
+            plot.data = _columns(self._recording, numbers)
+
+    def _add_rows(self, folder: GuiFolderHandle) -> None:
+        self._buttons = []
+        with folder:
+            for doubt in self._recording.suspects:
+                span = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first}-{doubt.last}"
+                row = self._server.gui.add_button(f"{span}: {doubt.words}", color="gray")
+                row.on_click(partial(_jump, self._go_to, doubt.worst))
+                self._buttons.append(row)
+
+    def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
+        """Show the state of a frame; where `hurried`, not more than ten times a second."""
+        now = time.perf_counter()
+        if hurried and now < self._due:
+            return
+        self._due = now + _EVERY
+        head = f"**frame {index}** of {self._recording.num_frames}, {frame.time:.3f} s"
+        self.text.content = "\n\n".join((head, *frame.words))
+
+
+def _jump(go_to: Callable[[int], None], frame: int, _event: object) -> None:
+    go_to(frame)
+
+
+def _columns(recording: Recording, numbers: list[int]) -> tuple[np.ndarray, ...]:
+    """Times, and the values of some curves."""
+    columns = [thinned(recording.times, recording.curves[number].values) for number in numbers]
+    return (columns[0][0], *(values for _, values in columns))
+
+
+def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
+    """A curve of at most as many values as a plot has columns: the largest of each column.
+
+    Args:
+        times: (T,) [s].
+        values: (T,); NaN where there is none.
+    """
+    step = -(-len(times) // _COLUMNS)
+    starts = np.arange(0, len(times), step)
+    return times[starts], np.fmax.reduceat(values, starts)
+
+
+class LiveView(Closing):
+    """Shows the newest frame of a tracker, from a thread of its own; frames in between are left out.
+
+    It takes frames as a sink does.
+    """
+
+    def __init__(self, server: ViserServer, rig: CameraRig | None = None) -> None:
+        self._server, self._rig = server, rig
+        self._newest: tuple[StreamedFrame, TrackedFrame] | None = None
+        self._came, self._ending = threading.Event(), False
+        self._thread: threading.Thread | None = None
+        self.frames = self.pictures = 0
+        """Frames that came, and pictures that were made of them."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """No frame counts as dropped."""
+        return {}
+
+    def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
+        """Take on a tracker's hands and bodies."""
+        self._recording = LiveRecording(hands, bodies, self._rig)
+        self._view = FrameView(self._server, self._recording)
+        self._text = self._server.gui.add_markdown("waiting for the first frame")
+        self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
+        self._thread.start()
+
+    def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Give the newest frame; this takes microseconds, whatever the page does."""
+        if not frame.silent:
+            self.frames += 1
+            self._newest = (frame, tracked)
+            self._came.set()
+
+    def notes(self) -> tuple[str, ...]:
+        """How many frames were shown."""
+        return (f"{self.frames} frames tracked, {self.pictures} of them shown",)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ending = True
+        self._came.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _draw(self) -> None:
+        due = text_due = 0.0
+        is_staged = False
+        while not self._ending:
+            self._came.wait()
+            self._came.clear()
+            newest, self._newest = self._newest, None
+            if newest is None:
+                continue
+            shown = self._recording.frame_of(*newest)
+            self._view.show(shown)
+            self.pictures += 1
+            if not is_staged and len(shown.points) and np.isfinite(shown.qpos).any():
+                set_stage(self._server, shown.points)
+                is_staged = True
+            now = time.perf_counter()
+            if now >= text_due:
+                text_due = now + _TEXT_EVERY
+                self._text.content = "\n\n".join((f"**live** frame {newest[0].number}", *shown.words))
+            due = max(due + 1.0 / PICTURES, now)
+            time.sleep(due - now)

@@ -37,15 +37,17 @@ from train.data.shards import row_dtype
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 from train.labelers.pose_prior import PosePrior, learn_pose_prior
 from train.labelers.protocol import (
+    LEARNED,
     Labeling,
     label_by_scores,
     label_in_batches,
     labeling_threads,
+    learned_folder,
+    learned_gloves,
     pad_clouds,
     torch_threads,
 )
-from train.labelers.storage import LEARNED, learned_folder, learned_gloves
-from train.settings import TrainSettings
+from train.settings import TrainSettings, batch_recipe
 from train.simulation.training_frames import (
     FrameSource,
     GenerateSettings,
@@ -269,7 +271,7 @@ def fine_tuned_labeler(
         models = sample_hands(source.settings.population, rng=rng)
         simulate_frames(rows[first : first + _POSES_EACH], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
-    recipe = TrainSettings(batch=_BATCH).batch_recipe(layout.num_markers)
+    recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
     optimizer = new_optimizer(network)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):

@@ -34,7 +34,7 @@ from train.labelers.matching import IMPOSSIBLE, SINKHORN
 from train.labelers.pose_prior import PosePrior
 from train.labelers.protocol import Labeler, labeling_threads
 from train.labelers.set_inference import TrainedSetLabeler
-from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSettings
+from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSettings, batch_recipe
 
 
 class LabelScores(NamedTuple):
@@ -424,7 +424,7 @@ def prepare_network(network: nn.Module, rows: NDArray[np.void] | MappedRows) -> 
     if isinstance(network, DeepLabelCNN):
         rng = np.random.default_rng(0)
         config = TrainSettings(batch=_PREPARED, rig_share=0.0, anisotropy=0.0)
-        batch = draw_batch(rows, config.batch_recipe(network.config.num_labels), rng=rng)
+        batch = draw_batch(rows, batch_recipe(config, network.config.num_labels), rng=rng)
         hand = MeanHand.of_clouds(batch.markers, batch.cloud.points, batch.cloud.present)
         network.mean_hand.set(hand)
 

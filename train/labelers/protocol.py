@@ -9,9 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
+import platformdirs
 from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
@@ -24,6 +26,8 @@ from train.labelers.pose_prior import PosePrior
 
 LABELERS: Final = "handsim.labelers"
 """Group of entry points of labelers."""
+LEARNED: Final = ".safetensors"
+"""How the files in `learned_folder` end."""
 _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 MOST_THREADS: Final = 1024
@@ -143,6 +147,17 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
     if len(cloud) > MAX_POINTS:
         raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     return cloud
+
+
+def learned_folder() -> Path:
+    """Where labelers of learned gloves are kept; `XDG_CACHE_HOME` moves it."""
+    return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
+
+
+def learned_gloves() -> tuple[Path, ...]:
+    """The files of the gloves that are kept, the most recently used first."""
+    files = learned_folder().glob(f"*{LEARNED}")
+    return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def label_on(threads: int) -> None:

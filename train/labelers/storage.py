@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import platformdirs
 from jaxtyping import Float
 from numpy.typing import NDArray
 
@@ -56,8 +55,6 @@ if TYPE_CHECKING:
 
 ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
-LEARNED: Final = ".safetensors"
-"""How the files in `learned_folder` end."""
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
 _ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
@@ -221,17 +218,6 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
             stacklevel=3,
         )
     return learned_labeler(layout)
-
-
-def learned_folder() -> Path:
-    """Where labelers of learned gloves are kept; `XDG_CACHE_HOME` moves it."""
-    return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
-
-
-def learned_gloves() -> tuple[Path, ...]:
-    """The files of the gloves that are kept, the most recently used first."""
-    files = learned_folder().glob(f"*{LEARNED}")
-    return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def shipped_labelers() -> tuple[str, ...]:

@@ -4,28 +4,32 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
-from handsim.app.page import Section, write_page
 from handsim.errors import DatasetError
-from handsim.hand.shape import JOINTS, SIDES
+from handsim.hand.shape import DIGITS, JOINTS, SIDES
+from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
 from handsim.space.rig import as_rig
 from train.data.shards import Dataset, hands_name
-from train.reports import dataset_plots as _plots
-from train.reports.plot_style import picture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 REPORT: Final = "report.html"
 MOST_ROWS: Final = 50_000
 """Rows read for the plots; larger sets are sampled evenly."""
-ANGLE_BINS: Final = 40
+_ANGLE_BINS: Final = 40
 _CHUNK: Final = 1024  # rows whose marker pairs are held in memory at one time
 _LOW: Final = np.array([joint.low for joint in JOINTS])
 _HIGH: Final = np.array([joint.high for joint in JOINTS])
+_PUBLISHED_MEDIAN: Final = (3, 4)  # median gap of real finger markers [frames]: lowest and highest take
+_PUBLISHED_P90: Final = (24, 43)  # the same, 90th percentile
 
 
 def write_dataset_page(
@@ -56,7 +60,7 @@ def write_dataset_page(
     ]
     if present is not None:
         sections.append(gap_section(present, rate))
-    write_page(
+    write_sections(
         path,
         sections,
         title=f"Training set {dataset.path.resolve().name}",
@@ -64,31 +68,6 @@ def write_dataset_page(
         f"{manifest.config['rig']}, seed {manifest.config['seed']}.",
     )
     return path
-
-
-def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
-    """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
-    if present.ndim != 2 or not present.size or present.dtype != np.bool_:
-        raise DatasetError(
-            f"present is {present.dtype} of shape {present.shape}, expected bool (frames, markers)"
-        )
-    if not 0.0 < rate < np.inf:
-        raise DatasetError(f"rate is {rate:g} Hz, expected a positive number")
-    lengths = run_lengths(~present, inside=True)
-    frames, markers = present.shape
-    text = (
-        f"A continuous take of {frames:,} frames at {rate:g} Hz. Of its {markers} markers "
-        f"{100 * (~present).mean():.2f} % are missing, in {len(lengths):,} gaps; gaps that the take's ends "
-        "cut off are not counted."
-    )
-    if not len(lengths):
-        return Section("Gaps", text)
-    drawn = picture((9.0, 4.2), partial(_plots.draw_gaps, lengths=lengths, rate=rate))
-    caption = (
-        "Share of gaps by length. Orange: median and 90th percentile of the gap lists of real finger markers "
-        "that were published with LocalMoCap (SIGGRAPH 2023)."
-    )
-    return Section("Gaps", text, pictures=[(drawn, caption)])
 
 
 def sample_rows(dataset: Dataset, most: int = MOST_ROWS) -> Shaped[np.ndarray, "T"]:
@@ -101,45 +80,6 @@ def sample_rows(dataset: Dataset, most: int = MOST_ROWS) -> Shaped[np.ndarray, "
         parts.append(shard[here])
         first += len(shard)
     return np.concatenate(parts)
-
-
-def angle_shares(rows: Shaped[np.ndarray, "T"], bins: int = ANGLE_BINS) -> Float[np.ndarray, "20 N"]:
-    """Share of frames in each of equally wide bins over the range of each joint angle."""
-    angles = np.rad2deg(rows["qpos"][:, 7:].astype(np.float64))
-    index = np.floor((angles - _LOW) / (_HIGH - _LOW) * bins).astype(np.int64).clip(0, bins - 1)
-    counts = np.stack([np.bincount(index[:, joint], minlength=bins) for joint in range(len(JOINTS))])
-    return counts / len(rows)
-
-
-def camera_shares(rows: Shaped[np.ndarray, "T"], num_cameras: int) -> Float[np.ndarray, "M C+1"]:
-    """Share of frames in which exactly 0, 1, ... cameras see each marker."""
-    counts = np.bitwise_count(rows["cameras"])
-    return np.stack([(counts == n).mean(axis=0) for n in range(num_cameras + 1)], axis=1)
-
-
-def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
-    """Frames with 0, 1, ... ghosts."""
-    here = np.isfinite(rows["ghosts"][..., 0])
-    return np.bincount(here.sum(axis=1), minlength=here.shape[1] + 1)
-
-
-def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
-    """From every ghost to the nearest marker of its frame, seen or not [m]."""
-    frame, ghost = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
-    away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, ghost][:, None]
-    distances: NDArray[np.float64] = np.linalg.norm(away, axis=-1).min(axis=1)
-    return distances
-
-
-def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"]:
-    """From every marker to the nearest other one, seen or not, center to center [m]."""
-    parts = []
-    for first in range(0, len(rows), _CHUNK):
-        markers = rows["markers"][first : first + _CHUNK]
-        apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
-        apart[:, range(markers.shape[1]), range(markers.shape[1])] = np.inf
-        parts.append(apart.min(axis=-1))
-    return np.concatenate(parts).astype(np.float64)
 
 
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:
@@ -167,9 +107,6 @@ def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section
 
 
 def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
-    edges = np.linspace(_LOW, _HIGH, ANGLE_BINS + 1, axis=1)
-    middle = np.rad2deg(np.percentile(rows["qpos"][:, 7:], [1.0, 99.0], axis=0)).T
-    draw = partial(_plots.draw_angles, shares=angle_shares(rows), edges=edges, middle=middle)
     text = (
         "Share of frames by angle, for each of the twenty joints. Zero is the flat hand; flexion counts "
         "towards the palm, abduction towards the thumb (the thumb's: away from the palm)."
@@ -178,44 +115,279 @@ def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
         "Gray: the joint's range. Orange: between these angles lie 98 % of the frames. The four fingers of a "
         "row share their axes."
     )
-    return Section("Joint angles", text, pictures=[(picture((10.8, 7.0), draw), caption)])
+    middle = np.rad2deg(np.percentile(rows["qpos"][:, 7:], [1.0, 99.0], axis=0)).T
+    drawn = picture((10.8, 7.0), _draw_angles, angle_shares(rows), middle)
+    return Section("Joint angles", text, pictures=[(drawn, caption)])
+
+
+def angle_shares(rows: Shaped[np.ndarray, "T"], bins: int = _ANGLE_BINS) -> Float[np.ndarray, "20 N"]:
+    """Share of frames in each of equally wide bins over the range of each joint angle."""
+    angles = np.rad2deg(rows["qpos"][:, 7:].astype(np.float64))
+    index = np.floor((angles - _LOW) / (_HIGH - _LOW) * bins).astype(np.int64).clip(0, bins - 1)
+    counts = np.stack([np.bincount(index[:, joint], minlength=bins) for joint in range(len(JOINTS))])
+    return counts / len(rows)
+
+
+def _draw_angles(
+    figure: Figure, shares: Float[np.ndarray, "20 N"], middle: Float[np.ndarray, "20 2"]
+) -> None:
+    """One column per digit, one row per joint angle from the knuckle outwards; `middle` is in [deg]."""
+    panels = figure.subplots(4, 5)
+    edges = np.linspace(_LOW, _HIGH, _ANGLE_BINS + 1, axis=1)
+    for number, joint in enumerate(JOINTS):
+        digit, row = divmod(number, 4)
+        panel: Axes = panels[row, digit]
+        if digit > 1:  # the thumb has axes of its own; linked before anything is drawn, so that all fits
+            panel.sharex(panels[row, 1])
+            panel.sharey(panels[row, 1])
+        density = 100.0 * shares[number] / np.diff(edges[number])
+        panel.axvspan(joint.low, joint.high, color=Paint.BAND, linewidth=0)
+        panel.stairs(density, edges[number], fill=True, color=Paint.BLUE)
+        panel.set_title(
+            joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=Paint.SOFT, fontsize=8.5
+        )
+        panel.margins(x=0.03, y=0.08)
+        panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
+        panel.plot(
+            middle[number], [0.0, 0.0], color=Paint.WARM, linewidth=2.6, solid_capstyle="butt", clip_on=False
+        )
+        panel.xaxis.set_major_formatter("{x:.0f}°")
+        panel.locator_params(axis="x", nbins=5)
+        panel.locator_params(axis="y", nbins=3)
+        panel.tick_params(labelsize=8.0, length=2.5)
+        panel.spines["left"].set_visible(digit < 2)
+        panel.tick_params(axis="y", left=digit < 2, labelleft=digit < 2)
+    for digit, name in enumerate(DIGITS):
+        place = (0.0, 1.0), (0.0, 20.0)
+        annotate(panels[0, digit], name, *place, xycoords="axes fraction", weight="bold", fontsize=10.5)
+    figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=Paint.SOFT)
 
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     manifest = dataset.manifest
+    least = manifest.min_cameras
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
     shares = camera_shares(rows, len(as_rig(manifest.config["rig"]).positions))
-    draw = partial(
-        _plots.draw_visibility,
-        names=manifest.marker_names,
-        lost=lost,
-        seen_by=shares,
-        min_cameras=manifest.min_cameras,
-    )
     text = (
-        f"A marker has a point when the rays of at least {manifest.min_cameras} cameras meet; other hands, "
+        f"A marker has a point when the rays of at least {least} cameras meet; other hands, "
         "held objects, merged blobs and lost pictures are included."
     )
     caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
     size = (10.8, 1.6 + 0.21 * len(lost))
-    return Section("Occlusion", text, pictures=[(picture(size, draw), caption)])
+    drawn = picture(size, _draw_visibility, manifest.marker_names, lost, shares, least)
+    return Section("Occlusion", text, pictures=[(drawn, caption)])
+
+
+def camera_shares(rows: Shaped[np.ndarray, "T"], num_cameras: int) -> Float[np.ndarray, "M C+1"]:
+    """Share of frames in which exactly 0, 1, ... cameras see each marker."""
+    counts = np.bitwise_count(rows["cameras"])
+    return np.stack([(counts == n).mean(axis=0) for n in range(num_cameras + 1)], axis=1)
+
+
+def _draw_visibility(
+    figure: Figure,
+    names: tuple[str, ...],
+    lost: Float[np.ndarray, "M"],
+    seen_by: Float[np.ndarray, "M C+1"],
+    min_cameras: int,
+) -> None:
+    """Bars of the share of frames without each marker; beside them how many cameras see it."""
+    rows = np.arange(len(names))
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
+    left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
+    for row, share in enumerate(lost):
+        annotate(
+            left, f"{100 * share:.1f}", (100 * share, row), (4, 0), va="center", color=Paint.SOFT, fontsize=8
+        )
+    left.set_yticks(rows, names, color=Paint.INK, parse_math=False)
+    left.set_ylim(len(names) - 0.4, -0.6)
+    left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
+    left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
+    left.tick_params(axis="y", length=0)
+    most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
+    shades = right.pcolormesh(
+        np.arange(most + 2) - 0.5, np.arange(len(names) + 1) - 0.5, 100.0 * seen_by[:, : most + 1],
+        cmap="Blues", vmin=0.0, edgecolors=Paint.CARD, linewidth=1.2,
+    )  # fmt: skip
+    means = seen_by @ np.arange(seen_by.shape[1])
+    right.plot(
+        means, rows, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=4.5, markeredgewidth=0.9
+    )
+    annotate(right, "mean", (means[0], 0.0), (0, 13), ha="center", fontsize=8.0)
+    least = min_cameras - 0.5
+    right.axvline(least, color=Paint.WARM, linewidth=1.4)
+    annotate(right, f"at least {min_cameras}", (least, -0.5), (3, 3), color=Paint.WARM, fontsize=8.0)
+    right.set_xlabel("cameras that see it")
+    right.locator_params(axis="x", integer=True)
+    right.tick_params(axis="y", length=0)
+    right.spines["left"].set_visible(False)
+    color_bar(figure, shades, "share of frames [%]", ax=right, pad=0.02, aspect=35)
 
 
 def _ghosts_section(rows: Shaped[np.ndarray, "T"]) -> Section:
     counts = ghost_counts(rows)
-    draw = partial(_plots.draw_ghosts, counts=counts, distances=ghost_distances(rows))
     caption = f"Left: ghosts per frame, of which {len(counts) - 1} at most are kept. Right: their distances."
     text = "Points of no marker: mirror images in shiny surfaces near the hand, and stray reflections."
-    return Section("Ghosts", text, pictures=[(picture((10.8, 3.4), draw), caption)])
+    drawn = picture((10.8, 3.4), _draw_ghosts, counts, ghost_distances(rows))
+    return Section("Ghosts", text, pictures=[(drawn, caption)])
+
+
+def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
+    """Frames with 0, 1, ... ghosts."""
+    here = np.isfinite(rows["ghosts"][..., 0])
+    return np.bincount(here.sum(axis=1), minlength=here.shape[1] + 1)
+
+
+def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
+    """From every ghost to the nearest marker of its frame, seen or not [m]."""
+    frame, ghost = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
+    away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, ghost][:, None]
+    distances: NDArray[np.float64] = np.linalg.norm(away, axis=-1).min(axis=1)
+    return distances
+
+
+def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float[np.ndarray, "N"]) -> None:
+    """Ghosts per frame, and how far [m] each lies from the nearest marker."""
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+    shares = 100.0 * counts / max(1, counts.sum())
+    left.bar(np.arange(len(counts)), shares, color=Paint.BLUE, width=0.62)
+    for count, share in enumerate(shares):
+        annotate(left, f"{share:.1f}", (count, share), (0, 3), ha="center", color=Paint.SOFT, fontsize=8.0)
+    left.set_xlabel("ghosts in a frame")
+    left.set_ylabel("share of frames [%]")
+    left.locator_params(axis="x", integer=True)
+    right.stairs(*_histogram(distances, _bins(distances)), fill=True, color=Paint.BLUE)
+    right.set_ylabel("share of ghosts [% per mm]")
+    right.set_xlim(left=0.0)
+    right.margins(y=0.12)
+    if not distances.size:
+        right.set_ylim(0.0, 1.0)
+    right.set_xlabel("from a ghost to the nearest marker [mm]")
+    if len(distances):
+        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
+    else:
+        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:
     distances = neighbor_distances(rows)
     closer = 100.0 * (distances.min(axis=1) < diameter).mean()
-    draw = partial(_plots.draw_neighbors, distances=distances, diameter=diameter)
     caption = (
         f"Markers seen or not. In {closer:.2f} % of the frames two of them are nearer to each other than "
         "a marker is wide."
     )
     text = "The nearer markers are to each other, the easier they are confused."
-    return Section("Nearest markers", text, pictures=[(picture((9.0, 3.6), draw), caption)])
+    drawn = picture((9.0, 3.6), _draw_neighbors, distances, diameter)
+    return Section("Nearest markers", text, pictures=[(drawn, caption)])
+
+
+def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"]:
+    """From every marker to the nearest other one, seen or not, center to center [m]."""
+    parts = []
+    for first in range(0, len(rows), _CHUNK):
+        markers = rows["markers"][first : first + _CHUNK]
+        apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
+        apart[:, range(markers.shape[1]), range(markers.shape[1])] = np.inf
+        parts.append(apart.min(axis=-1))
+    return np.concatenate(parts).astype(np.float64)
+
+
+def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
+    """How near each marker's nearest neighbor is, and the nearest pair of each frame [m]."""
+    panel = figure.subplots()
+    nearest, bins = distances.min(axis=1), _bins(distances)
+    panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
+    panel.stairs(*_histogram(nearest, bins), color=Paint.BLUE, linewidth=1.6)
+    panel.margins(y=0.12)
+    panel.set_ylabel("share [% per mm]")
+    panel.set_xlabel("distance to the nearest other marker, center to center [mm]")
+    for values, name, color in (
+        (nearest, "nearest pair\nof each frame", Paint.BLUE),
+        (distances, "every marker", Paint.SOFT),
+    ):
+        shares, _ = _histogram(values.ravel(), bins)
+        peak = int(shares.argmax())
+        annotate(panel, name, (bins[peak], shares[peak]), (10, 4), color=color, annotation_clip=False)
+    panel.set_xlim(left=0.0)
+    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", Paint.WARM)
+
+
+def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
+    """Edges [mm] of at most 80 whole-millimeter bins from 0 to the 99.9th percentile."""
+    longest = 1e3 * float(np.percentile(distances, 99.9)) if distances.size else 1.0
+    width = max(1.0, np.ceil(longest / 80.0))
+    return np.arange(0.0, longest + width, width)
+
+
+def _histogram(
+    distances: Float[np.ndarray, "N"], bins: Float[np.ndarray, "B"]
+) -> tuple[Float[np.ndarray, "B-1"], Float[np.ndarray, "B"]]:
+    """Percent per millimeter of distances [m], and the bins."""
+    counts, _ = np.histogram(1e3 * distances, bins)
+    return 100.0 * counts / (max(1, len(distances)) * np.diff(bins)), bins
+
+
+def _mark(panel: Axes, value: float, text: str, color: str) -> None:
+    """An upright line with its meaning beside its top."""
+    panel.axvline(value, color=color, linewidth=1.4)
+    panel.annotate(
+        text.format(value), (value, 1.0), (5, -2), ("data", "axes fraction"), "offset points", va="top",
+        color=color,
+    )  # fmt: skip
+
+
+def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
+    """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
+    if present.ndim != 2 or not present.size or present.dtype != np.bool_:
+        raise DatasetError(
+            f"present is {present.dtype} of shape {present.shape}, expected bool (frames, markers)"
+        )
+    if not 0.0 < rate < np.inf:
+        raise DatasetError(f"rate is {rate:g} Hz, expected a positive number")
+    lengths = run_lengths(~present, inside=True)
+    frames, markers = present.shape
+    text = (
+        f"A continuous take of {frames:,} frames at {rate:g} Hz. Of its {markers} markers "
+        f"{100 * (~present).mean():.2f} % are missing, in {len(lengths):,} gaps; gaps that the take's ends "
+        "cut off are not counted."
+    )
+    if not len(lengths):
+        return Section("Gaps", text)
+    caption = (
+        "Share of gaps by length. Orange: median and 90th percentile of the gap lists of real finger markers "
+        "that were published with LocalMoCap (SIGGRAPH 2023)."
+    )
+    return Section("Gaps", text, pictures=[(picture((9.0, 4.2), _draw_gaps, lengths, rate), caption)])
+
+
+def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> None:
+    """Share of gaps [frames] that are no longer than a length, beside the published median and p90."""
+    panel = figure.subplots()
+    ordered = np.sort(lengths)
+    longest = int(max(ordered[-1], 1.3 * _PUBLISHED_P90[1]))
+    steps = np.arange(1, longest + 2)
+    shares = 100.0 * np.searchsorted(ordered, steps, side="right") / len(ordered)
+    panel.step(steps, shares, where="post", color=Paint.BLUE, linewidth=1.8)
+    panel.set_xscale("log")
+    panel.set_xlim(0.9, 1.15 * longest)
+    panel.set_ylim(0.0, 103.0)
+    panel.xaxis.set_major_formatter("{x:.0f}")
+    panel.set_xlabel("length of a gap [frames]")
+    panel.set_ylabel("gaps no longer than that [%]")
+    milliseconds = panel.secondary_xaxis(
+        "top", functions=(partial(np.multiply, 1e3 / rate), partial(np.multiply, rate / 1e3))
+    )
+    milliseconds.xaxis.set_major_formatter("{x:.0f}")
+    milliseconds.set_xlabel(f"[ms at {rate:g} Hz]")
+    for height, name, published in ((50.0, "median", _PUBLISHED_MEDIAN), (90.0, "p90", _PUBLISHED_P90)):
+        mine = int(np.percentile(ordered, height, method="inverted_cdf"))
+        panel.axhline(height, color=Paint.BAND, linewidth=1.0, zorder=0)
+        panel.plot(
+            published, (height, height), color=Paint.WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85
+        )
+        told = f"real finger markers: {name} {published[0]} to {published[1]}"
+        annotate(panel, told, (published[1], height), (8, -11), color=Paint.WARM)
+        panel.plot(mine, height, "o", color=Paint.BLUE, markersize=6.0, markeredgecolor=Paint.CARD)
+        annotate(
+            panel, f"{name} {mine}", (mine, height), (-8, 5), color=Paint.BLUE, ha="right", weight="bold"
+        )

@@ -1,81 +1,144 @@
-"""The picture of a glove on the hand: markers colored by accuracy, arrows between confused ones."""
+"""Pictures of a glove on the resting hand: markers colored by accuracy, arrows between confused ones."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from train.reports.flat_hand import FlatHand
-from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
-from train.reports.run_plots import short
+from gloves.fit import attach_markers
+from gloves.layout import MarkerLayout
+from handsim.hand.model import HandModel
+from handsim.hand.shape import BONES, PALM
+from handsim.pages import Paint, color_bar, color_scale, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 HAND_SIZE: Final = (10.8, 9.6)
-"""Of the picture [inch]."""
-MOST_ARROWS: Final = 12
+"""Size of the picture [inch]."""
+HAND_CAPTION: Final = (
+    "A right hand of size M at rest, from the back; rings are markers that look to the palm's side. "
+)
+LONGEST_NAME: Final = 20
+"""Letters of a marker's name that are drawn."""
+_MOST_ARROWS: Final = 12
 _MARGIN: Final = 34.0  # around the hand [points]
-_BEND: Final = 0.22  # of the arrows, so that two that lead to and fro lie side by side
-_BAR: Final = (0.90, 0.2, 0.016, 0.6)  # the colors' scale, in shares of the picture
-FONT_SIZE: Final = 7.5
-"""Of names [points]."""
-DOT_RADIUS: Final = 4.2
-"""Of a marker's dot [points]."""
-DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)
-"""Tried from a dot to its name [points]."""
+_BEND: Final = 0.22  # of the arrows, so that the two between a pair of markers lie side by side
+_BAR: Final = (0.90, 0.2, 0.016, 0.6)  # place of the color bar, as shares of the picture
+_FONT_SIZE: Final = 7.5  # of names [points]
+_DOT_RADIUS: Final = 4.2  # of a marker's dot [points]
+_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # tried from dot to name [points]
+
+
+class FlatHand(NamedTuple):
+    """A right hand of size M at rest, seen from the back, in the plane [m]: thumb left, fingers up."""
+
+    outlines: list[Float[np.ndarray, "N 2"]]
+    bones: Float[np.ndarray, "L 2 2"]
+    markers: Float[np.ndarray, "M 2"]
+    below: NDArray[np.bool_]
+    """Which markers face the palm's side (M,)."""
+
+    def draw(
+        self, panel: Axes, *, scale: float = 1.0, shift: Any = 0.0, bone_width: float, **bones: Any
+    ) -> None:
+        """Draw outline and bones, scaled and then shifted."""
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path
+
+        outlines = [Path(scale * loop + shift, closed=True) for loop in self.outlines]
+        outline = Path.make_compound_path(*outlines)
+        panel.add_patch(PathPatch(outline, facecolor=Paint.BAND, edgecolor=Paint.LINE, linewidth=1.0))
+        for bone in scale * self.bones + shift:
+            panel.plot(*bone.T, color=Paint.LINE, linewidth=bone_width, solid_capstyle="round", **bones)
+
+
+def flat_hand(layout: MarkerLayout) -> FlatHand:
+    """The drawing of a glove on the hand."""
+    model = HandModel.named("M")
+    attachment = attach_markers(layout, model)
+    starts = model.rest_transforms[:, :3, 3]
+    ends = starts + model.skeleton.lengths[:, None] * model.rest_transforms[:, :3, 0]
+    bones = [(starts[number], ends[number]) for number in range(1, len(BONES))]
+    bones += [(starts[PALM], starts[number]) for number, bone in enumerate(BONES) if bone.parent == PALM]
+    surface = model.surface
+    return FlatHand(
+        _outlines(_projected(surface.vertices), surface.faces),
+        _projected(np.array(bones)),
+        _projected(attachment.points),
+        attachment.normals[:, 2] < 0.0,
+    )
+
+
+def _projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions in the wrist's frame (..., 3) [m] as seen from the back of a right hand (..., 2)."""
+    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
+
+
+def _outlines(
+    vertices: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"]
+) -> list[Float[np.ndarray, "N 2"]]:
+    """Loops around the faces that face the viewer; holes in them run in the opposite direction."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    one, other = second - first, third - first
+    seen = faces[one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0.0]
+    ways = np.concatenate([seen[:, [0, 1]], seen[:, [1, 2]], seen[:, [2, 0]]]).tolist()
+    back = {(end, start) for start, end in ways}
+    follow: dict[int, list[int]] = {}
+    for start, end in ways:
+        if (start, end) not in back:
+            follow.setdefault(start, []).append(end)
+    loops = []
+    while follow:
+        loop = [next(iter(follow))]
+        while loop[-1] in follow:
+            here = loop[-1]
+            loop.append(follow[here].pop())
+            if not follow[here]:
+                del follow[here]
+        loops.append(vertices[loop])
+    return loops
 
 
 class Mistake(NamedTuple):
-    """Points of one marker that were taken for another's."""
+    """Points of one marker that were labeled as another's."""
 
     truth: int
     called: int
     points: int
     share: float
-    """Of the marker's points."""
+    """Share of the marker's points."""
 
 
-def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = MOST_ARROWS) -> list[Mistake]:
+def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MOST_ARROWS) -> list[Mistake]:
     """The pairs of markers that are confused most often, most often first; ghosts do not count."""
     between = confusion[:-1, :-1] * ~np.eye(len(confusion) - 1, dtype=np.bool_)
     order = np.argsort(-between, axis=None, kind="stable")[:most]
     truths, called = np.unravel_index(order, between.shape)
     return [
-        Mistake(
-            int(truth), int(other), int(between[truth, other]), between[truth, other] / confusion[truth].sum()
-        )
-        for truth, other in zip(truths, called, strict=True)
-        if between[truth, other]
+        Mistake(int(one), int(other), int(between[one, other]), between[one, other] / confusion[one].sum())
+        for one, other in zip(truths, called, strict=True)
+        if between[one, other]
     ]
 
 
-def draw_hand(
+def hand_picture(layout: MarkerLayout, accuracy: Float[np.ndarray, "M"], arrows: list[Mistake]) -> str:
+    """The hand with each marker's slot accuracy, and arrows for the mistakes, the most frequent first."""
+    return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, accuracy, arrows)
+
+
+def _draw_hand(
     figure: Figure,
     hand: FlatHand,
     names: tuple[str, ...],
     accuracy: Float[np.ndarray, "M"],
     arrows: list[Mistake],
 ) -> None:
-    """The hand's picture.
-
-    Args:
-        figure: Where to draw, of `HAND_SIZE`.
-        names: Markers in label order.
-        accuracy: Slot accuracy of each, 0 to 1.
-        arrows: From what points are to what they were called, the most frequent first.
-    """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path
-
     # Constrained layout would move things after the names are placed.
     figure.set_layout_engine("none")
     panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -86,49 +149,41 @@ def draw_hand(
     low, size = everything.min(axis=0), np.ptp(everything, axis=0)
     scale = float(((np.array([0.86 * width, height]) - 2.0 * _MARGIN) / size).min())
     shift = np.array([0.46 * width, 0.5 * height]) - scale * (low + size / 2.0)
-    outlines = [Path(scale * loop + shift, closed=True) for loop in hand.outlines]
-    panel.add_patch(
-        PathPatch(Path.make_compound_path(*outlines), facecolor=BAND, edgecolor=LINE, linewidth=1.0)
-    )
-    for bone in scale * hand.bones + shift:
-        panel.plot(*bone.T, color=LINE, linewidth=3.0, solid_capstyle="round")
+    hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
-    colors = LinearSegmentedColormap.from_list("right", [WARM, "#d9a441", PALE, BLUE])
-    norm = Normalize(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
-    _draw_dots(panel, dots, colors(norm(100.0 * accuracy)), hand.below)
+    colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
+    for dot, color, ring in zip(dots, colors.to_rgba(100.0 * accuracy), hand.below, strict=True):
+        edge, face, width = (color, Paint.CARD, 2.2) if ring else (Paint.INK, color, 0.7)
+        panel.plot(*dot, "o", markersize=2.0 * _DOT_RADIUS, zorder=5, markeredgecolor=edge,
+                   markerfacecolor=face, markeredgewidth=width)  # fmt: skip
     labels = [short(name) for name in names]
     curves = [arrow_curve(dots[arrow.truth], dots[arrow.called]) for arrow in arrows]
     centers = place_names(labels, dots, curves, (width, height))
     for name, dot, center in zip(labels, dots, centers, strict=True):
         _draw_name(panel, name, dot, center)
-    bar = figure.colorbar(ScalarMappable(norm, colors), cax=figure.add_axes(_BAR))
-    bar.set_label("slots right [%]")
-    bar.outline.set_visible(False)
+    color_bar(figure, colors, "slots right [%]", cax=figure.add_axes(_BAR))
 
 
-def _draw_dots(
-    panel: Axes, dots: NDArray[np.float64], colors: NDArray[np.float64], below: NDArray[np.bool_]
-) -> None:
-    """Markers of the back as dots, those of the palm's side as rings."""
-    for dot, color, ring in zip(dots, colors, below, strict=True):
-        panel.plot(*dot, "o", markersize=2.0 * DOT_RADIUS, zorder=5, markeredgecolor=color if ring else INK,
-                   markerfacecolor=CARD if ring else color, markeredgewidth=2.2 if ring else 0.7)  # fmt: skip
+def short(name: str) -> str:
+    """A marker's name as there is room for it."""
+    return name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
 
 
 def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], center: NDArray[np.float64]) -> None:
     """A name, with a line to its dot where it is not beside it."""
     panel.annotate(
-        name, (center[0], center[1]), fontsize=FONT_SIZE, color=INK, ha="center", va="center_baseline",
+        name, (center[0], center[1]), fontsize=_FONT_SIZE, color=Paint.INK, ha="center", va="center_baseline",
         zorder=6, parse_math=False,
     )  # fmt: skip
     half = np.array(name_extent(name)) / 2.0
     end = np.clip(dot, center - half, center + half)
-    if np.linalg.norm(end - dot) > DISTANCES[1] + 1.0:
-        panel.plot(*np.stack([dot, end]).T, color=SOFT, linewidth=0.5, zorder=4)
+    if np.linalg.norm(end - dot) > _DISTANCES[1] + 1.0:
+        panel.plot(*np.stack([dot, end]).T, color=Paint.SOFT, linewidth=0.5, zorder=4)
 
 
 def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) -> None:
+    """Arrows from what points are to what they were called, wider the more points."""
     from matplotlib.patches import FancyArrowPatch
 
     for arrow in arrows:
@@ -137,7 +192,7 @@ def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) 
             FancyArrowPatch(
                 dots[arrow.truth], dots[arrow.called], connectionstyle=f"arc3,rad={_BEND}",
                 arrowstyle=f"-|>,head_length={2.2 + wide},head_width={1.2 + 0.7 * wide}", mutation_scale=1.0,
-                shrinkA=DOT_RADIUS + 1.0, shrinkB=DOT_RADIUS + 1.5, color=WARM, linewidth=wide,
+                shrinkA=_DOT_RADIUS + 1.0, shrinkB=_DOT_RADIUS + 1.5, color=Paint.WARM, linewidth=wide,
                 alpha=0.75, zorder=3,
             )
         )  # fmt: skip
@@ -157,17 +212,11 @@ def place_names(
     curves: Sequence[Float[np.ndarray, "K 2"]],
     size: tuple[float, float],
 ) -> Float[np.ndarray, "M 2"]:
-    """Centers of the names [points], each placed in turn where it overlaps least with what is there.
-
-    Args:
-        dots: Markers [points].
-        curves: Points along the arrows [points].
-        size: Width and height of the picture [points].
-    """
+    """Centers of the names [points], each placed in turn where it overlaps least with what is there."""
     extents = np.array([name_extent(name) for name in names])
     taken = np.concatenate([dots, *curves])
     half_sizes = np.concatenate(
-        [np.full((len(dots), 2), DOT_RADIUS + 1.0), np.full((len(taken) - len(dots), 2), 1.5)]
+        [np.full((len(dots), 2), _DOT_RADIUS + 1.0), np.full((len(taken) - len(dots), 2), 1.5)]
     )
     angles = np.deg2rad(np.arange(0.0, 360.0, 22.5))
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -176,8 +225,8 @@ def place_names(
     # The most crowded dots come first.
     for number in np.argsort(np.sort(crowd, axis=1)[:, : min(4, len(dots))].sum(axis=1), kind="stable"):
         half = extents[number] / 2.0
-        offsets = np.concatenate([around * (distance + half) for distance in DISTANCES])
-        cost = np.repeat(np.array(DISTANCES), len(around)) - 2.0 * np.tile(around[:, 0], len(DISTANCES))
+        offsets = np.concatenate([around * (distance + half) for distance in _DISTANCES])
+        cost = np.repeat(np.array(_DISTANCES), len(around)) - 2.0 * np.tile(around[:, 0], len(_DISTANCES))
         candidates = dots[number] + offsets
         overlap = (half + half_sizes - np.abs(candidates[:, None] - taken)).clip(0.0, None).prod(axis=-1)
         others = np.arange(len(taken)) != number
@@ -194,7 +243,6 @@ def name_extent(name: str) -> tuple[float, float]:
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextToPath
 
-    width, _, _ = TextToPath().get_text_width_height_descent(
-        name, FontProperties(size=FONT_SIZE), ismath=False
-    )
-    return float(width), 1.15 * FONT_SIZE
+    font = FontProperties(size=_FONT_SIZE)
+    width, _, _ = TextToPath().get_text_width_height_descent(name, font, ismath=False)
+    return float(width), 1.15 * _FONT_SIZE

@@ -1,28 +1,36 @@
-"""The page of a training run: figures, curves, confusions and reliability."""
+"""What a training run leaves to read: the page with its curves and confusions, and the model card."""
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from jaxtyping import Int
 
 from gloves.layout import MarkerLayout, stored_layout
-from handsim.app.page import Section, write_page
-from train.evaluation import LEAST_SURE, History, LabelingReport, percent, reliability
-from train.reports import hand_plot as _hand_plot
-from train.reports import run_plots as _run_plots
-from train.reports.flat_hand import flat_hand
-from train.reports.plot_style import picture
+from handsim.files.outputs import atomic_write
+from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
+from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
+from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 PAGE: Final = "report.html"
+MODEL_CARD: Final = "README.md"
+UNKNOWN_LICENSE: Final = "unknown"
+"""The license of weights as long as who trained them names none; hubs know the word."""
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
+_LEAST_SHARE: Final = 0.01  # lowest end of the confusions' scale [%]
+_MOST_WRITTEN: Final = 30  # classes up to which a cell has room for a number
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
-    """Write the page of a run: one HTML file with its pictures inside, complete or not at all; its path.
+    """Write the page of a run, complete or not at all; its path.
 
     The report is of held-out frames with the paper's corruption.
     """
@@ -35,7 +43,7 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: La
         _reliability_section(report),
     ]
     path = out / PAGE
-    write_page(path, sections, title=f"Labeler {out.resolve().name}", lead=_lead(card, layout))
+    write_sections(path, sections, title=f"Labeler {out.resolve().name}", lead=_lead(card, layout))
     return path
 
 
@@ -79,19 +87,49 @@ def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
 
 
 def _curves_section(history: History) -> Section:
-    drawn = picture((9.6, 5.6), partial(_run_plots.draw_curves, history=history))
     caption = (
         "Mean loss since the point before; slot accuracy on the same few held-out frames each time, with the "
         "paper's recipe and the running mean of the weights; learning rate."
     )
-    return Section(
-        "The run", "How it went over the clouds that the network saw.", pictures=[(drawn, caption)]
-    )
+    text = "How it went over the clouds that the network saw."
+    return Section("The run", text, pictures=[(picture((9.6, 5.6), draw_curves, history), caption)])
+
+
+def draw_curves(figure: Figure, history: History) -> None:
+    """Loss, held-out accuracy where there is any, and learning rate, over the samples seen."""
+    from matplotlib.ticker import LogFormatter
+
+    done, losses, rates = np.array(history.losses, dtype=np.float64).reshape(-1, 3).T
+    single = "o" if len(done) == 1 else None
+    upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=(2.6, 1.5, 0.9))
+    upper.plot(done, losses, color=Paint.BLUE, linewidth=1.6, marker=single)
+    upper.set_yscale("log")
+    for axis in (upper.yaxis.set_major_formatter, upper.yaxis.set_minor_formatter):
+        axis(LogFormatter(minor_thresholds=(2.0, 0.5)))
+    upper.set_ylabel("loss")
+    if history.accuracies:
+        seen, _, accuracy = np.array(history.accuracies, dtype=np.float64).T
+        middle.plot(seen, 100.0 * accuracy, "o-", color=Paint.WARM, linewidth=1.6, markersize=4.5)
+        last = 100.0 * accuracy[-1]
+        annotate(
+            middle, f"{last:.2f}", (seen[-1], last), (0, -12), ha="right", color=Paint.WARM, weight="bold"
+        )
+    middle.set_ylabel("held-out slots\nright [%]")
+    middle.margins(y=0.2)
+    lower.plot(done, rates, color=Paint.SOFT, linewidth=1.4, marker=single)
+    lower.set_ylabel("learning\nrate")
+    lower.set_ylim(bottom=0.0)
+    lower.set_xlim(left=0.0)
+    lower.xaxis.set_major_formatter("{x:,.0f}")
+    lower.set_xlabel("samples")
+    for panel in (upper, middle, lower):
+        panel.grid(axis="y", which="major", color=Paint.BAND, linewidth=0.8)
+    figure.align_ylabels()
 
 
 def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
-    draw = partial(_run_plots.draw_confusion, names=layout.names, confusion=report.confusion)
-    drawn = picture(_run_plots.confusion_size(layout.num_markers + 1), draw)
+    size = confusion_size(layout.num_markers + 1)
+    drawn = picture(size, draw_confusion, layout.names, report.confusion)
     caption = (
         "A row holds the points of one marker, the last one ghosts; a column, what they were called. A row's "
         "shares add up to 100 %. The colors' scale is logarithmic; blank cells are mistakes never made."
@@ -101,21 +139,59 @@ def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     return Section("What is taken for what", text, pictures=[(drawn, caption)])
 
 
+def confusion_size(num_classes: int) -> tuple[float, float]:
+    """Width and height [inch] of a confusion matrix in which every name can be read."""
+    side = 1.6 + num_classes * float(np.clip(8.4 / num_classes, 0.15, 0.36))
+    return side + 0.9, side
+
+
+def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarray, "M+1 M+1"]) -> None:
+    """Share of each row's points by what they were called: mistakes in color, the diagonal in figures."""
+    from matplotlib.colors import LogNorm
+
+    classes = [*map(short, names), "ghost"]
+    places = np.arange(len(classes))
+    with np.errstate(invalid="ignore"):  # rows without points are NaN
+        shares = 100.0 * confusion / confusion.sum(axis=1, keepdims=True)
+    wrong = np.where(np.eye(len(classes), dtype=np.bool_) | (shares == 0.0), np.nan, shares)
+    # From the decade below the rarest mistake to the most frequent one.
+    rarest, most = np.nanmin(wrong, initial=1.0), np.nanmax(wrong, initial=10.0)
+    norm = LogNorm(max(_LEAST_SHARE, 10.0 ** np.ceil(np.log10(rarest) - 1.0)), most, clip=True)
+    panel: Axes = figure.subplots()
+    for place, right in enumerate(shares.diagonal()):
+        low, high = place - 0.5, place + 0.5
+        panel.fill([low, high, high, low], [low, low, high, high], color=Paint.BAND, linewidth=0)
+        if len(classes) <= _MOST_WRITTEN and np.isfinite(right):
+            panel.annotate(f"{right:.1f}" if right < 99.95 else "100", (place, place), ha="center",
+                           va="center", fontsize=6.0, color=Paint.SOFT)  # fmt: skip
+    edges = np.arange(len(classes) + 1) - 0.5
+    shades = panel.pcolormesh(edges, edges, np.ma.masked_invalid(wrong), cmap="Oranges", norm=norm)
+    panel.hlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
+    panel.vlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
+    small = 8.0 if len(classes) <= _MOST_WRITTEN else 6.5
+    panel.set_xticks(places, classes, rotation=90, fontsize=small, color=Paint.INK, parse_math=False)
+    panel.set_yticks(places, classes, fontsize=small, color=Paint.INK, parse_math=False)
+    panel.set_xlim(edges[0], edges[-1])
+    panel.set_ylim(edges[-1], edges[0])
+    panel.set_aspect("equal")
+    panel.tick_params(length=0)
+    panel.spines[:].set_visible(False)
+    panel.set_xlabel("called")
+    panel.set_ylabel("is")
+    bar = color_bar(
+        figure, shades, "share of the row's points [%]", ax=panel, pad=0.02, aspect=40, shrink=0.8
+    )
+    bar.yaxis.set_major_formatter("{x:g}")
+
+
 def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
-    arrows = _hand_plot.mistakes(report.confusion)
-    draw = partial(
-        _hand_plot.draw_hand, hand=flat_hand(layout), names=layout.names,
-        accuracy=report.slot_accuracy_by_marker, arrows=arrows,
-    )  # fmt: skip
-    drawn = picture(_hand_plot.HAND_SIZE, draw)
-    caption = (
-        "A right hand of size M at rest, from the back; rings are markers that look to the palm's side. "
-        + (
-            f"Arrows lead from what points are to what they were called: the {len(arrows)} most frequent "
-            "pairs, wider the more often."
-            if arrows
-            else "No marker was taken for another."
-        )
+    arrows = mistakes(report.confusion)
+    drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
+    caption = HAND_CAPTION + (
+        f"Arrows lead from what points are to what they were called: the {len(arrows)} most frequent "
+        "pairs, wider the more often."
+        if arrows
+        else "No marker was taken for another."
     )
     names = layout.names
     table = [["marker", "taken for", "points", "of its points [%]"]] if arrows else []
@@ -135,8 +211,8 @@ def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
     )
     figures, confusion = report.figures, report.confusion
     markers, ghosts = confusion[:-1].sum(), confusion[-1].sum()
-    lost = percent(confusion[:-1, -1].sum() / markers) if markers else "-"
-    named = percent(confusion[-1, :-1].sum() / ghosts) if ghosts else "-"
+    lost = percent(confusion[:-1, -1].sum() / markers) if markers else NOTHING
+    named = percent(confusion[-1, :-1].sum() / ghosts) if ghosts else NOTHING
     return (
         f"Least often right: {worst} of their slots. Of all slots {percent(figures['occlusion_ratio'])} % "
         f"had no point; the labeler found {percent(figures['occlusion_recall'])} % of those. There were "
@@ -147,11 +223,124 @@ def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
 
 def _reliability_section(report: LabelingReport) -> Section:
     bins = reliability(report.confidences, report.right)
-    error = report.figures["calibration_error"]
-    drawn = picture((6.4, 6.0), partial(_run_plots.draw_reliability, bins=bins, error=error))
+    drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
     caption = (
         "Points in fifteen bins of confidence: how many of each bin are right, and how many there are. On "
         "the gray line they would be right as often as the labeler says; orange is what they miss it by."
     )
     text = "Whether the confidence that comes with every label can be taken at its word."
     return Section("How sure to believe it", text, pictures=[(drawn, caption)])
+
+
+def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
+    """Share right by confidence, and below it how many points have that confidence."""
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3.0, 1.0))
+    there = bins.count > 0
+    upper.plot([0.0, 100.0], [0.0, 100.0], color=Paint.LINE, linewidth=1.4, zorder=1)
+    confidence, right = 100.0 * bins.confidence[there], 100.0 * bins.right[there]
+    upper.vlines(confidence, confidence, right, color=Paint.WARM, linewidth=2.0, zorder=2)
+    upper.plot(confidence, right, "o-", color=Paint.BLUE, markersize=5.0, linewidth=1.4, zorder=3)
+    upper.set_ylim(-3.0, 103.0)
+    upper.set_ylabel("points right [%]")
+    upper.set_title(f"expected calibration error {100.0 * error:.2f} %", loc="left", color=Paint.WARM)
+    edges = np.linspace(0.0, 100.0, BINS + 1)
+    lower.stairs(np.maximum(bins.count, 0.5), edges, fill=True, color=Paint.PALE, baseline=0.5)
+    lower.set_yscale("log")
+    lower.set_ylim(0.5, 2.0 * max(1, int(bins.count.max())))
+    lower.set_ylabel("points")
+    lower.set_xlabel("confidence [%]")
+    lower.set_xlim(0.0, 100.5)
+    figure.align_ylabels()
+
+
+_CARD: Final = """\
+---
+license: {license}
+library_name: handsim
+pipeline_tag: other
+tags:
+- handsim
+- motion-capture
+- hand-tracking
+- point-cloud
+- marker-labeling
+---
+
+# Labeler of hand markers: {layout}
+
+{kind} of handsim {version}. It gets the points of one
+hand in one frame, in meters, and says for each which of {count} markers it is, or that
+it is a ghost.
+
+Markers: {markers}.
+
+## Data
+
+Trained on {trained_on}: {num_frames:,} of them, from `handsim generate` with
+seed {seed}, of which training saw {samples:,} clouds. `labeler.json` holds
+every setting.
+
+## Figures
+
+On held-out simulated frames, in percent:
+
+{figures}
+
+## Use
+
+```
+handsim label take.c3d --glove {layout} --labeler THIS_FOLDER --out labeled.c3d
+handsim export THIS_FOLDER --out labeler.onnx
+```
+
+In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
+`labeler.safetensors` and `labeler.json`; both are read without unpickling.
+
+## Limits
+
+- One hand in one frame; it does not tell left from right.
+- Markers of this layout only; moved by more than a centimeter they want a labeler of their own.
+- Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
+"""
+_CARD_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
+_CARD_FIGURES: Final = {
+    "slot_accuracy": "labels and gaps that are right",
+    "point_accuracy": "points labeled right",
+    "frame_accuracy": "frames without a mistake",
+}
+
+
+def write_model_card(out: Path, card: dict[str, Any]) -> Path:
+    """Write the README of a run's folder, complete or not at all, from its card; the page's path.
+
+    A README there is replaced, unless somebody has named a license in it: then it is theirs.
+    """
+    path = out / MODEL_CARD
+    if path.is_file() and f"license: {UNKNOWN_LICENSE}" not in path.read_text("utf-8", "replace"):
+        return path
+    with atomic_write(path) as temporary:
+        temporary.write_text(model_card(card), encoding="utf-8")
+    return path
+
+
+def model_card(card: dict[str, Any]) -> str:
+    """The README's text as hubs of models read it: YAML first, then data, figures, use and limits."""
+    dataset, columns = card["dataset"], card["held_out_simulated"]
+    figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
+    figures += [
+        f"| {words} | {' | '.join(percent(column[name]) for column in columns.values())} |"
+        for name, words in _CARD_FIGURES.items()
+    ]
+    return _CARD.format(
+        license=card["license"],
+        layout=dataset["layout"]["name"],
+        kind=_CARD_KINDS[card["train"]["labeler"]],
+        version=card["handsim"],
+        count=len(card["marker_names"]),
+        markers=", ".join(card["marker_names"]),
+        trained_on=card["trained_on"],
+        num_frames=dataset["num_frames"],
+        seed=dataset["seed"],
+        samples=card["train"]["samples"],
+        figures="\n".join(figures),
+    )

@@ -128,10 +128,7 @@ def simulate_take(
 
 
 def simulate_calibration(
-    hands: tuple[GloveFit, ...],
-    config: CalibrationTakeConfig | None = None,
-    *,
-    rng: np.random.Generator,
+    hands: tuple[GloveFit, ...], config: CalibrationTakeConfig | None = None, *, rng: np.random.Generator
 ) -> Take:
     """What cameras see of a certain user who makes a calibration capture with one hand or both."""
     config = config or CalibrationTakeConfig()

@@ -1,4 +1,4 @@
-"""Ghosts: mirror images are where mirrors put them, and never too many."""
+"""Mirror images, strays and ghosts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.optics.ghosts import MAX_GHOSTS, GhostConfig, reflect, sample_ghosts
+from gloves.optics.ghosts import (
+    MAX_GHOSTS,
+    GhostConfig,
+    StrayConfig,
+    cameras_by_mirror,
+    reflect,
+    sample_ghosts,
+    sample_strays,
+)
 from handsim.space.rig import named_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
@@ -59,3 +67,61 @@ def test_strays_follow_their_rate(rng):
         hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
     )
     assert 0.35 < np.isfinite(ghosts[..., 0]).sum(axis=1).mean() < 0.65
+
+
+RIG = named_rig("figure5")
+PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+MIRRORS_NOTHING = np.zeros((1, 0, 2, 3)), np.zeros(0)
+
+
+def _seen(marker: np.ndarray, radius: float, segments: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    images = reflect(marker[None, None], PATCH, UP)
+    return cameras_by_mirror(images, PATCH[None], UP[None], radius, RIG, segments, radii)[0, 0]
+
+
+def test_light_leaves_a_mirror_as_it_comes() -> None:
+    marker = np.array([0.01, 0.02, 1.1])
+    seen = _seen(marker, 0.5, *MIRRORS_NOTHING)
+    assert (seen == (RIG.positions[:, 2] > 1.0)).all()  # a level mirror shows nothing to cameras below it
+    image = reflect(marker, PATCH, UP)
+    np.testing.assert_allclose(image, [0.01, 0.02, 0.9])
+    for camera in RIG.positions[seen]:
+        hit = image + (1.0 - image[2]) / (camera[2] - image[2]) * (camera - image)
+        inwards, outwards = (
+            (hit - marker) / np.linalg.norm(hit - marker),
+            (camera - hit) / np.linalg.norm(camera - hit),
+        )
+        np.testing.assert_allclose(inwards * [1, 1, -1], outwards, atol=1e-12)
+
+
+def test_a_small_patch_shows_less_and_its_back_nothing() -> None:
+    marker = np.array([0.0, 0.0, 1.1])
+    sizes = [_seen(marker, radius, *MIRRORS_NOTHING).sum() for radius in (0.001, 0.12, 0.5)]
+    assert sizes[0] == 0 < sizes[1] <= sizes[2]
+    assert not _seen(np.array([0.0, 0.0, 0.9]), 0.5, *MIRRORS_NOTHING).any()
+
+
+def test_both_legs_must_be_free() -> None:
+    marker = np.array([0.0, 0.0, 1.1])
+    free = _seen(marker, 0.5, *MIRRORS_NOTHING)
+    camera = int(np.flatnonzero(free)[0])
+    image = reflect(marker, PATCH, UP)
+    hit = image + (1.0 - image[2]) / (RIG.positions[camera, 2] - image[2]) * (RIG.positions[camera] - image)
+    for middle in (0.5 * (marker + hit), 0.5 * (hit + RIG.positions[camera])):
+        ball = np.stack([middle, middle])[None, None]
+        assert not _seen(marker, 0.5, ball, np.array([0.005]))[camera]
+
+
+def test_strays_ride_along_and_flash_for_their_time(rng: np.random.Generator) -> None:
+    pose = np.tile(np.eye(4), (60_000, 1, 1))
+    pose[:, 0, 3] = np.arange(60_000) * 1e-4
+    config = StrayConfig(number=12.0, shown=0.2, hidden=0.6)
+    places, seen = sample_strays(pose, np.array([0.1, 0.0, 0.0]), config, rate=120.0, num_cameras=16, rng=rng)
+    np.testing.assert_allclose(places - pose[:, None, :3, 3], np.tile(places[:1], (60_000, 1, 1)), atol=1e-9)
+    assert (np.linalg.norm(places[0] - [0.1, 0.0, 0.0], axis=1) <= config.reach).all()
+    shining = seen.any(axis=2)
+    assert abs(shining.mean() - 0.25) < 0.03
+    starts = (shining[1:] & ~shining[:-1]).sum()
+    assert abs(shining.sum() / starts / 120.0 - 0.2) < 0.03
+    none, _ = sample_strays(pose, np.zeros(3), StrayConfig(number=0.0), rate=120.0, num_cameras=16, rng=rng)
+    assert none.shape == (60_000, 0, 3)

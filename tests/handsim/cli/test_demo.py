@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from handsim.app.page import Section, write_page
 from handsim.cli.main import main
+from handsim.pages import Section, write_sections
 
 
 class Links(HTMLParser):
@@ -58,7 +58,7 @@ def test_page_escapes_what_it_shows(tmp_path: Path) -> None:
     section = Section(
         "a < b", "text", pictures=[("x.png", 'a "b" & c')], table=[["<i>"], ["1"]], notes=["<n>"]
     )
-    write_page(tmp_path / "index.html", [section], title="<title>", lead="x & y")
+    write_sections(tmp_path / "index.html", [section], title="<title>", lead="x & y")
     page = (tmp_path / "index.html").read_text("utf-8")
     assert "<title>&lt;title&gt;</title>" in page
     assert "x &amp; y</p>" in page

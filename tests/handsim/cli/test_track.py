@@ -38,7 +38,7 @@ from track.rigid_body import load_body
 from track.streams.live_stream import open_source
 from track.streams.natnet import ReplayServer
 from track.user import load_user
-from track.viewer.corrector import Corrector
+from track.viewer.editors import Corrector
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
 

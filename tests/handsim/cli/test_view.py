@@ -16,8 +16,8 @@ import pytest
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from track.streams.natnet import ReplayServer
-from track.viewer import live_view
-from track.viewer.video import chosen_frames
+from track.viewer.recordings import chosen_frames
+from track.viewer.timeline import LiveView
 
 FRAMES = 120
 
@@ -68,16 +68,17 @@ def test_a_file_is_served_until_ctrl_c(capture, capfd):
 def test_a_live_tracker_is_shown_and_recorded_and_frames_are_never_dropped(
     capture, tmp_path, capsys, monkeypatch
 ):
-    shown: list[live_view.LiveView] = []
+    shown: list[LiveView] = []
     offered: list[int] = []
-    plain = live_view.LiveView.offer
+    plain = LiveView.send
 
-    def offer(self, frame, tracked):
+    def send(self, frame, tracked):
         shown.append(self)
-        offered.append(frame.number)
+        if not frame.silent:
+            offered.append(frame.number)
         plain(self, frame, tracked)
 
-    monkeypatch.setattr(live_view.LiveView, "offer", offer)
+    monkeypatch.setattr(LiveView, "send", send)
     with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
         thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
         out = tmp_path / "take.npz"

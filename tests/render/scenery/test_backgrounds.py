@@ -12,7 +12,8 @@ from handsim.errors import HandSimError
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import named_rig
 from render.config import RenderConfig
-from render.frames import Pictures, RenderedFrame
+from render.frames import RenderedFrame
+from render.painting.rasterizer import Geometry
 from render.scenery.backgrounds import (
     KINDS,
     Background,
@@ -204,7 +205,7 @@ def test_an_empty_box_is_where_it_says() -> None:
     height, width = seen.depth.shape
     empty = np.zeros((height, width), dtype=np.uint8)
     bare = np.zeros((height, width, 3), dtype=np.float32)
-    filled = seen.put_behind(Pictures(None, empty.astype(np.float32), bare, empty, empty, empty), camera)
+    filled = seen.put_behind(Geometry(empty.astype(np.float32), bare, empty, empty, empty), camera)
     assert filled.normals is not None and filled.depth is not None
     np.testing.assert_array_equal(filled.depth, seen.depth)
     np.testing.assert_allclose(np.linalg.norm(filled.normals, axis=-1), 1.0, atol=1e-6)

@@ -22,7 +22,6 @@ from track.association.label_consistency import (
     gate_labels,
 )
 from track.config import TrackerConfig
-from train import load_labeler
 from train.labelers.protocol import Labeling
 
 RATE = 120.0

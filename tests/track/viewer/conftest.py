@@ -25,7 +25,7 @@ from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_poses
 from tests.waiting import wait_for
 from track.streams import LOOPBACK
-from track.viewer.server import opened_server
+from track.viewer import opened_server
 
 FRAMES = 30
 _MARKS = itertools.count()

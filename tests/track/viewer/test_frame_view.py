@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 
 from track.viewer.contents import show_recording
-from track.viewer.frame_view import FrameView
 from track.viewer.recordings import TakeRecording
+from track.viewer.stage import FrameView
 
 
 def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page_of, tracked):

@@ -12,7 +12,7 @@ from gloves.takes.corrections import corrections_of, corrections_path
 from gloves.takes.take import load_take
 from handsim.errors import CaptureError, HandSimWarning
 from track.viewer.contents import open_content, show_recording
-from track.viewer.corrector import Corrector
+from track.viewer.editors import Corrector
 from track.viewer.recordings import TakeRecording
 
 TIP = "right:ThumbTip"

@@ -10,7 +10,7 @@ from gloves.layout import load_layout, starter_layout
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel
 from track.viewer.contents import open_content
-from track.viewer.layout_editor import LayoutEditor, edited_path
+from track.viewer.editors import LayoutEditor, edited_path
 
 
 @pytest.fixture

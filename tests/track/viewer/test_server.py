@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from handsim.errors import ArgumentError, HandSimError
 from track.streams import LOOPBACK
-from track.viewer.server import address_of, is_own_page, opened_server
+from track.viewer import address_of, is_own_page, opened_server
 
 
 def test_the_page_is_served_here_until_the_end(capsys):

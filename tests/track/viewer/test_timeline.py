@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from track.viewer import timeline as module
-from track.viewer.status_panel import thinned
-from track.viewer.timeline import Timeline
+from track.viewer.timeline import Timeline, thinned
 
 TIMES = np.arange(400) / 200.0
 

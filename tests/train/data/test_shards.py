@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset, MappedRows, row_dtype
-from train.settings import TrainSettings
+from train.settings import TrainSettings, batch_recipe
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings, SceneMix
 
@@ -61,7 +61,7 @@ def test_a_set_that_is_handed_on_is_its_files(dataset):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_are_the_batch_of_one_device_shared_out(dataset, share, count):
-    recipe = TrainSettings(batch=32, rig_share=share).batch_recipe(19)
+    recipe = batch_recipe(TrainSettings(batch=32, rig_share=share), 19)
     whole, again = (
         draw_batch(rows, recipe, rng=np.random.default_rng(5))
         for rows in (dataset.rows(), dataset.mapped_rows())

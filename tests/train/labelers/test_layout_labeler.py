@@ -21,7 +21,8 @@ from train.labelers.layout_labeler import (
     save_layout_network,
     shipped_network,
 )
-from train.labelers.storage import learned_folder, learned_gloves, load_labeler, shipped_labelers
+from train.labelers.protocol import learned_folder, learned_gloves
+from train.labelers.storage import load_labeler, shipped_labelers
 
 
 @pytest.fixture(scope="module")

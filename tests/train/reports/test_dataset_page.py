@@ -163,9 +163,9 @@ def test_only_drawing_loads_matplotlib_and_nothing_loads_pyplot():
     code = """
 import sys
 import handsim.cli.generate, handsim.cli.train, train.simulation.generation
-import train.reports.dataset_page, train.reports.run_page, train.reports.plot_style
+import handsim.pages, train.reports.dataset_page, train.reports.run_page
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
-train.reports.plot_style.picture((1, 1), lambda figure: figure.subplots())
+handsim.pages.picture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -8,8 +8,7 @@ import pytest
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONES, bones_of
-from train.reports.flat_hand import flat_hand
-from train.reports.hand_plot import HAND_SIZE, arrow_curve, mistakes, name_extent, place_names
+from train.reports.hand_plot import HAND_SIZE, arrow_curve, flat_hand, mistakes, name_extent, place_names
 
 
 def any_layout(count: int) -> MarkerLayout:

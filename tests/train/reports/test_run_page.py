@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import json
 import re
+from importlib import resources
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +16,7 @@ import torch
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
 from handsim.hand.shape import BONES
+from handsim.pages import picture
 from tests.renames import fails_at
 from train.data.shards import Dataset
 from train.evaluation import (
@@ -23,11 +26,22 @@ from train.evaluation import (
     expected_calibration_error,
     macro_f1,
     percent,
+    reliability,
 )
 from train.labelers.storage import CARD, WEIGHTS, load_labeler
 from train.loop import CHECKPOINT, TrainingState, train_labeler
-from train.reports.model_card import MODEL_CARD
-from train.reports.run_page import PAGE, write_run_page
+from train.reports.hand_plot import LONGEST_NAME, short
+from train.reports.run_page import (
+    MODEL_CARD,
+    PAGE,
+    confusion_size,
+    draw_confusion,
+    draw_curves,
+    draw_reliability,
+    model_card,
+    write_model_card,
+    write_run_page,
+)
 from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
 from train.simulation.training_frames import GenerateSettings
@@ -57,7 +71,8 @@ def run(dataset, tmp_path_factory):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    monkeypatch.setattr("train.reports.run_page.picture", lambda size, draw: "data:,")
+    for page in ("run_page", "hand_plot"):
+        monkeypatch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
 
 
 def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path, without_pictures):
@@ -78,8 +93,8 @@ def test_the_page_says_what_the_card_says(run):
             assert f"<td>{percent(figures[figure])}</td>" in text
     drawn = pictures(out / PAGE)
     assert len(drawn) == 4
-    for picture in drawn:
-        assert len(list(ElementTree.fromstring(picture).iter())) > 100
+    for one in drawn:
+        assert len(list(ElementTree.fromstring(one).iter())) > 100
     assert load_labeler(out).marker_names == tuple(card["marker_names"])
 
 
@@ -201,3 +216,95 @@ def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng):
     card, report = made_up(19, rng, perfect=True)
     page = write_run_page(tmp_path, card, History([(256, 0.1, 0.6)], [(256, 0.1, 1.0)]), report)
     assert "No marker was taken for another" in page.read_text("utf-8")
+
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+@pytest.mark.parametrize(
+    "history",
+    [
+        History(),
+        History([(256, 3.0, 0.1)], [(256, 0.1, 0.5)]),
+        History([(256, 3.0, 0.1), (512, 0.02, 0.1), (768, 1e-4, 0.0)], [(512, 0.1, 1.0), (768, 0.2, 1.0)]),
+    ],
+)
+def test_curves_of_any_length_are_drawn(history):
+    assert picture((6.0, 4.0), draw_curves, history=history).startswith("data:image/svg")
+
+
+@pytest.mark.parametrize(
+    "confusion",
+    [np.zeros((6, 6), int), 7 * np.eye(6, dtype=int), np.ones((6, 6), int), np.diag([0, 5, 0, 0, 9, 0])],
+)
+def test_any_confusion_is_drawn(confusion):
+    names = ("a$b$", "<i>&amp;", "x" * 60, "\\frac", "e")
+    assert picture(confusion_size(6), draw_confusion, names, confusion).startswith("data:image/svg")
+
+
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_reliability_of_few_and_many_points(rng, count):
+    confidence = rng.uniform(size=count)
+    bins = reliability(confidence, confidence > 0.4)
+    assert picture((6.0, 6.0), draw_reliability, bins, 0.1).startswith("data:image/svg")
+
+
+def test_long_names_are_cut():
+    assert short("IndexTip") == "IndexTip"
+    assert len(short("x" * 60)) == LONGEST_NAME and short("x" * 60).endswith("…")
+
+
+SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
+
+
+def head(text: str) -> dict[str, str | list[str]]:
+    """The YAML between the first two rules: plain keys with a word or a list of words."""
+    before, lines, _ = text.split("---\n", maxsplit=2)
+    assert before == ""
+    found: dict[str, str | list[str]] = {}
+    for line in lines.splitlines():
+        if line.startswith("- "):
+            entries = found[key]
+            assert isinstance(entries, list)
+            entries.append(line[2:])
+        else:
+            key, _, value = line.partition(":")
+            found[key] = value.strip() or []
+    return found
+
+
+@pytest.mark.parametrize("license", ["unknown", "apache-2.0"])
+def test_the_head_is_what_hubs_read(license: str) -> None:
+    found = head(model_card(SHIPPED | {"license": license}))
+    assert found["license"] == license
+    assert found["library_name"] == "handsim"
+    assert found["pipeline_tag"] == "other"
+    assert "motion-capture" in found["tags"]
+
+
+def test_the_shipped_weights_have_the_same_head() -> None:
+    text = resources.files("train").joinpath("weights/README.md").read_text()
+    assert head(text) == head(model_card(SHIPPED))
+
+
+def test_the_words_say_what_the_card_says() -> None:
+    text = model_card(SHIPPED)
+    assert "# Labeler of hand markers: dense19" in text
+    assert "Trained on simulated frames only: 1,200,000 of them" in text
+    assert "clouds" in text
+    for column in SHIPPED["held_out_simulated"].values():
+        assert f"{100 * column['slot_accuracy']:.2f}" in text
+    for name in SHIPPED["marker_names"]:
+        assert name in text
+
+
+def test_a_card_in_which_a_license_was_named_is_its_authors(tmp_path: Path) -> None:
+    card = SHIPPED | {"license": "unknown"}
+    path = write_model_card(tmp_path, card)
+    assert path == tmp_path / MODEL_CARD
+    write_model_card(tmp_path, card | {"handsim": "9.9.9"})
+    assert "9.9.9" in path.read_text()
+    mine = path.read_text().replace("license: unknown", "license: cc-by-4.0")
+    path.write_text(mine)
+    write_model_card(tmp_path, card)
+    assert path.read_text() == mine

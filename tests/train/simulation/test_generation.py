@@ -36,7 +36,7 @@ COMMAND = """
 import sys
 from pathlib import Path
 from train.simulation import generation
-from train.simulation.training_frames import (GenerateSettings)
+from train.simulation.training_frames import GenerateSettings
 generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
     config = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)

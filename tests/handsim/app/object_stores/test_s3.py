@@ -42,8 +42,7 @@ ROOT = Path(__file__).resolve().parents[4]
 RUN = f"""
 import sys
 from train.simulation import generation
-from train.simulation.training_frames import (GenerateSettings)
-from train.simulation.training_frames import SceneMix
+from train.simulation.training_frames import GenerateSettings, SceneMix
 
 generation.ROWS_PER_SHARD = {ROWS}
 config = GenerateSettings(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})

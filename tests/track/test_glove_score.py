@@ -1,0 +1,276 @@
+"""What is known of a layout: counted again by other means where that is possible."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.fit import attach
+from gloves.layout import MarkerPlace, load_layout
+from gloves.takes.take import Take
+from handsim.errors import CaptureError
+from handsim.hand.model import HandModel
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, JOINTS
+from handsim.space.rig import load_rig
+from poses.shapes import sample_poses
+from track.glove_improvement import verdict
+from track.glove_page import trial_rows
+from track.glove_score import (
+    METHODS,
+    NOISE,
+    Trial,
+    free_spreads,
+    joint_spreads,
+    layout_spreads,
+    right_shares,
+    score_layout,
+    try_take,
+)
+from track.kinematics.pose_solver import PoseSolver
+from train.forecast.rig_forecast import observe_motion, observe_poses
+from train.labelers.layout_labeler import LayoutLabeler
+from train.labelers.storage import load_labeler
+from train.simulation.takes import simulate_take
+
+
+def test_seen_and_near_are_counted(tips, tips_hands, tips_score):
+    observed = np.concatenate([hand.frames.observed for hand in tips_hands])
+    markers = np.concatenate([hand.frames.markers for hand in tips_hands])
+    np.testing.assert_allclose(tips_score.seen, np.isfinite(observed).all(axis=2).mean(axis=0))
+    first, second = tips.names.index("MiddleTip"), tips.names.index("RingTip")
+    apart = np.linalg.norm(markers[:, first] - markers[:, second], axis=1)
+    expected = (apart < 2 * tips.radius + 0.003).mean()
+    assert tips_score.near[first, second] == tips_score.near[second, first] == pytest.approx(expected)
+    assert np.diag(tips_score.near).max() == 0.0
+
+
+def test_slots_are_right_more_often_where_all_is_seen(tips, tips_score):
+    clean, observed = tips_score.clean.figures, tips_score.observed.figures
+    assert 1.0 / tips.num_markers < observed["slot_accuracy"] <= clean["slot_accuracy"] + 0.02
+    assert tips_score.observed.num_frames == tips_score.clean.num_frames
+    assert tips_score.sides_right > 0.9
+
+
+def test_joints_are_known_less_without_a_marker(tips, tips_score):
+    assert tips_score.joints_without.shape == (tips.num_markers, 20)
+    assert (tips_score.joints_without >= tips_score.joints - 0.01).all()
+
+
+def test_a_blind_rig_sees_fewer_markers(tips):
+    rig = load_rig("six")
+    pair = dataclasses.replace(rig, cameras=rig.cameras[:2])
+    shares = [
+        np.isfinite(
+            np.concatenate(
+                [hand.frames.observed for hand in observe_poses(tips, one, 120, rng=np.random.default_rng(2))]
+            )
+        ).mean()
+        for one in (rig, pair)
+    ]
+    assert shares[1] < 0.7 * shares[0]
+
+
+def test_the_hands_of_a_take_wear_the_layout(tips):
+    take = simulate_take("hand-hand", num_frames=60)
+    hands = observe_motion(take, tips, load_rig("figure5"), 20, rng=np.random.default_rng(3))
+    assert [hand.fit.side for hand in hands] == [hand.side for hand in take.hands]
+    assert all(hand.frames.markers.shape == (20, tips.num_markers, 3) for hand in hands)
+    np.testing.assert_array_equal(hands[0].qpos[:, 7:], take.qpos[np.linspace(0, 59, 20).astype(int), 0, 7:])
+    empty = Take.of_poses(take.hands, np.full_like(take.qpos, np.nan), rate=take.rate)
+    with pytest.raises(CaptureError, match="no frame in which every hand"):
+        observe_motion(empty, load_layout("tips8"), load_rig("six"), 20, rng=np.random.default_rng(3))
+
+
+@pytest.fixture(scope="session")
+def tips():
+    return load_layout("tips8")
+
+
+@pytest.fixture(scope="session")
+def tips_hands(tips):
+    return observe_poses(tips, load_rig("six"), 240, rng=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def tips_score(tips, tips_hands):
+    labeler = LayoutLabeler.at_once(tips, num_poses=2000)
+    return score_layout(tips, tips_hands, labeler, rng=np.random.default_rng(1))
+
+
+@pytest.fixture
+def good(tips, tips_score):
+    """A score of a layout without faults."""
+    count = tips.num_markers
+    report = dataclasses.replace(
+        tips_score.observed, confusion=np.diag([*[100] * count, 0]), slot_accuracy_by_marker=np.ones(count)
+    )
+    return dataclasses.replace(
+        tips_score,
+        observed=report,
+        seen=np.ones(count),
+        near=np.zeros((count, count)),
+        joints=np.full(20, 0.05),
+        joints_without=np.full((count, 20), 0.2),
+        sides_right=1.0,
+    )
+
+
+def test_a_good_layout_is_left_alone(good):
+    assert good.advice == ()
+
+
+def test_confused_markers_are_named(good):
+    confusion = good.observed.confusion.copy()
+    confusion[2, 2], confusion[2, 4] = 80, 20
+    report = dataclasses.replace(good.observed, confusion=confusion)
+    (sentence,) = dataclasses.replace(good, observed=report).advice
+    names = good.layout.names
+    assert sentence.startswith(f"Move {names[2]} or {names[4]}") and "20 %" in sentence
+
+
+def test_a_joint_of_which_nothing_is_told_asks_for_a_marker_on_its_bone(good):
+    joints = good.joints.copy()
+    number = JOINT_NAMES.index("index_PIP_flexion")
+    joints[number] = 0.9 * free_spreads()[number]
+    (sentence,) = dataclasses.replace(good, joints=joints).advice
+    assert sentence.startswith("Add a marker on index_middle")
+
+
+def test_no_marker_is_asked_for_where_every_bone_has_one(good):
+    joints = good.joints.copy()
+    joints[JOINT_NAMES.index("middle_DIP_flexion")] = free_spreads()[0]
+    (sentence,) = dataclasses.replace(good, joints=joints).advice
+    assert sentence.startswith("Add a marker on middle_middle")  # the tip has one
+    bones = [bone for bone in BONE_NAMES if bone.startswith("middle")]
+    first, *_, second = good.layout.markers[:4]  # of other digits
+    moved = {
+        one.name: MarkerPlace(one.name, bone, 0.5, 0.0)
+        for one, bone in zip((first, second), bones, strict=False)
+    }
+    markers = tuple(moved.get(one.name, one) for one in good.layout.markers)
+    layout = dataclasses.replace(good.layout, markers=markers)
+    assert dataclasses.replace(good, joints=joints, layout=layout).advice == ()
+
+
+def test_the_worst_marker_of_captures_is_named(good):
+    slots = np.ones(good.layout.num_markers)
+    slots[4] = 0.8
+    found = Trial(dict.fromkeys(METHODS, slots), dict.fromkeys(METHODS, 0.9), np.zeros(20), 0.0)
+    (sentence,) = dataclasses.replace(good, trials={"two touching": found}).advice
+    assert sentence.startswith(f"With two touching {good.layout.names[4]} is labeled worst: right in 80 %")
+
+
+def test_hidden_touching_and_symmetric_markers_are_told(good):
+    seen, near = good.seen.copy(), good.near.copy()
+    seen[3], near[5, 6], near[0, 1] = 0.4, 0.1, 0.3  # tips touch, too, because fingers do
+    sentences = dataclasses.replace(good, seen=seen, near=near, sides_right=0.7).advice
+    assert len(sentences) == 3
+    assert sentences[0].startswith(f"Move {good.layout.names[3]} towards the back") and "40 %" in sentences[0]
+    assert sentences[1].startswith("Make the back of the hand less symmetric") and "30 %" in sentences[1]
+    assert sentences[2].startswith(f"Move {good.layout.names[5]} and {good.layout.names[6]} apart")
+
+
+def test_a_marker_that_tells_nothing_can_be_dropped(good):
+    without = good.joints_without.copy()
+    without[5] = good.joints
+    (sentence,) = dataclasses.replace(good, joints_without=without).advice
+    assert sentence.startswith(f"{good.layout.names[5]} can be dropped")
+
+
+def test_the_forecast_is_the_error_of_the_solver(rng):
+    """Flexions that three markers tell of; noise of the forecast's size is added to true markers."""
+    fit = attach(load_layout("starter30"), HandModel.named("M"))
+    qpos = sample_poses(fit.model, 300, rng=rng)
+    markers = fit.markers(qpos)[0]
+    seen = np.ones(markers.shape[:2], dtype=bool)
+    forecast = layout_spreads([(fit, qpos, seen)])
+    solved = PoseSolver(fit).solve(markers + NOISE * rng.standard_normal(markers.shape), qpos).qpos
+    measured = np.sqrt(((solved - qpos)[:, 7:] ** 2).mean(axis=0))
+    ratios = measured / forecast
+    assert 1 / 1.3 < np.median(ratios) < 1.3
+    assert (ratios > 0.4).all() and (ratios < 2.5).all()
+
+
+def test_more_markers_leave_less_open(rng):
+    model = HandModel.named("M")
+    qpos = sample_poses(model, 40, rng=rng)
+    few, many = (
+        layout_spreads([(attach(load_layout(name), model), qpos, np.ones((40, count), dtype=bool))])
+        for name, count in (("starter10", 10), ("starter30", 30))
+    )
+    assert (many < few).all()
+    assert (few <= free_spreads() + 1e-9).all()
+
+
+def test_a_finger_without_markers_is_known_as_far_as_its_neighbors_tell():
+    """All markers on the palm: nothing is known of the fingers."""
+    layout = load_layout("starter30")
+    palm = tuple(marker for marker in layout.markers if marker.bone == "palm")
+    fit = attach(dataclasses.replace(layout, markers=palm), HandModel.named("M"))
+    qpos = np.zeros((1, 27))
+    qpos[:, 3] = 1.0
+    spreads = layout_spreads([(fit, qpos, np.ones((1, len(palm)), dtype=bool))])
+    fingers = [number for number, joint in enumerate(JOINTS) if not joint.name.startswith("thumb")]
+    # The skin of the palm moves a little with the first joints of the fingers.
+    np.testing.assert_allclose(spreads[fingers][2::4], free_spreads()[fingers][2::4], rtol=0.01)
+    np.testing.assert_allclose(spreads[fingers][3::4], free_spreads()[fingers][3::4], rtol=0.01)
+
+
+def test_a_tip_that_is_never_seen_costs_its_finger(tips, tips_hands):
+    tip = tips.names.index("IndexTip")
+    joints = [number for number, joint in enumerate(JOINTS) if joint.name.startswith("index")]
+    others = [number for number, joint in enumerate(JOINTS) if joint.name.startswith("little")]
+    lost = joint_spreads(tips_hands, without=tip) - joint_spreads(tips_hands)
+    assert lost[joints].max() > 5 * max(1e-3, lost[others].max())
+
+
+@pytest.fixture(scope="module")
+def take():
+    return simulate_take("single-hand", glove="dense19", num_frames=40, seed=1, hands=["right"])
+
+
+def trial(share, joints):
+    slots = np.full(4, share)
+    slots[2] -= 0.1
+    return Trial(dict.fromkeys(METHODS, slots), dict.fromkeys(METHODS, share), np.full(20, joints), 0.002)
+
+
+def test_a_hand_in_the_dense_glove_is_labeled_and_tracked(take):
+    found = try_take(take, load_layout("dense19"), load_labeler("dense19"))
+    assert min(found.share(method) for method in METHODS) > 0.98
+    assert np.rad2deg(np.sqrt(np.mean(found.joints**2))) < 15.0
+    assert found.size_error < 0.012
+
+
+def test_truth_is_all_right_and_exchanged_markers_are_not(take):
+    share, frames = right_shares(take, take)
+    assert (share == 1.0).all() and frames == 1.0
+    labels = take.labels.copy()
+    labels[:20][take.labels[:20] == 3] = 4
+    labels[:20][take.labels[:20] == 4] = 3
+    share, frames = right_shares(take, dataclasses.replace(take, labels=labels))
+    assert share[3] == pytest.approx(share[4]) and share[3] <= 0.5 + 1e-9
+    assert (np.delete(share, [3, 4]) == 1.0).all() and frames <= 0.5
+
+
+def test_labels_of_a_hand_that_is_not_there_are_wrong(take):
+    both = simulate_take("single-hand", glove="dense19", num_frames=40, seed=1)
+    other = dataclasses.replace(take, hands=(both.hands[1],))
+    share, frames = right_shares(take, other)
+    assert share.max() < 0.2 and frames == 0.0
+
+
+def test_the_sentence_says_whether_a_layout_is_better():
+    before, more, same = trial(0.95, 0.2), trial(0.99, 0.21), trial(0.951, 0.1)
+    assert verdict({"a": before}, {"a": more}).startswith("Better in captures: 92.50 %")
+    assert verdict({"a": before}, {"a": same}).startswith("Better in captures")
+    assert verdict({"a": more}, {"a": before}).startswith("Not better in captures")
+    assert verdict({"a": before}, {"a": before}).startswith("Not better in captures")
+
+
+def test_the_table_names_the_worst_marker(tips):
+    header, row = trial_rows({"two touching": trial(0.95, 0.2)}, tips)
+    assert len(header) == len(row)
+    assert row[0] == "two touching" and f"{tips.names[2]} (85 %)" in row

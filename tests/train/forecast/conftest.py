@@ -1,0 +1,25 @@
+"""Hands at work for a short while, as a rig sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.layout import load_layout
+from handsim.space.rig import ROOM_CENTER, named_rig
+from train.forecast.rig_forecast import light, sample_work
+from train.simulation.room import RoomConfig
+
+SIDES = np.full(3, 0.6)
+
+
+@pytest.fixture(scope="session")
+def work():
+    rng = np.random.default_rng(0)
+    found = sample_work(load_layout("tips8"), np.array(ROOM_CENTER), SIDES, 120, 1, rng=rng)
+    return [scene for scenes in found.values() for scene in scenes]
+
+
+@pytest.fixture(scope="session")
+def six_lit(work):
+    return light(work, named_rig("six"), RoomConfig(), rng=np.random.default_rng(1))

@@ -1,0 +1,150 @@
+"""The page of a layout's score: advice, figures, the hand with confusions, and its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from gloves.layout import MarkerLayout
+from handsim.hand.shape import DIGITS, JOINTS
+from handsim.pages import NOTHING, Paint, Section, color_bar, color_scale, html_list, picture, write_sections
+from track.glove_score import METHODS, NOISE, LayoutScore, Trial
+from train.evaluation import percent
+from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST: Final = 15.0  # end of the colors' scale [deg]
+_PAIRS: Final = 5  # pairs of near markers that are listed
+
+
+def write_glove_page(path: Path, score: LayoutScore) -> None:
+    """Write the page on a layout's score."""
+    layout = score.layout
+    sections = [
+        _advice_section(score),
+        *([_trials_section(score)] if score.trials else []),
+        _labels_section(score),
+        _markers_section(score),
+        _joints_section(score),
+    ]
+    network = (
+        "a labeler trained on it"
+        if score.is_trained
+        else "the network for any layout, after a minute of learning this one"
+    )
+    lead = (
+        f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {score.observed.num_frames:,} "
+        f"frames of {score.seen_by}. Points were labeled by {network}."
+    )
+    write_sections(path, sections, title=f"Layout {layout.name}", lead=lead)
+
+
+def _advice_section(score: LayoutScore) -> Section:
+    nothing = "Nothing stands out: no marker is in anybody's way."
+    return Section("What to do", html_list(score.advice) if score.advice else nothing)
+
+
+def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
+    """What became of simulated captures of each kind of work, the header first."""
+    rows = [
+        ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
+         "size off [mm]"]
+    ]  # fmt: skip
+    for work, trial in trials.items():
+        rights = [f"{percent(trial.share(name))}, {100 * trial.frames[name]:.0f}" for name in METHODS]
+        worst = f"{layout.names[trial.worst]} ({100 * trial.right[trial.worst]:.0f} %)"
+        rows.append([work, *rights, worst, f"{trial.joint_error:.1f}", f"{1e3 * trial.size_error:.1f}"])
+    return rows
+
+
+def _trials_section(score: LayoutScore) -> Section:
+    text = (
+        "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
+        "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames "
+        "that are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints "
+        "is about calibrated ones."
+    )
+    return Section("Captures", text, table=trial_rows(score.trials, score.layout))
+
+
+def _labels_section(score: LayoutScore) -> Section:
+    columns = (score.observed, score.clean, score.corrupted)
+    table = [["labels [%]", "as the rig sees them", "every marker seen", "the paper's drops and ghosts"]]
+    table += [
+        [title, *(percent(report.figures[name]) for report in columns)]
+        for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
+    ]
+    accuracy, arrows = score.observed.slot_accuracy_by_marker, mistakes(score.observed.confusion)
+    caption = f"{HAND_CAPTION}Arrows lead from what points are to what they are called, wider the more often."
+    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames."
+    drawn = hand_picture(score.layout, accuracy, arrows)
+    return Section("Labels", text, table=table, pictures=[(drawn, caption)])
+
+
+def _markers_section(score: LayoutScore) -> Section:
+    names, accuracy = score.layout.names, score.observed.slot_accuracy_by_marker
+    worst = {mistake.truth: mistake for mistake in reversed(mistakes(score.observed.confusion, 200))}
+    lost = np.rad2deg((score.joints_without - score.joints).max(axis=1))
+    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]", "joints lose [deg]"]]
+    for number, name in enumerate(names):
+        mistake = worst.get(number)
+        taken = (names[mistake.called], percent(mistake.share)) if mistake else (NOTHING, NOTHING)
+        shares = percent(score.seen[number]), percent(accuracy[number])
+        table.append([name, *shares, *taken, f"{lost[number]:.1f}"])
+    text = (
+        "Seen: the marker becomes a point. Joints lose: by how much the worst-hit joint is known less well "
+        "without it."
+    )
+    near = np.triu(score.near)
+    order = np.argsort(-near, axis=None, kind="stable")[:_PAIRS]
+    pairs = "; ".join(
+        f"{names[first]} and {names[second]}: {percent(near[first, second])} %"
+        for first, second in zip(*np.unravel_index(order, near.shape), strict=True)
+        if near[first, second] > 0.0
+    )
+    notes = [f"Pairs that touch or nearly do, in shares of the frames: {pairs}."] if pairs else []
+    return Section("Markers", text, table=table, notes=notes)
+
+
+def _joints_section(score: LayoutScore) -> Section:
+    caption = (
+        "Markers are small rings, joints disks: the standard deviation of the worst angle there, in degrees."
+    )
+    table = [["joints [deg]", "abduction", "first flexion", "second flexion", "last flexion"]]
+    degrees = np.rad2deg(score.joints)
+    rows = zip(DIGITS, degrees.reshape(len(DIGITS), -1), strict=True)
+    table += [[digit, *(f"{one:.1f}" for one in row)] for digit, row in rows]
+    text = (
+        "Standard deviation of each joint's angle, from the information that the markers give the solver "
+        f"frame by frame where they lie within {1e3 * NOISE:g} mm of a calibrated hand's, and from the "
+        "limits of the joints. Tracking knows more: what the hand did before, and what hands usually do."
+    )
+    drawn = picture((8.4, 6.4), _draw_joints, flat_hand(score.layout), degrees)
+    return Section("Joints", text, table=table, pictures=[(drawn, caption)])
+
+
+def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"]) -> None:
+    """Draw a disk at each bone's near end, with the standard deviation of the worst joint there."""
+    panel = figure.subplots()
+    panel.set_axis_off()
+    panel.set_aspect("equal")
+    hand.draw(panel, bone_width=2.5, zorder=1)
+    panel.plot(*hand.markers.T, "o", color=Paint.SOFT, markersize=5.0, markerfacecolor=Paint.CARD, zorder=2)
+    colors = color_scale(_MOST, 0.0)
+    for bone in sorted({joint.bone for joint in JOINTS}):
+        worst = max(degrees[number] for number, joint in enumerate(JOINTS) if joint.bone == bone)
+        x, y = hand.bones[bone - 1][0]
+        color = colors.to_rgba(worst)
+        panel.plot(x, y, "o", markersize=15.0, color=color, markeredgecolor=Paint.INK, zorder=3)
+        panel.annotate(
+            f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=Paint.INK, zorder=4
+        )
+    color_bar(
+        figure, colors, "standard deviation of the worst joint [deg]", ax=panel, shrink=0.6, extend="max"
+    )

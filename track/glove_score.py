@@ -1,0 +1,509 @@
+"""The score of a marker layout before anybody wears it: labels, joints, simulated captures, and advice.
+
+Captures are short: simulated people in the glove, labeled and tracked as users' are. Nothing is calibrated:
+the size of the hands is measured in each capture, as `handsim label` and `handsim track` do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gloves.fit import GloveFit, attach_markers
+from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace, load_layout
+from gloves.takes.take import Take, load_take
+from handsim.callbacks import OnStep, no_step
+from handsim.errors import HandSimWarning
+from handsim.hand.model import HandModel
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.space.rig import CameraRig, as_rig
+from handsim.space.transforms import MIRROR
+from track.captures import label_capture, measure_hands, track_capture
+from track.config import BOTH
+from track.kinematics.marker_kinematics import hand_arrays
+from track.kinematics.pose_spread import known_hand, pose_spreads, tip_lengths
+from track.user import AnyGlove
+from train.data.batches import Corruption, corrupt, paper_corruption
+from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
+from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
+from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
+from train.labelers.layout_labeler import learned_labeler
+from train.labelers.pose_prior import SideClassifier
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+from train.reports.hand_plot import mistakes
+from train.simulation.scenes import SimulatedKind
+from train.simulation.takes import simulate_take
+
+METHODS: Final = ("label", "track")
+CAPTURES: Final = 3
+"""Captures of each kind of work; those of one number have the same people and motions for every layout."""
+FRAMES: Final = 240
+"""Frames of a capture: two seconds."""
+WORK: Final[Mapping[str, tuple[SimulatedKind, tuple[Side, ...]]]] = {
+    "one hand": ("single-hand", ("right",)),
+    "two apart": ("single-hand", ("right", "left")),
+    "two touching": ("hand-hand", ("right", "left")),
+}
+"""What hands do in captures."""
+NOISE: Final = 0.0015
+"""Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
+_TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
+_NEAR: Final = 0.003  # distance between two markers' surfaces at which gloves and blobs touch [m]
+_SIDE_FRAMES: Final = 500
+_JOINT_FRAMES: Final = 600
+_FEWEST: Final = 4  # markers of a pose
+_FEWEST_OF_BODY: Final = 3  # markers of a rigid body
+_IN_LINE: Final = 1e-8  # least information of markers that are not in a line [m^2]
+
+# A layout with these figures gets a sentence.
+_UNINFORMED: Final = 0.6  # share of a joint's usual spread
+_UNCERTAIN: Final = np.deg2rad(5.0)  # spread of a joint
+_CONFUSED: Final = 0.02  # share of a marker's points that are taken for another's
+_HIDDEN: Final = 0.85  # share of frames in which a marker is seen
+_TOUCHING: Final = 0.02  # share of frames
+_WRONG: Final = 0.97  # share of frames in which a marker of a capture is right
+_SIDES: Final = 0.99  # share of frames whose side is right
+_DISPENSABLE: Final = np.deg2rad(0.3)  # largest growth of a joint's spread without a marker
+_MOST_OF_A_KIND: Final = 4  # sentences
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """What became of the captures of one kind of work."""
+
+    slots: dict[str, Float[np.ndarray, "M"]]
+    """Share of the frames in which each marker's slot is right, by method: `label` and `track`."""
+    frames: dict[str, float]
+    """Share of the frames without any error, by method."""
+    joints: Float[np.ndarray, "20"]
+    """Root mean square error of each joint that `track` gives [rad]; NaN if no hand was found."""
+    size_error: float
+    """Mean distance of the measured from the true length of the hands [m]."""
+
+    @property
+    def right(self) -> Float[np.ndarray, "M"]:
+        """Share of each marker's slots that are right, the mean of both methods."""
+        share: Float[np.ndarray, "M"] = np.mean([self.slots[name] for name in METHODS], axis=0)
+        return share
+
+    @property
+    def worst(self) -> int:
+        """The marker with most wrong slots."""
+        return int(self.right.argmin())
+
+    @property
+    def joint_error(self) -> float:
+        """Root mean square error over the joints [deg]."""
+        return float(np.rad2deg(np.sqrt(np.mean(self.joints**2))))
+
+    def share(self, method: str) -> float:
+        """Share of all slots that are right."""
+        return float(self.slots[method].mean())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayoutScore:
+    """How well a layout can be labeled, and what it tells of each joint."""
+
+    layout: MarkerLayout
+    observed: LabelingReport
+    """Labels of the frames as the rig sees them, on average over both hands."""
+    clean: LabelingReport
+    """Labels where every marker is seen."""
+    corrupted: LabelingReport
+    """Labels with the drops and ghosts of the paper's recipe."""
+    seen: Float[np.ndarray, "M"]
+    """Share of the frames in which each marker is seen by two cameras and becomes a point."""
+    near: Float[np.ndarray, "M M"]
+    """Share of the frames in which two markers touch or nearly do."""
+    joints: Float[np.ndarray, "20"]
+    """Standard deviation that the markers leave of each joint of a calibrated hand [rad]."""
+    joints_without: Float[np.ndarray, "M 20"]
+    """The same without each marker [rad]."""
+    sides_right: float
+    """Share of the frames in which left and right are told apart by the labeled markers."""
+    trials: Mapping[str, Trial] = field(default_factory=dict)
+    """What became of simulated captures of each kind of work; empty where none was tried."""
+    is_trained: bool = False
+    """Whether the labeler was trained on the layout; else it is the network for any layout."""
+    seen_by: str = ""
+    """Whose motion was seen by which rig, in words."""
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to move, add or drop, in sentences, the most important first."""
+        kinds = (_captures, _confusions, _joints, _hidden, _touching, _sides, _dispensable)
+        found = [
+            one
+            for kind in kinds
+            for one in sorted(kind(self), key=lambda item: -item.weight)[:_MOST_OF_A_KIND]
+        ]
+        return tuple(one.sentence for one in sorted(found, key=lambda item: -item.weight))
+
+
+def score_glove(
+    glove: AnyGlove,
+    settings: ScoreGloveSettings | None = None,
+    *,
+    on_step: OnStep = no_step,
+    **options: Any,
+) -> LayoutScore:
+    """Score a layout as `handsim glove score` does; nothing is trained.
+
+    Args:
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        settings: What hands do, before which rig.
+        on_step: Called with the name of each step.
+        options: Fields of `settings`, by name: `rig="six"`.
+
+    Returns:
+        Shares of labels that are right, standard deviations of joints [rad], what became of the captures, and
+        advice in sentences.
+
+    Raises:
+        ArgumentError: A setting is unknown or refused.
+        CaptureError: The take cannot be read, or its hands are never there together.
+        LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
+    """
+    chosen = ScoreGloveSettings.of(settings, options)
+    layout, rig, given = load_layout(glove), as_rig(chosen.rig), chosen.labeler
+    rng = np.random.default_rng(chosen.seed)
+    on_step("simulating hands")
+    hands, seen = _hands(chosen, layout, rig, rng)
+    on_step("learning the layout, about a minute the first time")
+    labeler = learned_labeler(layout, rig) if given is None else load_labeler(layout, given)
+    on_step("labeling")
+    score = score_layout(layout, hands, labeler, rng=rng)
+    trials = try_layout(
+        layout, rig, labeler, count=chosen.captures, told=lambda words: on_step(f"trying captures: {words}")
+    )
+    seen_by = f"{seen}, seen by rig {rig.name}"
+    return dataclasses.replace(score, trials=trials, is_trained=given is not None, seen_by=seen_by)
+
+
+def _hands(
+    settings: ScoreGloveSettings, layout: MarkerLayout, rig: CameraRig, rng: np.random.Generator
+) -> tuple[list[ObservedHand], str]:
+    """Hands in the motion that was asked for, and its name."""
+    motion, frames = settings.motion, settings.num_frames
+    if motion == POSES:
+        return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
+    if motion == TWINS:
+        kinds: tuple[SimulatedKind, ...] = ("single-hand", "hand-hand", "hand-pen")
+        takes = [simulate_take(kind, num_frames=_TWIN_FRAMES, seed=settings.seed) for kind in kinds]
+        hands = [hand for take in takes for hand in observe_motion(take, layout, rig, frames // 6, rng=rng)]
+        return hands, "simulated motion of one hand and of two"
+    if isinstance(motion, Take):
+        return observe_motion(motion, layout, rig, frames, rng=rng), "a take"
+    return observe_motion(load_take(motion), layout, rig, frames, rng=rng), f"the take {Path(motion).name}"
+
+
+def score_layout(
+    layout: MarkerLayout, hands: Sequence[ObservedHand], labeler: Labeler, *, rng: np.random.Generator
+) -> LayoutScore:
+    """Label and count what a rig sees of gloved hands, with a labeler of this layout; no captures."""
+    observed = np.concatenate([hand.frames.observed for hand in hands])
+    ghosts = np.concatenate([hand.frames.ghosts for hand in hands])
+    markers = np.concatenate([hand.frames.markers for hand in hands])
+    center = markers.mean(axis=1, keepdims=True)
+    nothing = Corruption(occlude=0, ghosts=0)
+    cloud = corrupt(observed - center, nothing, ghosts=ghosts - center, rng=rng)
+    recipe, some = paper_corruption(layout.num_markers), _some(hands, _JOINT_FRAMES)
+    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
+    near: Float[np.ndarray, "M M"] = (apart < 2.0 * layout.radius + _NEAR).mean(axis=0)
+    np.fill_diagonal(near, 0.0)
+    return LayoutScore(
+        layout,
+        evaluate_frames(labeler, [cloud_frames(cloud)]),
+        evaluate_labeler(labeler, markers - center, nothing, rng=rng),
+        evaluate_labeler(labeler, markers - center, recipe, rng=rng),
+        np.isfinite(observed[..., 0]).mean(axis=0),
+        near,
+        joint_spreads(some),
+        np.array([joint_spreads(some, without=marker) for marker in range(layout.num_markers)]),
+        _sides_right(layout, hands, rng),
+    )
+
+
+def _some(hands: Sequence[ObservedHand], count: int) -> list[ObservedHand]:
+    """About so many frames, evenly chosen."""
+    step = max(1, sum(len(hand.qpos) for hand in hands) // count)
+    return [
+        ObservedHand(hand.fit, hand.qpos[::step], type(hand.frames)(*(part[::step] for part in hand.frames)))
+        for hand in hands
+    ]
+
+
+def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.random.Generator) -> float:
+    """Share of the frames whose side is recognized from the markers that are seen, by the true labels."""
+    classifier, right, count = SideClassifier(layout, rng=rng), 0, 0
+    for hand in _some(hands, _SIDE_FRAMES):
+        observed, side = hand.frames.observed, hand.fit.side
+        other: Side = "left" if side == "right" else "right"
+        for markers, one in ((observed, side), (observed @ MIRROR, other)):
+            right += int(classifier.recognized(markers, one).sum())
+            count += len(markers)
+    return right / max(1, count)
+
+
+def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
+    """`layout_spreads` of observed hands, perhaps without a marker."""
+    parts = []
+    for hand in hands:
+        seen = np.isfinite(hand.frames.observed[..., 0])
+        if without is not None:
+            seen[:, without] = False
+        parts.append((hand.fit, hand.qpos, seen))
+    return layout_spreads(parts)
+
+
+def layout_spreads(
+    poses: Iterable[tuple[GloveFit, Float[np.ndarray, "T 27"], Bool[np.ndarray, "T M"]]],
+) -> Float[np.ndarray, "20"]:
+    """Standard deviation of each joint's error [rad], its root mean square over the frames.
+
+    It comes from the information of the markers that are seen, of hands in their gloves and poses, and from
+    the limits of the joints, as in the solver; frames with fewer than four markers tell nothing. What hands
+    usually do narrows that further when a hand is tracked.
+    """
+    squares, count = np.zeros(NUM_JOINTS), 0
+    limits = np.diag(free_spreads() ** -2.0)
+    for fit, qpos, seen in poses:
+        good = seen.sum(axis=1) >= _FEWEST
+        hand, unseen = hand_arrays(fit), np.where(seen[good], 0.0, np.inf)
+        known = known_hand(hand.digits, NOISE)
+        spreads, _ = pose_spreads(hand, tip_lengths(fit), limits, known, qpos[good], unseen)
+        squares += (spreads**2).sum(axis=0)
+        squares += np.count_nonzero(~good) * free_spreads() ** 2
+        count += len(good)
+    return np.sqrt(squares / max(1, count))
+
+
+def free_spreads() -> Float[np.ndarray, "20"]:
+    """Standard deviation of each joint where nothing is seen: anywhere in its range [rad]."""
+    ranges = np.deg2rad([joint.high - joint.low for joint in JOINTS])
+    return np.asarray(ranges / np.sqrt(12.0))
+
+
+def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
+    """Standard deviation of the palm's rotation about its least certain axis, by its own markers [rad].
+
+    Infinite with fewer than three markers on the palm, or three in a line.
+    """
+    palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
+    if len(palm) < _FEWEST_OF_BODY:
+        return float("inf")
+    points = attach_markers(layout_of(palm, 0.003), model).points[: len(palm)]
+    arms = points - points.mean(axis=0)
+    information = (arms**2).sum() * np.eye(3) - arms.T @ arms
+    least = float(np.linalg.eigvalsh(information)[0])
+    return float(NOISE / np.sqrt(least)) if least > _IN_LINE else float("inf")
+
+
+def layout_of(places: Sequence[MarkerPlace], radius: float) -> MarkerLayout:
+    """A layout of any places, numbered, the first repeated where they are fewer than a glove's markers."""
+    copies = (*places, *[places[0]] * (FEWEST_MARKERS - len(places)))
+    named = [dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies)]
+    return MarkerLayout("places", tuple(named), radius)
+
+
+def try_layout(
+    layout: MarkerLayout,
+    rig: CameraRig | str,
+    labeler: Labeler,
+    *,
+    count: int = CAPTURES,
+    first: int = 0,
+    frames: int = FRAMES,
+    told: Callable[[str], None] = no_step,
+) -> dict[str, Trial]:
+    """Label and track simulated captures, from number `first` on, of each kind of work that the glove is for.
+
+    `told` is called before each capture with what it is.
+    """
+    found: dict[str, Trial] = {}
+    for name in WORK if count else ():
+        kind, needed = WORK[name]
+        sides = tuple(side for side in needed if side in layout.sides)
+        if name == "one hand":
+            sides = sides or layout.sides
+        elif len(sides) < len(needed):
+            continue
+        tried = []
+        for number in range(1, count + 1):
+            told(f"{name}, capture {number} of {count}")
+            take = simulate_take(
+                kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
+            )
+            tried.append(try_take(take, layout, labeler))
+        found[name] = mean_trial(tried)
+    return found
+
+
+def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
+    """Label and track a simulated capture of unknown hands, whose gloves have slipped a little."""
+    capture = truth.capture()
+    sides = [side for side in BOTH if side in layout.sides]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HandSimWarning)
+        user = measure_hands(capture, layout, labeler=labeler, hands=sides)
+        tracked = track_capture(capture, hands=user, labeler=labeler)
+        labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
+    slots, frames = {}, {}
+    for name, take in zip(METHODS, (labeled, tracked), strict=True):
+        slots[name], frames[name] = right_shares(truth, take)
+    errors = [
+        (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
+        for number, hand in enumerate(truth.hands)
+    ]
+    size_error = abs(tracked.hands[0].shape.length - truth.hands[0].shape.length)
+    return Trial(slots, frames, _root_mean(np.concatenate(errors)), size_error)
+
+
+def mean_trial(trials: Sequence[Trial]) -> Trial:
+    """The mean of captures of equal length."""
+    return Trial(
+        {name: np.mean([one.slots[name] for one in trials], axis=0) for name in METHODS},
+        {name: float(np.mean([one.frames[name] for one in trials])) for name in METHODS},
+        _root_mean(np.array([one.joints**2 for one in trials])),
+        float(np.mean([one.size_error for one in trials])),
+    )
+
+
+def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
+    """Root mean of the squares that are known; NaN where none is."""
+    known = np.isfinite(squares)
+    sums: Float[np.ndarray, "20"] = np.where(known, squares, 0.0).sum(axis=0)
+    return np.sqrt(sums / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
+
+
+def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float]:
+    """Share of the frames in which each marker's slots are right, of hands that are there; and of frames."""
+    markers = truth.hands[0].layout.num_markers
+    names = truth.label_names
+    of_hands = [names.index(name) if name in names else -1 for name in take.label_names]
+    others = len(truth.hands) * markers  # labels of hands that are not there
+    known = np.array([number if 0 <= number < others else others for number in of_hands] + [-1])
+    counts, right = LabelCounts(), np.zeros(others)
+    for points, true, given in zip(truth.points, truth.labels, take.labels, strict=True):
+        here = np.isfinite(points[:, 0])
+        worn = np.where(true[here] < others, true[here], -1)
+        right += counts.add(known[given[here]], worn, others + 1)[:others]
+    share: Float[np.ndarray, "M"] = (right / counts.frames).reshape(len(truth.hands), markers).mean(axis=0)
+    return share, counts.frames_right / counts.frames
+
+
+class _Advice(NamedTuple):
+    """A sentence, and the share of points, frames or joints that it is about."""
+
+    weight: float
+    sentence: str
+
+
+def _captures(score: LayoutScore) -> Iterator[_Advice]:
+    """The worst marker of the captures that were tried."""
+    for work, trial in score.trials.items():
+        shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
+        if min(shares.values()) < _WRONG:
+            told = ", ".join(f"{100 * share:.0f} % with {method}" for method, share in shares.items())
+            yield _Advice(
+                1.0 - min(shares.values()),
+                f"With {work} {score.layout.names[trial.worst]} is labeled worst: right in {told}. Give it "
+                "a marker next to it on the same digit, or other distances to the markers of the palm.",
+            )
+
+
+def _confusions(score: LayoutScore) -> Iterator[_Advice]:
+    names, told = score.layout.names, set()
+    for mistake in mistakes(score.observed.confusion, most=2 * _MOST_OF_A_KIND):
+        pair = frozenset((mistake.truth, mistake.called))
+        if mistake.share < _CONFUSED or pair in told:
+            continue
+        told.add(pair)
+        first, second = names[mistake.truth], names[mistake.called]
+        yield _Advice(
+            mistake.share,
+            f"Move {first} or {second}, so that their distances to the others differ: "
+            f"{100 * mistake.share:.0f} % of the points of {first} are taken for {second}.",
+        )
+
+
+def _joints(score: LayoutScore) -> Iterator[_Advice]:
+    """Digits with poorly observed joints, and the bone to add a marker to."""
+    share = score.joints / free_spreads()
+    carried = {marker.bone for marker in score.layout.markers}
+    for digit, name in enumerate(DIGITS):
+        joints = [number for number, joint in enumerate(JOINTS) if BONES[joint.bone].digit == digit]
+        poor = [
+            number for number in joints if share[number] > _UNINFORMED and score.joints[number] > _UNCERTAIN
+        ]
+        bones = [BONES[JOINTS[number].bone].name for number in (*joints, *poor)]
+        bone = next((one for one in reversed(bones) if one not in carried), None)
+        if not poor or bone is None:
+            continue
+        listed = ", ".join(
+            f"{JOINTS[number].name.removeprefix(name + '_').replace('_', ' ')} "
+            f"({np.rad2deg(score.joints[number]):.0f} deg)"
+            for number in poor
+        )
+        yield _Advice(
+            float(share[poor].max()) * 0.1,
+            f"Add a marker on {bone}: the markers tell little of the {name}'s {listed}.",
+        )
+
+
+def _hidden(score: LayoutScore) -> Iterator[_Advice]:
+    for name, seen in zip(score.layout.names, score.seen, strict=True):
+        if seen < _HIDDEN:
+            yield _Advice(
+                1.0 - float(seen),
+                f"Move {name} towards the back of the hand: it is a point in {100 * seen:.0f} % of the "
+                "frames only.",
+            )
+
+
+def _touching(score: LayoutScore) -> Iterator[_Advice]:
+    """Pairs on one digit; tips of two meet because fingers do, and moving them does not help."""
+    names, digits = score.layout.names, [digit_of(marker) for marker in score.layout.markers]
+    for first, second in zip(*np.nonzero(np.triu(score.near) > _TOUCHING), strict=True):
+        share = float(score.near[first, second])
+        if digits[first] == digits[second]:
+            yield _Advice(
+                share,
+                f"Move {names[first]} and {names[second]} apart: they touch, or nearly, in "
+                f"{100 * share:.0f} % of the frames, and their blobs merge.",
+            )
+
+
+def digit_of(place: MarkerPlace) -> int:
+    """The digit that a marker is on."""
+    return BONES[BONE_NAMES.index(place.bone)].digit
+
+
+def _sides(score: LayoutScore) -> Iterator[_Advice]:
+    if score.sides_right < _SIDES:
+        yield _Advice(
+            1.0 - score.sides_right,
+            f"Make the back of the hand less symmetric: left and right are mistaken in "
+            f"{100 * (1.0 - score.sides_right):.0f} % of the frames.",
+        )
+
+
+def _dispensable(score: LayoutScore) -> Iterator[_Advice]:
+    grown: Float[np.ndarray, "M"] = (score.joints_without - score.joints).max(axis=1)
+    for marker in np.argsort(grown):
+        if grown[marker] < _DISPENSABLE:
+            yield _Advice(
+                0.0,
+                f"{score.layout.names[marker]} can be dropped as far as joints go: without it none is known "
+                f"worse by more than {np.rad2deg(grown[marker]):.1f} deg. It may still help to tell the "
+                "others apart.",
+            )

@@ -1,0 +1,503 @@
+"""The page on a take and the tables beside it: what a biomechanics lab looks at before it uses the angles.
+
+Angles are in degrees and residuals in
+millimeters. In the tables (.csv) units stand in the names of columns, and an empty cell is a number that does
+not exist.
+"""
+
+from __future__ import annotations
+
+import csv
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from gloves.captures.capture import runs_of
+from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
+from handsim.files.outputs import atomic_write, check_ending, written_together
+from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
+from track.config import Size
+from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
+from track.user import MEASURED
+from train.evaluation import percent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
+_RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
+"""What is told of a range of motion, as percentiles."""
+_CHUNK: Final = 4096  # frames whose bones are posed at once
+_MOST_SPANS: Final = 100  # rows; with more a take is not worth reading line by line
+_BINS: Final = 750  # of a long take; the curve has the least and the largest value of each
+_STROKES: Final = (
+    Paint.VIOLET,
+    Paint.BLUE,
+    Paint.WARM,
+    Paint.GREEN,
+)  # of a digit's joints, from the knuckle outwards
+_COASTING: Final = "#efd9c9"
+_SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
+_UNCALIBRATED: Final = (
+    "Joint angles of such hands are typically 5 to 7 degrees off in the mean, those of calibrated hands 1 to "
+    "2 (simulated captures, whose truth is known); the bands say how much for each joint. "
+)
+_CALIBRATE: Final = (
+    "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
+    "<code>handsim calibrate minute.c3d --out user.json</code>, then <code>handsim track ... --shape "
+    "user.json</code>."
+)
+
+
+def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
+    """Write the page on a take and its tables beside it, all or none, as `handsim report` does.
+
+    The page names the take's file, its source. The page and its tables are returned: frames, joints, markers
+    and doubtful frames.
+    """
+    out = Path(out)
+    check_ending(out, ".html")
+    hands, spans = hand_figures(take), find_suspect_spans(take, most=None)
+    sections = [_summary_section(take), _calibration_section(take)]
+    sections += [section for hand in hands for section in _hand_sections(take, hand)]
+    sections.append(_spans_section(take, spans, source))
+    tables = [
+        _frame_rows(take, hands),
+        _joint_rows(hands),
+        _marker_rows(take, hands),
+        _span_rows(take, spans),
+    ]
+    paths = table_paths(out)
+    with written_together():
+        write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
+        for path, rows in zip(paths, tables, strict=True):
+            with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
+    return out, *paths
+
+
+def table_paths(page: Path) -> tuple[Path, ...]:
+    """The tables beside a page: frames, ranges of motion, markers, frames to look at."""
+    return tuple(page.with_suffix(ending) for ending in _TABLES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandFigures:
+    """What a take tells of one hand over its T frames, with its M markers."""
+
+    side: Side
+    marker_names: tuple[str, ...]
+    status: Int[np.ndarray, "T"]
+    """Indices into `STATUSES`."""
+    angles: Float[np.ndarray, "T 20"]
+    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
+    angle_spread: Float[np.ndarray, "T 20"] | None
+    """Standard deviation of each angle [deg]; None where the take does not know them."""
+    residuals: Float[np.ndarray, "T M"]
+    """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
+    confidence: Float[np.ndarray, "T M"]
+    """Probability of each marker's label; NaN where the marker has no point."""
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "T M"]:
+        """Which markers have a point."""
+        seen: NDArray[np.bool_] = np.isfinite(self.confidence)
+        return seen
+
+    @property
+    def fitted(self) -> Bool[np.ndarray, "T"]:
+        """Frames whose pose was fitted to points, which a coasting hand's is not."""
+        return self.status >= INITIALIZED
+
+    @property
+    def rms(self) -> Float[np.ndarray, "T"]:
+        """3D RMS of the residuals of each frame [m], of a truth too; NaN where there is none."""
+        known = np.isfinite(self.residuals)
+        total = np.sum(np.square(self.residuals), axis=1, where=known)
+        square: NDArray[np.float64] = np.full(len(total), np.nan)
+        np.divide(total, known.sum(axis=1), out=square, where=known.any(axis=1))
+        return np.sqrt(square)
+
+    def joints(self) -> Float[np.ndarray, "20 6"]:
+        """`_RANGE` of each angle over the fitted frames, and its median spread [deg]; NaN if unknown."""
+        found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
+        if self.fitted.any():
+            found[:, :-1] = np.percentile(self.angles[self.fitted], list(_RANGE.values()), axis=0).T
+            if self.angle_spread is not None:
+                found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
+        return found
+
+    def markers(self) -> Iterator[MarkerFigures]:
+        """What was seen of each marker, in the order of the glove."""
+        seen = self.seen
+        for marker, name in enumerate(self.marker_names):
+            frames = np.flatnonzero(seen[:, marker])
+            gaps = np.diff(frames) - 1  # frames between one in which it is seen and the next
+            residuals = self.residuals[:, marker]
+            known = residuals[np.isfinite(residuals)]
+            median, high = np.percentile(known, (50.0, 95.0)) if len(known) else (np.nan, np.nan)
+            yield MarkerFigures(
+                name,
+                seen=float(seen[:, marker].mean()),
+                num_gaps=int((gaps > 0).sum()),
+                longest_gap=int(gaps.max(initial=0)),
+                median_residual=float(median),
+                high_residual=float(high),
+                median_confidence=float(np.median(self.confidence[frames, marker]))
+                if len(frames)
+                else np.nan,
+            )
+
+
+class MarkerFigures(NamedTuple):
+    """What was seen of a marker; NaN where it was never seen, and without a pose."""
+
+    name: str
+    seen: float
+    """Share of all frames in which it has a point."""
+    num_gaps: int
+    """How often it was lost and seen again."""
+    longest_gap: int
+    """Frames."""
+    median_residual: float
+    """Distance from the pose's marker [m]."""
+    high_residual: float
+    """The 95th percentile [m]."""
+    median_confidence: float
+    """Median confidence in its labels."""
+
+
+def hand_figures(take: Take) -> tuple[HandFigures, ...]:
+    """The figures of each hand of a take, simulated or tracked, in their order."""
+    found = []
+    for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
+        there = take.status[:, number] != LOST
+        angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
+        confidence = np.full((take.num_frames, len(labels)), np.nan)
+        points = take.point_list
+        own = (points.labels >= labels.start) & (points.labels < labels.stop)
+        confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
+        residuals = np.full((take.num_frames, len(labels)), np.nan)
+        observed, shown = take.observed(hand.side), np.flatnonzero(there)
+        for first in range(0, len(shown), _CHUNK):
+            part = shown[first : first + _CHUNK]
+            expected, _ = hand.markers(take.qpos[part, number])
+            residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
+        spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
+        status, names = take.status[:, number], hand.layout.names
+        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence))
+    return tuple(found)
+
+
+def _lead(take: Take) -> str:
+    """What the take is, and how long."""
+    settings = take.settings
+    glove = settings.get("glove", take.hands[0].layout.name)
+    parts = [f"capture {settings['capture']}"] if "capture" in settings else []
+    parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", _user(take)]
+    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
+    first = ", ".join(part for part in parts if part)
+    return f"{first[0].upper()}{first[1:]}; {end}"
+
+
+def _user(take: Take) -> str:
+    """Whose hands they are, in words."""
+    notes = str(take.settings.get("user", ""))
+    _, is_measured, size = notes.partition(MEASURED)
+    if is_measured:
+        return f"size measured in the capture, {size}"
+    return f"size {notes}" if notes in get_args(Size) else notes
+
+
+def _summary_section(take: Take) -> Section:
+    told = suspicions(take) if take.made_by_tracker else []
+    items = html_list([line[0].upper() + line[1:] for line in summarize(take)], "ul")
+    kind = (
+        "Found: the frame in which a hand is initialized. Tracked: its pose follows from the frame before. "
+        "Coasting: for up to a tenth of a second its pose is predicted. Lost: it has no pose."
+        if take.made_by_tracker
+        else "The take is not of a tracker: its poses and labels are what was simulated or given."
+    )
+    return Section("The take", f"{kind}{items}", notes=told)
+
+
+def _calibration_section(take: Take) -> Section:
+    """Whether the hands are calibrated, and what that means for the angles; HTML."""
+    notes = str(take.settings.get("user", ""))
+    if not take.made_by_tracker:
+        text = "The hands are those that the take was made with: there is nothing to calibrate."
+    elif notes.startswith(MEASURED):
+        text = "The hands are not calibrated: their size and proportions were measured in the capture. "
+        text += _UNCALIBRATED + _CALIBRATE
+    elif notes in get_args(Size):
+        text = (
+            f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
+        )
+        text += _UNCALIBRATED + _CALIBRATE
+    elif notes:
+        text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
+    else:
+        text = "The hands were given, and the take does not say whether they are calibrated. "
+        text += "If they are not: " + _UNCALIBRATED[0].lower() + _UNCALIBRATED[1:]
+    return Section("Calibration", text)
+
+
+def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
+    side = hand.side.capitalize()
+    if not hand.fitted.any():
+        return [Section(f"{side} hand", "It has no pose in any frame.")]
+    return [
+        _angles_section(f"{side} hand: joint angles", take, hand),
+        _range_section(f"{side} hand: range of motion", hand),
+        _markers_section(f"{side} hand: markers", take, hand),
+        _residuals_section(f"{side} hand: residuals", take, hand),
+    ]
+
+
+def _angles_section(title: str, take: Take, hand: HandFigures) -> Section:
+    text = (
+        "Zero is the flat hand. Flexion counts positive towards the palm, extension negative. Abduction "
+        "counts positive towards the thumb; for the thumb itself away from the palm."
+    )
+    if hand.angle_spread is not None:
+        text += " The band is one standard deviation to either side."
+    return Section(title, text, pictures=[(picture((9.6, 9.6), _draw_angles, take.times, hand), _SHADES)])
+
+
+def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    """One panel for each digit with its four angles and their bands; lost and coasting frames are shaded."""
+    panels = figure.subplots(len(DIGITS), 1, sharex=True)
+    starts, _ = _bins(len(times))
+    shape = len(times), len(DIGITS), -1
+    angles = hand.angles.reshape(shape)
+    spread = None if hand.angle_spread is None else hand.angle_spread.reshape(shape)
+    names = np.reshape([joint.split("_", 1)[1].replace("_", " ") for joint in JOINT_NAMES], angles.shape[1:])
+    for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
+        _prepare(panel, times, hand.status)
+        panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
+        for joint, (name, stroke) in enumerate(zip(names[number], _STROKES, strict=True)):
+            values = angles[:, number, joint]
+            panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
+            if spread is not None:
+                low, high = values - spread[:, number, joint], values + spread[:, number, joint]
+                low, high = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+                panel.fill_between(times[starts], low, high, color=stroke, alpha=0.15, linewidth=0.0)
+        panel.set_ylabel(f"{digit} [deg]")
+        panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
+    panels[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+
+
+def _range_section(title: str, hand: HandFigures) -> Section:
+    table = [["joint [deg]", *_RANGE, "range of the model", "usual spread"]]
+    for joint, (*row, spread) in zip(JOINTS, hand.joints(), strict=True):
+        cells = [f"{value:.1f}" for value in row]
+        usual = NOTHING if np.isnan(spread) else f"{spread:.1f}"
+        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}", usual])
+    text = (
+        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points; 5th and 95th are "
+        "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
+        "angle, from what is not known of the hand, hidden markers and noise."
+    )
+    return Section(title, text, table=table)
+
+
+def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
+    header = ["marker", "seen [%]", "gaps", "longest [s]", "residual: median [mm]", "95th [mm]"]
+    table = [[*header, "confidence: median [%]"]]
+    for marker in hand.markers():
+        table.append(
+            [
+                marker.name,
+                percent(marker.seen),
+                f"{marker.num_gaps:,}",
+                f"{marker.longest_gap / take.rate:.3f}" if marker.num_gaps else NOTHING,
+                _millimeters(marker.median_residual),
+                _millimeters(marker.high_residual),
+                percent(marker.median_confidence),
+            ]
+        )
+    drawn = picture((9.6, 1.0 + 0.17 * len(hand.marker_names)), _draw_presence, take.times, hand)
+    text = (
+        "Seen: the share of all frames in which a point has the marker's label. A gap is between two frames "
+        "that have it. Residual: how far the point is from the marker of the pose."
+    )
+    caption = "Blue where the marker was seen; pale where it was seen in some of the frames of a column."
+    return Section(title, text, pictures=[(drawn, caption)], table=table)
+
+
+def _millimeters(meters: float) -> str:
+    return NOTHING if np.isnan(meters) else f"{1e3 * meters:.2f}"
+
+
+def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    """A strip for each marker: blue where it was seen, blank where not; of long takes the share seen."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    panel = figure.subplots()
+    starts, ends = _bins(len(times))
+    share = np.add.reduceat(hand.seen, starts, axis=0, dtype=np.float64) / (ends - starts)[:, None]
+    colors = LinearSegmentedColormap.from_list("seen", (Paint.CARD, Paint.BLUE))
+    edges = np.append(times[starts], _end(times))
+    rows = np.arange(share.shape[1] + 1)
+    panel.pcolormesh(edges, rows, share.T, cmap=colors, vmin=0.0, vmax=1.0, rasterized=True)
+    panel.hlines(rows[1:-1], edges[0], edges[-1], color=Paint.CARD, linewidth=1.5)
+    panel.set_yticks(rows[:-1] + 0.5, hand.marker_names, fontsize=7.5)
+    panel.tick_params(axis="y", length=0.0)
+    panel.invert_yaxis()
+    panel.set_xlim(edges[0], edges[-1])
+    panel.set_xlabel("time [s]")
+
+
+def _residuals_section(title: str, take: Take, hand: HandFigures) -> Section:
+    rms = hand.rms[np.isfinite(hand.rms)]
+    if not len(rms):
+        return Section(title, "None of its markers has a point.")
+    text = (
+        "RMS distance of the labeled points of each frame from the pose's markers: median "
+        f"{1e3 * np.median(rms):.2f} mm, 95th percentile {1e3 * np.percentile(rms, 95.0):.2f} mm."
+    )
+    return Section(title, text, pictures=[(picture((9.6, 2.2), _draw_residuals, take.times, hand), _SHADES)])
+
+
+def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    panel = figure.subplots()
+    _prepare(panel, times, hand.status)
+    panel.plot(*decimated(times, 1e3 * hand.rms), color=Paint.BLUE, linewidth=1.1)
+    panel.set_ylim(bottom=0.0)
+    panel.set_ylabel("RMS [mm]")
+    panel.set_xlabel("time [s]")
+
+
+def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
+    """Grid and limits of a panel, with the frames shaded in which the hand is lost or coasts."""
+    panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
+    panel.set_xlim(times[0], _end(times))
+    for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
+        spans: Sequence[tuple[float, float]] = shaded(times, status == state)
+        across = panel.get_xaxis_transform()
+        panel.broken_barh(spans, (0.0, 1.0), transform=across, facecolors=color, linewidth=0.0)
+    panel.tick_params(labelcolor=Paint.SOFT)
+
+
+def decimated(
+    times: Float[np.ndarray, "T"], values: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+    """A curve of at most twice 750 values: the least and the largest of each bin of frames, or NaN."""
+    starts, ends = _bins(len(times))
+    if len(starts) == len(times):
+        return times, values
+    middles = (starts + ends) // 2
+    pairs = np.stack([np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)], axis=1)
+    return np.stack([times[starts], times[middles]], axis=1).ravel(), pairs.ravel()
+
+
+def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[tuple[float, float]]:
+    """Begin and length of the spans of frames that are flagged [s], as wide as a bin at least."""
+    starts, ends = _bins(len(times))
+    edges = np.append(times, _end(times))
+    runs = runs_of(np.logical_or.reduceat(flags, starts))
+    return [(float(edges[starts[a]]), float(edges[ends[b]] - edges[starts[a]])) for a, b in runs]
+
+
+def _bins(num_frames: int) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
+    """The first frame of each bin, and the one after its last; a bin for each frame of a short take."""
+    width = 1 if num_frames <= 2 * _BINS else -(-num_frames // _BINS)
+    starts = np.arange(0, num_frames, width)
+    return starts, np.append(starts[1:], num_frames)
+
+
+def _end(times: Float[np.ndarray, "T"]) -> float:
+    """When the last frame ends [s]: it lasts as long as the one before."""
+    return float(2.0 * times[-1] - times[-2]) if len(times) > 1 else float(times[-1]) + 1.0
+
+
+def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Section:
+    command = f"handsim view {shlex.quote(source)}"
+    if not spans:
+        return Section("Doubtful frames", "No label is probably wrong or missing.")
+    table = [["frames", "start [s]", "end [s]", "of", "why", "to look at", "in"]]
+    for span in spans[:_MOST_SPANS]:
+        frames = f"{span.first}" if span.first == span.last else f"{span.first} to {span.last}"
+        start, end, worst = (f"{take.times[one]:.3f}" for one in (span.first, span.last, span.worst))
+        look = f"frame {span.worst}, {worst} s"
+        table.append([frames, start, end, span.of, span.why, look, f"{command} --time {worst}"])
+    text = (
+        "Spans in which a label is probably wrong or a marker lacks its own, those with the most such frames "
+        "first; the percentage is the least confidence in a point. "
+        f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
+        "and a wrong label can be corrected."
+    )
+    more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
+    return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
+
+
+_Rows = list[list[object]]
+
+
+def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """One row per frame and hand, below the header."""
+    header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
+    header += [f"{joint}_deg" for joint in JOINT_NAMES]
+    rows: _Rows = [[*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)]]
+    numbers = []
+    for hand in hands:
+        spread = np.full_like(hand.angles, np.nan) if hand.angle_spread is None else hand.angle_spread
+        numbers.append(np.column_stack([1e3 * hand.rms, hand.angles, spread]).tolist())
+    counts = [hand.seen.sum(axis=1).tolist() for hand in hands]
+    for frame, time in enumerate(take.times.tolist()):
+        for hand, count, row in zip(hands, counts, numbers, strict=True):
+            first = [frame, _time(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
+            rows.append([*first, *map(_number, row[frame])])
+    return rows
+
+
+def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
+    """The range of motion of each joint, beside the model's."""
+    columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
+    rows: _Rows = [["hand", "joint", *columns]]
+    for hand in hands:
+        for joint, (*row, spread) in zip(JOINTS, hand.joints().tolist(), strict=True):
+            rows.append([hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread))])
+    return rows
+
+
+def _marker_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """What was seen of each marker."""
+    header = ["hand", "marker", "seen_share", "gaps", "longest_gap_frames", "longest_gap_s"]
+    rows: _Rows = [[*header, "residual_median_mm", "residual_95th_mm", "confidence_median"]]
+    for hand in hands:
+        for marker in hand.markers():
+            gaps = [marker.num_gaps, marker.longest_gap, _number(marker.longest_gap / take.rate)]
+            residuals = (1e3 * marker.median_residual, 1e3 * marker.high_residual)
+            last = map(_number, (*residuals, marker.median_confidence))
+            rows.append([hand.side, marker.name, _number(marker.seen), *gaps, *last])
+    return rows
+
+
+def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
+    """Frames to look at, the worst first; `frame` is the one to go to."""
+    rows: _Rows = [["first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"]]
+    for span in spans:
+        times = [_time(float(take.times[one])) for one in (span.first, span.last)]
+        rows.append([span.first, span.last, *times, span.worst, span.of, span.why])
+    return rows
+
+
+def _number(value: float) -> str:
+    """Six digits; nothing for NaN."""
+    return "" if np.isnan(value) else f"{value:.6g}"
+
+
+def _time(seconds: float) -> str:
+    """Nine digits, which hold a tenth of a millisecond of a day."""
+    return f"{seconds:.9g}"

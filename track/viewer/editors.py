@@ -1,0 +1,495 @@
+"""Labels of a take and markers of a layout, corrected by a person in the page and saved."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.fit import GloveFit, attach, place_marker
+from gloves.layout import MarkerLayout, moved_text
+from gloves.takes.corrections import (
+    NO_MARKER,
+    Correction,
+    applied_corrections,
+    corrections_of,
+    corrections_path,
+    follow_point,
+    save_corrections,
+)
+from gloves.takes.take import Take
+from handsim.errors import CaptureError, LayoutError
+from handsim.files.inputs import read_bytes
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_QPOS
+from track.corrected_take import correct_take
+from track.viewer.recordings import TakeRecording
+from track.viewer.stage import HandSkin, PointBalls, set_stage
+
+if TYPE_CHECKING:
+    from viser import SceneNodePointerEvent, ViserServer
+
+_NOTHING: Final = "choose"
+_HALO: Final = 2.5  # radius around the chosen point, in radii of a marker
+_HALO_COLOR: Final = (255, 190, 0)
+_LISTED: Final = 12  # corrections
+_HEIGHT: Final = 0.06  # of the wrist above the ground [m]
+_GIZMO: Final = 0.03  # [m]
+
+
+class Corrector:
+    """A take that is open for corrections.
+
+    Args:
+        path: The take's file; the corrections beside it are read.
+
+    Raises:
+        CaptureError: The corrections cannot be read, or cannot be meant for this take.
+    """
+
+    def __init__(self, path: Path, take: Take) -> None:
+        self.path, self._base, self._lock = path, take, threading.Lock()
+        self.saved: tuple[Correction, ...] = corrections_of(path)
+        """What the file of corrections holds."""
+        self.added: tuple[Correction, ...] = ()
+        """What was added and is not saved."""
+        self.take = take
+        """The take with all corrections."""
+        self.unfitting: tuple[Correction, ...] = ()
+        """Saved corrections that fit no point."""
+        self._state = _state_of(path)
+        records = applied_corrections(take)
+        self._stale = any(correction.record() not in records for correction in self.saved)
+        if self._stale:
+            try:
+                self._make(())
+            except CaptureError as error:
+                raise CaptureError(f"{corrections_path(path)}: {error}") from error
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether the take with all corrections differs from its file."""
+        return bool(self.added) or self._stale
+
+    def span_of(self, frame: int, column: int) -> tuple[int, int]:
+        """The frames around one in which its point has the same ID and label without a gap."""
+        take, points = self.take, self.take.point_list
+        point = points.at(frame, column)
+        if points.ids[point] < 0:
+            return frame, frame
+        same = (points.ids == points.ids[point]) & (points.labels == points.labels[point])
+        ends = np.setdiff1d(np.arange(take.num_frames), points.frames[same])
+        position = np.searchsorted(ends, frame)
+        first = int(ends[position - 1]) + 1 if position else 0
+        last = int(ends[position]) - 1 if position < len(ends) else take.num_frames - 1
+        return first, last
+
+    def add(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
+        """Give a point its right label.
+
+        Args:
+            frame: A frame in which the point is there.
+            span: The first and the last frame in which the label is right.
+            label: Name of its marker, or `NO_MARKER`.
+
+        Returns:
+            The correction, for those frames of the span in which the point is there.
+
+        Raises:
+            CaptureError: The point is not in the span, or another one of a frame is corrected to that marker.
+        """
+        with self._lock:
+            correction = self._meant(frame, column, span, label)
+            self._make((*self.added, correction))
+        return correction
+
+    def undo(self) -> None:
+        """Take back what was added last."""
+        with self._lock:
+            if self.added:
+                self._make(self.added[:-1])
+
+    def save(self) -> str:
+        """Write the corrections and the take, and say so.
+
+        Raises:
+            CaptureError: A file cannot be written, or was changed since it was read.
+        """
+        with self._lock:
+            if _state_of(self.path) != self._state or corrections_of(self.path) != self.saved:
+                raise CaptureError(
+                    f"{self.path} or its corrections have changed since they were opened, expected the same "
+                    "files; open it again"
+                )
+            beside, every = corrections_path(self.path), (*self.saved, *self.added)
+            save_corrections(beside, every)
+            self.saved, self.added, self._stale = corrections_of(self.path), (), True
+            try:
+                self.take.save(self.path)
+            except OSError as error:
+                words = error.strerror or error
+                raise CaptureError(f"{self.path}: cannot be written: {words}") from error
+            self._base, self._state, self._stale = self.take, _state_of(self.path), False
+        return f"saved {self.path} and {beside}"
+
+    def _meant(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
+        """A correction of the frames of a span in which a point is there."""
+        points = self.take.point_list
+        first, last = min(span), max(span)
+        point = points.at(frame, column)
+        start = frame
+        if points.ids[point] >= 0:
+            same = np.flatnonzero(points.ids == points.ids[point])
+            same = same[(points.frames[same] >= first) & (points.frames[same] <= last)]
+            if not len(same):
+                raise CaptureError(
+                    f"the point is not there in frames {first} to {last}, expected a frame with it"
+                )
+            point = int(same[0])
+            start, last = int(points.frames[point]), int(points.frames[same[-1]])
+        place: list[float] = points.points[point].tolist()
+        correction = Correction(start, max(start, last), (place[0], place[1], place[2]), label)
+        followed = points.frames[follow_point(points, correction)]
+        return Correction(start, int(followed[-1]), correction.place, label)
+
+    def _make(self, added: Sequence[Correction]) -> None:
+        """Make the take with these corrections, unless they cannot be meant."""
+        every = (*self.saved, *added)
+        corrected = correct_take(self._base, every)
+        self.added, self.unfitting = tuple(added), corrected.unfitting
+        self.take = corrected.take if every else self._base
+
+
+def label_of(take: Take, frame: int, column: int) -> str:
+    """Name of a point's marker, or `NO_MARKER`."""
+    label = int(take.point_list.labels[take.point_list.at(frame, column)])
+    return take.label_names[label] if label >= 0 else NO_MARKER
+
+
+def _state_of(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is written anew; None where it is gone."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+class LabelEditor:
+    """The folder of the panel in which labels are corrected, and a halo around the chosen point.
+
+    Args:
+        changed: Called when the take has changed.
+    """
+
+    def __init__(
+        self,
+        server: ViserServer,
+        recording: TakeRecording,
+        corrector: Corrector,
+        changed: Callable[[], None],
+    ) -> None:
+        self._recording, self._corrector, self._changed = recording, corrector, changed
+        self._frame, self._rows = 0, dict[str, int]()
+        self.chosen: tuple[int, int] | None = None
+        """Frame and column of the chosen point."""
+        self.halo = server.scene.add_icosphere(
+            "/chosen", _HALO * recording.radius, _HALO_COLOR, opacity=0.5, cast_shadow=False, visible=False
+        )
+        """Around the chosen point."""
+        self._add_controls(server)
+        self._list()
+
+    def show(self, index: int, *, hurried: bool) -> None:
+        """Follow the page to a frame; where `hurried`, without the list of its points."""
+        self._frame = index
+        self._show_halo()
+        if not hurried:
+            self._show_points()
+
+    def pick(self, index: int) -> None:
+        """Choose a point of the shown frame, counted as in `ShownFrame.points`."""
+        columns = self._columns()
+        if index < len(columns):
+            self.choose(self._frame, int(columns[index]))
+        else:
+            self.state.content = "That marker was not seen: it has no point whose label could be wrong."
+
+    def choose(self, frame: int, column: int) -> None:
+        """Choose a point by its column in a frame; the span becomes that of its label."""
+        points = self._corrector.take.point_list
+        self.chosen = (frame, column)
+        _set(self.span, self._corrector.span_of(frame, column))
+        _set(self.label, label_of(self._corrector.take, frame, column))
+        self._show_halo()
+        self._show_points()
+        first, last = self.span.value
+        sure = points.confidence[points.at(frame, column)]
+        self.state.content = (
+            f"**{self._name(frame, column)}**, {100 * float(sure):.0f} %, "
+            f"with this label in frames {first} to {last}"
+        )
+
+    def correct(self) -> None:
+        """Give the chosen point the chosen label over the chosen span, or say why not."""
+        if self.chosen is None:
+            self.state.content = "Choose a point first: click on it, or take it from the list."
+            return
+        first, last = (int(value) for value in self.span.value)
+        try:
+            correction = self._corrector.add(*self.chosen, (first, last), self.label.value)
+        except CaptureError as error:
+            self.state.content = str(error)
+            return
+        self._renew()
+        self.state.content = f"corrected: {correction}"
+
+    def save(self) -> None:
+        """Save the corrections and the take, or say why not."""
+        try:
+            self.state.content = self._corrector.save()
+        except CaptureError as error:
+            self.state.content = str(error)
+        self._list()
+
+    def _add_controls(self, server: ViserServer) -> None:
+        gui, last = server.gui, self._recording.num_frames - 1
+        with gui.add_folder("Correct labels"):
+            self.state = gui.add_markdown("Click on a point whose label is wrong, or take it from the list.")
+            """What is chosen, or what was done."""
+            self.points = gui.add_dropdown("point", (_NOTHING,), hint="ID and label of each point")
+            """The points of the shown frame."""
+            self.span = gui.add_multi_slider(
+                "frames", 0, max(last, 1), 1, (0, last), disabled=last == 0, hint="First and last frame"
+            )
+            """The first and the last frame."""
+            ends = gui.add_button_group("shown frame is", ("first", "last"))
+            self.label = gui.add_dropdown("right label", (NO_MARKER, *self._recording.label_names))
+            """The label that the point shall have."""
+            gui.add_button("Correct").on_click(lambda _: self.correct())
+            gui.add_button("Undo", color="gray", hint="What was not saved").on_click(lambda _: self._undo())
+            saves = gui.add_button("Save take", color="gray", hint=f"Writes {self._corrector.path}")
+            saves.on_click(lambda _: self.save())
+            self.list = gui.add_markdown("")
+            """The corrections."""
+        self.points.on_update(self._pick_row)
+        ends.on_click(lambda event: self._set_end(event.target.value))
+
+    def _undo(self) -> None:
+        self._corrector.undo()
+        self._renew()
+        self.state.content = "taken back"
+
+    def _renew(self) -> None:
+        """Show what the corrector has made."""
+        self._recording.replace(self._corrector.take)
+        self._list()
+        self._changed()
+
+    def _pick_row(self, event: Any) -> None:
+        if event.client is not None and self.points.value in self._rows:
+            self.choose(self._frame, self._rows[self.points.value])
+
+    def _set_end(self, end: str) -> None:
+        first, last = self.span.value
+        frame = self._frame
+        _set(self.span, (frame, max(frame, last)) if end == "first" else (min(first, frame), frame))
+
+    def _columns(self) -> np.ndarray:
+        """Columns of the points of the shown frame."""
+        points = self._corrector.take.point_list
+        return points.columns[points.of(self._frame)]
+
+    def _name(self, frame: int, column: int) -> str:
+        take = self._corrector.take
+        number = int(take.point_list.ids[take.point_list.at(frame, column)])
+        return f"{'ID ' if number >= 0 else 'column '}{number if number >= 0 else column}: " + label_of(
+            take, frame, column
+        )
+
+    def _show_points(self) -> None:
+        """The points of the shown frame as rows of a list, the chosen one selected."""
+        self._rows = {self._name(self._frame, int(column)): int(column) for column in self._columns()}
+        rows = (_NOTHING, *self._rows)
+        if rows != self.points.options:
+            self.points.options = rows
+        column = self._chosen_column()
+        value = _NOTHING if column is None else self._name(self._frame, column)
+        if self.points.value != value:
+            _set(self.points, value)
+
+    def _chosen_column(self) -> int | None:
+        """The column of the chosen point in the shown frame."""
+        if self.chosen is None:
+            return None
+        points, (frame, column) = self._corrector.take.point_list, self.chosen
+        number = points.ids[points.at(frame, column)]
+        if number < 0:
+            return column if frame == self._frame else None
+        shown = points.of(self._frame)
+        there = points.columns[shown][points.ids[shown] == number]
+        return int(there[0]) if len(there) else None
+
+    def _show_halo(self) -> None:
+        column = self._chosen_column()
+        if column is not None:
+            points = self._corrector.take.point_list
+            self.halo.position = points.points[points.at(self._frame, column)]
+        if self.halo.visible != (column is not None):
+            self.halo.visible = column is not None
+
+    def _list(self) -> None:
+        corrector = self._corrector
+        lines = [f"{correction}: no longer fits" for correction in corrector.unfitting]
+        lines += [f"{correction}, not saved" for correction in reversed(corrector.added)]
+        lines += [str(correction) for correction in reversed(corrector.saved)]
+        more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
+        self.list.content = "\n\n".join((*lines[:_LISTED], *more))
+
+
+def _set(handle: Any, value: object) -> None:
+    """Give an element of the panel a value, as the program and not a person."""
+    handle.value = value
+
+
+class LayoutEditor:
+    """The markers of a layout on one hand.
+
+    Args:
+        layout: What it says.
+        out: Where the changed layout is saved.
+    """
+
+    def __init__(
+        self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
+    ) -> None:
+        self._server, self._path, self._out, self._lock = server, path, out, threading.Lock()
+        self.shift = np.array([0.0, 0.0, _HEIGHT])
+        """Where the wrist is in the page [m]."""
+        self.fit: GloveFit = attach(layout, model)
+        """The hand in its glove as it is now."""
+        self.changed = False
+        """Whether a marker was moved since the layout was read or saved."""
+        self._chosen: int | None = None
+        qpos = np.zeros(NUM_QPOS)
+        qpos[2], qpos[3] = _HEIGHT, 1.0
+        self.skin = HandSkin(server, "/hand")
+        self.skin.show(model, qpos)
+        count = layout.num_markers
+        self.balls = PointBalls(server, "/markers", layout.names, most=count, radius=layout.radius)
+        self.gizmo = server.scene.add_transform_controls(
+            "/move", scale=_GIZMO, disable_rotations=True, depth_test=False, visible=False, line_width=3.0
+        )
+        """The handle of the chosen marker."""
+        self._add_controls(layout)
+        self.balls.balls.on_click(self._click)
+        self.gizmo.on_update(self._drag)
+        self._show()
+        set_stage(server, self.skin_points(), ground=0.0)
+
+    def skin_points(self) -> np.ndarray:
+        """The vertices of the skin in the page [m]."""
+        points: np.ndarray = self.fit.model.surface.vertices + self.shift
+        return points
+
+    def choose(self, index: int) -> None:
+        """Choose the marker that the gizmo moves."""
+        with self._lock:
+            self._chosen = index
+            self.gizmo.position = self.fit.attachment.points[index] + self.shift
+            self.gizmo.visible = True
+            self.names.value = self.fit.layout.names[index]  # type: ignore[misc]  # viser sets it itself
+            self._tell()
+
+    def move(self, index: int, point: np.ndarray) -> None:
+        """Move a marker to the skin near a point of the page [m]; where there is none it stays."""
+        with self._lock:
+            try:
+                layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift)
+            except LayoutError as error:
+                self.state.content = str(error)
+                return
+            self.fit = attach(layout, self.fit.model)
+            self.changed = True
+            self._show()
+            self._tell()
+
+    def save(self) -> str:
+        """Write the layout, and say so.
+
+        Raises:
+            LayoutError: A file cannot be read or written.
+        """
+        with self._lock:
+            given = read_bytes(self._path, error=LayoutError).decode("utf-8", "replace")
+            text, kept = moved_text(given, self.fit.layout)
+            try:
+                with atomic_write(self._out) as temporary:
+                    temporary.write_text(text, "utf-8")
+            except OSError as error:
+                raise LayoutError(f"{self._out}: cannot be written: {error.strerror or error}") from error
+        self.changed = False
+        return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
+
+    def _add_controls(self, layout: MarkerLayout) -> None:
+        gui = self._server.gui
+        self.state = gui.add_markdown(f"**{layout.name}**: click a marker, then drag its arrows.")
+        """What is chosen, or what was done."""
+        self.names = gui.add_dropdown("marker", layout.names)
+        self.names.on_update(self._pick)
+        every = gui.add_checkbox("names", False)
+        labels = frozenset(range(layout.num_markers))
+        every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
+        button = gui.add_button("Save layout", hint=f"Writes {self._out}")
+        button.on_click(lambda _: self._save())
+
+    def _save(self) -> None:
+        try:
+            self.state.content = self.save()
+        except LayoutError as error:
+            self.state.content = str(error)
+
+    def _pick(self, event: Any) -> None:
+        if event.client is not None:
+            self.choose(self.fit.layout.names.index(self.names.value))
+
+    def _click(self, event: SceneNodePointerEvent[Any]) -> None:
+        index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))
+        if index is not None:
+            self.choose(index)
+
+    def _drag(self, event: Any) -> None:
+        chosen = self._chosen
+        if chosen is None or (event.phase != "end" and self._lock.locked()):
+            return  # a step of the drag that comes too early; the last one counts
+        self.move(chosen, np.array(self.gizmo.position))
+        if event.phase == "end":
+            self.choose(chosen)  # the gizmo goes where the marker is
+
+    def _show(self) -> None:
+        count = self.fit.layout.num_markers
+        points = self.fit.attachment.points + self.shift
+        self.balls.show(points, np.arange(count), np.ones(count, dtype=np.bool_))
+
+    def _tell(self) -> None:
+        if self._chosen is None:
+            return
+        marker = self.fit.layout.markers[self._chosen]
+        across = f", across {marker.across:.3f}" if marker.across else ""
+        self.state.content = (
+            f"**{marker.name}** on {marker.bone}: along {marker.along:.3f}, "
+            f"around {math.degrees(marker.around):.1f}°{across}"
+        )
+
+
+def edited_path(path: Path) -> Path:
+    """A name beside a file that no file has yet: `glove-edited.toml`, `glove-edited-2.toml`, ..."""
+    endings = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
+    candidates = (path.with_name(f"{path.stem}-edited{ending}{path.suffix}") for ending in endings)
+    return next(candidate for candidate in candidates if not candidate.exists())

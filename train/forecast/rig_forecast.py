@@ -1,0 +1,417 @@
+"""What a rig sees of hands at work: simulated people, or those of a take, and what becomes of their markers.
+
+Captures are forecast in the rooms of simulated takes; the error of points is a covariance, from the noise of
+blobs in the pictures. Gloves are scored on single frames, which `observe_poses` and `observe_motion` give.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from gloves.captures.capture import run_lengths, runs_of
+from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.layout import MarkerLayout
+from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
+from gloves.takes.take import Take
+from handsim.errors import CaptureError, PoseError
+from handsim.hand.model import BodyMotion
+from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
+from handsim.space.transforms import pose_matrices
+from train.simulation.room import (
+    LightSources,
+    RoomConfig,
+    SceneSight,
+    label_false_points,
+    sample_light_sources,
+    usual_room,
+)
+from train.simulation.scenes import (
+    KINDS,
+    SIMULATED_KINDS,
+    Kind,
+    MovingObject,
+    SceneMotion,
+    SimulatedKind,
+    sample_real_like_scene,
+)
+from train.simulation.takes import sample_scene
+from train.simulation.training_frames import (
+    FrameScene,
+    GenerateSettings,
+    HandFrames,
+    observe_scene,
+    sample_frame_scene,
+    sample_hands,
+    wear_gloves,
+)
+
+HALF_SIDE: Final = 0.3
+"""Half side of the cube that hands work in unless somebody says otherwise [m]."""
+OPTICS: Final = OpticsConfig()
+"""Noise of blobs and size of visible spots, the same in every room."""
+_REAL_LIKE: Final = "real-like"
+_MAX_PEOPLE: Final = 10
+_FEWEST_FRAMES: Final = 12  # of a stretch of a take without a break
+_ROUND: Final = (11.0, 14.0, 9.0)  # through the volume and back along each axis [s]
+_POSES_EACH: Final = 60  # poses of each person in single frames
+_ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
+
+
+def sample_work(
+    layout: MarkerLayout,
+    center: Float[np.ndarray, "3"],
+    sides: Float[np.ndarray, "3"],
+    num_frames: int,
+    people: int,
+    *,
+    rng: np.random.Generator,
+) -> dict[str, list[SceneMotion]]:
+    """What the gloved hands of several people do, by kind of work: real-like, and as in the paper's captures.
+
+    They work around the center of a volume; through one that is longer than hands reach, people walk [m].
+    """
+    work: dict[str, list[SceneMotion]] = {}
+    for kind in (_REAL_LIKE, *KINDS):
+        work[kind] = []
+        for _ in range(people):
+            scene = _work_scene(kind, layout, num_frames, rng)
+            walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
+            work[kind].append(moved(scene, walk + center - ROOM_CENTER))
+    return work
+
+
+def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
+    """The motion of the first person who can do it."""
+    if kind != _REAL_LIKE:
+        return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
+    reason: PoseError | None = None
+    for _ in range(_MAX_PEOPLE):
+        try:
+            return sample_real_like_scene(layout, num_frames, rng=rng)
+        except PoseError as error:
+            reason = error
+    raise PoseError(f"none of {_MAX_PEOPLE} people can do '{_REAL_LIKE}'; the last: {reason}") from reason
+
+
+def _walk(
+    seconds: float, frames: int, sides: Float[np.ndarray, "3"], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Offsets (T, 3) [m] to and fro through the part of the volume that hands in its middle do not reach."""
+    reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
+    turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND + rng.random(3)
+    return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))
+
+
+def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
+    """The same motion somewhere else in each frame [m]."""
+    hands = []
+    for hand in scene.hands:
+        qpos = hand.qpos.copy()
+        qpos[:, :3] += offsets
+        hands.append(GlovedHand(hand.fit, qpos))
+    held = scene.moving_object
+    if held is not None:
+        poses = held.motion.T_world_body.copy()
+        poses[:, :3, 3] += offsets
+        held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+    return dataclasses.replace(scene, hands=tuple(hands), moving_object=held)
+
+
+def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
+    """The first frames of a take where its hands were, in stretches in which every hand has a pose.
+
+    The hands wear another glove if one is given.
+    """
+    fits = [hand if layout is None else attach(layout, hand.model) for hand in take.hands]
+    whole = np.isfinite(take.qpos).all(axis=(1, 2))
+    scenes, left = [], num_frames
+    for first, last in runs_of(whole):
+        part = slice(first, min(last + 1, first + left))
+        if part.stop - part.start >= _FEWEST_FRAMES:
+            left -= part.stop - part.start
+            scenes.append(_scene(take, fits, part))
+    if not scenes:
+        raise CaptureError(
+            f"the take has no {_FEWEST_FRAMES} frames in a row in which every hand has a pose, expected some"
+        )
+    return {"the take": scenes}
+
+
+def _scene(take: Take, fits: list[GloveFit], part: slice) -> SceneMotion:
+    hands = tuple(
+        GlovedHand(fit, np.ascontiguousarray(take.qpos[part, number])) for number, fit in enumerate(fits)
+    )
+    held = None
+    for number, body in enumerate(take.bodies):
+        thing, poses = body.shape, take.body_poses[part, number]
+        if held is None and thing is not None and np.isfinite(poses).all():
+            held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
+    return SceneMotion(hands, held, take.rate)
+
+
+class ObservedHand(NamedTuple):
+    """One hand in some frames."""
+
+    fit: GloveFit
+    qpos: Float[np.ndarray, "T 27"]
+    frames: HandFrames
+    """What rig and optical system make of it."""
+
+
+def observe_poses(
+    layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
+) -> list[ObservedHand]:
+    """Random people's hands in the poses and scenes of training sets; at least so many frames in all."""
+    config, observed, done = GenerateSettings(), [], 0
+    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
+    while done < num_frames:
+        models = sample_hands(config.population, rng=rng)
+        scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
+        fits = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
+        hands = list(_observe(scene, fits, rig, rng))
+        observed += hands
+        done += sum(len(hand.qpos) for hand in hands)
+    return observed
+
+
+def observe_motion(
+    take: Take, layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
+) -> list[ObservedHand]:
+    """The hands of a take in another glove, in at most so many of its frames, in the middle of the rig."""
+    posed = np.flatnonzero(np.isfinite(take.qpos).all(axis=(1, 2)))
+    if not len(posed):
+        raise CaptureError("there is no frame in which every hand of the take has a pose, expected one")
+    chosen = posed[np.unique(np.linspace(0, len(posed) - 1, num_frames).astype(int))]
+    poses = take.qpos[chosen]
+    poses[..., :3] += ROOM_CENTER - poses[..., :3].mean(axis=(0, 1))
+    models = tuple(hand.model for hand in take.hands)
+    fits = tuple(attach(layout, model) for model in models)
+    qpos = tuple(np.ascontiguousarray(poses[:, number]) for number in range(len(models)))
+    return list(_observe(FrameScene(models, qpos), fits, rig, rng))
+
+
+def _observe(
+    scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
+) -> Iterator[ObservedHand]:
+    config = GenerateSettings()
+    # Single frames do not continue points, so that two rays are enough, as for points that exist already.
+    optics = dataclasses.replace(config.optics, min_rays_to_start=config.min_cameras)
+    frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)
+    for fit, qpos, seen in zip(fits, scene.qpos, frames, strict=True):
+        yield ObservedHand(fit, qpos, seen)
+
+
+class LitScene(NamedTuple):
+    """A scene, and all that shines in it as the cameras of a rig see it."""
+
+    scene: SceneMotion
+    sources: LightSources
+    optics: OpticsConfig
+    """Noise and losses of the room."""
+
+    @property
+    def num_markers(self) -> int:
+        """Markers of the hands, the first of the sources."""
+        return sum(hand.fit.layout.num_markers for hand in self.scene.hands)
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "T M C"]:
+        """Which cameras have a free view of the hands' markers."""
+        return self.sources.visible[:, : self.num_markers]
+
+    def without(self, camera: int) -> LitScene:
+        """The same scene before one camera less."""
+        visible = np.delete(self.sources.visible, camera, axis=2)
+        return self._replace(sources=self.sources._replace(visible=visible))
+
+
+def light(
+    scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
+) -> list[LitScene]:
+    """Cast all lines of sight; refuses a rig with a camera in the hands."""
+    return [
+        LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
+        for scene in scenes
+    ]
+
+
+def light_work(
+    work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
+) -> dict[str, list[LitScene]]:
+    """`light` for scenes of each kind of work, in the rooms that simulated takes of it have by default."""
+    return {
+        kind: [lit for scene in scenes for lit in light([scene], rig, _room(kind, scene), rng=rng)]
+        for kind, scenes in work.items()
+    }
+
+
+def _room(kind: str, scene: SceneMotion) -> RoomConfig:
+    """The room of simulated takes of this kind of work, or of the kind most like it, as for a take."""
+    if kind not in SIMULATED_KINDS:
+        free = "hand-hand" if len(scene.hands) > 1 else "single-hand"
+        kind = free if scene.moving_object is None else "hand-pen"
+    return usual_room(cast("SimulatedKind", kind))
+
+
+class ErrorEllipsoid(NamedTuple):
+    """The error of points, averaged."""
+
+    axes: Float[np.ndarray, "3"]
+    """Standard deviations along the directions, the longest first [m]; NaN without points."""
+    directions: Float[np.ndarray, "3 3"]
+    """Unit vectors in the world, one in each row."""
+    mean: float
+    """Root mean square of the distance from the truth, averaged over the points [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """What a rig makes of hands at work; shares are of marker-frames: every marker in every frame."""
+
+    marker_frames: int
+    seen_by_two: float
+    """Share that two cameras or more see."""
+    seen_by_three: float
+    missing: float
+    """Share without a point."""
+    gaps: float
+    """Gaps of a marker in a minute."""
+    gap_median: float
+    """Length of a gap [s]; NaN without gaps."""
+    gap_p95: float
+    ghosts: float
+    """Points of a frame that are no marker."""
+    error: ErrorEllipsoid
+
+
+class CameraLoss(NamedTuple):
+    """What one camera is worth."""
+
+    seen: float
+    """Share of the marker-frames that it sees."""
+    needed: float
+    """Share of the marker-frames that it sees and fewer than two others see."""
+    without: Forecast | None
+    """The forecast without it; None where two cameras are all there are."""
+
+
+class _Counts(NamedTuple):
+    """What is added up over scenes."""
+
+    marker_frames: int
+    scene_frames: int
+    minutes: float  # of markers
+    two: int
+    three: int
+    missing: int
+    ghosts: int
+
+
+def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
+    """What the optical system makes of scenes as this rig sees them, its noise and losses from a seed."""
+    rng = np.random.default_rng(seed)
+    counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
+    total = _Counts(*(sum(column) for column in zip(*counts, strict=True)))
+    lengths = np.concatenate(gaps)
+    median, p95 = np.percentile(lengths, [50, 95]) if len(lengths) else (np.nan, np.nan)
+    return Forecast(
+        total.marker_frames,
+        total.two / total.marker_frames,
+        total.three / total.marker_frames,
+        total.missing / total.marker_frames,
+        len(lengths) / total.minutes,
+        float(median),
+        float(p95),
+        total.ghosts / total.scene_frames,
+        ellipsoid(np.concatenate(spreads)),
+    )
+
+
+def _count(
+    one: LitScene, rig: CameraRig, rng: np.random.Generator
+) -> tuple[_Counts, Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
+    """Counts of a scene, the lengths of its gaps [s], and covariances of some of its points [m^2]."""
+    sources, optics, markers, rate = one.sources, one.optics, one.num_markers, one.scene.rate
+    found = reconstruct(
+        sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
+    )
+    triangulated = np.isfinite(found.positions[..., 0])
+    false_labels = label_false_points(found, sources.positions, sources.labels, optics.max_residual)
+    present = triangulated[:, :markers].copy()
+    frame, column = np.nonzero((false_labels >= 0) & (false_labels < markers))
+    present[frame, false_labels[frame, column]] = True
+    false = np.isfinite(found.false_points[..., 0]) & (false_labels < 0)
+    views = one.seen.sum(axis=-1)
+    rows, columns = np.nonzero(triangulated[:, :markers] & (views >= FEWEST_CAMERAS))
+    step = max(1, len(rows) // _ERRORS)
+    rows, columns = rows[::step], columns[::step]
+    noise = optics.noise * np.sqrt(MARKER_RADIUS / sources.radii[columns])
+    counts = _Counts(
+        present.size,
+        len(present),
+        present.size / rate / 60.0,
+        int((views >= FEWEST_CAMERAS).sum()),
+        int((views > FEWEST_CAMERAS).sum()),
+        int((~present).sum()),
+        int(triangulated[:, sources.labels < 0].sum() + false.sum()),
+    )
+    spreads = covariances(sources.positions[rows, columns], one.seen[rows, columns], rig, noise)
+    return counts, run_lengths(~present) / rate, spreads
+
+
+def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> list[CameraLoss]:
+    """What each camera is worth: the same hands without it."""
+    seen = np.concatenate([one.seen.reshape(-1, len(rig.positions)) for one in lit])
+    views, losses = seen.sum(axis=1), []
+    for camera in range(len(rig.positions)):
+        mine, without = seen[:, camera], None
+        if len(rig.positions) > FEWEST_CAMERAS:
+            without = forecast([one.without(camera) for one in lit], rig.without(camera), seed=seed)
+        needed = mine & (views <= FEWEST_CAMERAS)
+        losses.append(CameraLoss(int(mine.sum()) / len(seen), int(needed.sum()) / len(seen), without))
+    return losses
+
+
+def covariances(
+    points: Float[np.ndarray, "N 3"],
+    seen: Bool[np.ndarray, "N C"],
+    rig: CameraRig,
+    noise: Float[np.ndarray, "N"],
+) -> Float[np.ndarray, "N 3 3"]:
+    """Covariance of each triangulated point [m^2], the one nearest to its rays, which all count alike.
+
+    Args:
+        points: Points in the world [m].
+        seen: Which cameras see each: two or more, from different directions.
+        noise: Standard deviation of each point's blob per axis [px].
+    """
+    total, shifts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
+    for number, camera in enumerate(rig.cameras):
+        rays = points - camera.T_world_camera[:3, 3]
+        distances = np.linalg.norm(rays, axis=1)
+        directions = rays / distances[:, None]
+        across = (np.eye(3) - directions[:, :, None] * directions[:, None]) * seen[:, number, None, None]
+        total += across
+        # A pixel to the right or down moves the ray at the point's depth by so much, across the ray.
+        local = camera.local(points)
+        tangents = np.linalg.inv(camera.lens.jacobian(local)) / camera.focal_lengths
+        shift = across @ camera.T_world_camera[:3, :2] @ tangents * (local[:, 2] * noise)[:, None, None]
+        shifts += shift @ shift.transpose(0, 2, 1)
+    inverse = np.linalg.inv(total)
+    return inverse @ shifts @ inverse
+
+
+def ellipsoid(spread: Float[np.ndarray, "N 3 3"]) -> ErrorEllipsoid:
+    """The mean of some points' covariances [m^2]."""
+    if not len(spread):
+        return ErrorEllipsoid(np.full(3, np.nan), np.eye(3), float("nan"))
+    values, vectors = np.linalg.eigh(spread.mean(axis=0))
+    mean = float(np.sqrt(np.trace(spread, axis1=1, axis2=2)).mean())
+    return ErrorEllipsoid(np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1], mean)

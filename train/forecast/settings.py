@@ -1,0 +1,123 @@
+"""The settings of forecasts: how gloves and rigs are scored, and how better ones are sought."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, Literal, get_args
+
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, list_layouts
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError
+from handsim.settings import Expected, Limits, Settings
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
+from train.labelers.protocol import Labeler
+
+LONGEST_SIDE: Final = 50.0
+"""No volume or room is longer, and no middle of one farther from the origin [m]."""
+Mount = Literal["walls", "truss", "tripods"]
+MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)
+POSES: Final = "poses"
+TWINS: Final = "twins"
+_Sides = Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)]
+_Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
+_Rig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
+_Layout = Annotated[
+    MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
+]
+_Seed = Annotated[int, Limits(0)]
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreRigSettings(Settings):
+    """What hands do before a rig that is scored: options of `handsim rig score`, arguments of `score_rig`."""
+
+    volume: _Sides = (0.6, 0.6, 0.6)
+    """Sides of the space that hands work in [m]."""
+    center: _Center | None = None
+    """Its middle [m]; (0, 0, 1.1) when not given, or where the hands of the take are."""
+    take: Annotated[Take | str | Path | None, Expected("a Take, or the path of one")] = None
+    """A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are; simulated
+    people when not given."""
+    glove: _Layout | None = None
+    """Marker layout: a shipped name or the path of a .toml file; dense19 or that of the take when not
+    given."""
+    num_frames: Annotated[int, Limits(60)] = 900
+    """Frames of every person and kind of work, or of the take."""
+    seed: _Seed = 0
+    """Seed of people, motion and cameras' losses."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRigSettings(Settings):
+    """What a rig is planned for: options of `handsim rig plan`, arguments of `plan_rig`."""
+
+    mounts: tuple[Mount, ...] = MOUNTS
+    """What cameras can hang on: walls, a truss along the room's edges (four beams above and four posts),
+    tripods."""
+    volume: _Sides = (0.6, 0.6, 0.6)
+    """Sides of the space that hands work in [m]."""
+    center: _Center = ROOM_CENTER
+    """Its middle [m]."""
+    keep: _Rig | None = None
+    """A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like its
+    first."""
+    size: Annotated[tuple[int, int], Limits(1)] = (1280, 1280)
+    """Width and height of the new cameras' pictures [px]."""
+    field_of_view: Annotated[float, Limits(1.0, 170.0)] = 60.0
+    """Full opening across the shorter side of these [deg]."""
+    glove: _Layout = "dense19"
+    """Marker layout: a shipped name or the path of a .toml file."""
+    seed: _Seed = 0
+    """Seed of people and motion."""
+
+    def check(self) -> None:
+        """Refuse a plan without a mount."""
+        if not self.mounts:
+            raise ArgumentError(f"mounts is empty, expected some of {', '.join(MOUNTS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreGloveSettings(Settings):
+    """How a layout is scored: options of `handsim glove score`, arguments of `score_glove`."""
+
+    rig: _Rig = "figure5"
+    """Camera rig: a shipped name or the path of a .toml file."""
+    motion: Annotated[Take | str | Path, Expected("a Take, or the path of one", lambda: (POSES, TWINS))] = (
+        POSES
+    )
+    """What hands do: poses (random people and poses), twins (simulated motion of one hand and of two) or a
+    take (.npz) of `handsim track` or `handsim simulate`."""
+    num_frames: Annotated[int, Limits(100)] = 1500
+    """Frames of hands, of a take those of each hand."""
+    labeler: Annotated[Labeler | str | Path | None, Expected("a Labeler, or the path of one")] = None
+    """Folder of a labeler trained on the layout, or an exported .onnx file; the network for any layout when
+    not given."""
+    captures: Annotated[int, Limits(0)] = 3
+    """Captures of each kind of work that are tried, of different people; 0 for none."""
+    seed: _Seed = 0
+    """Seed of people, poses and cameras' losses; captures have their own."""
+
+    def check(self) -> None:
+        """Refuse a motion that is no take."""
+        motion = self.motion
+        if not isinstance(motion, Take) and motion not in (POSES, TWINS) and Path(motion).suffix != ".npz":
+            raise ArgumentError(f"motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
+
+
+@dataclass(frozen=True, slots=True)
+class ImproveGloveSettings(Settings):
+    """How a better layout is sought: options of `handsim glove improve`, arguments of `improve_glove`."""
+
+    markers: Annotated[int | None, Limits(FEWEST_MARKERS, MOST_MARKERS)] = None
+    """Number of markers of the new layout; as many as before when not given."""
+    keep: tuple[str, ...] = ()
+    """Names of markers that stay where they are."""
+    rig: _Rig = "figure5"
+    """Camera rig: a shipped name or the path of a .toml file."""
+    minutes: Annotated[float, Limits(0.0)] = 3.0
+    """How long to move markers [min]."""
+    captures: Annotated[int, Limits(0)] = 3
+    """Captures of each kind of work on which both layouts are tried at the end; 0 for none."""
+    seed: _Seed = 0
+    """Seed of people, poses and tries."""
