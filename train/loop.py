@@ -128,9 +128,13 @@ def train_labeler(
         threads = torch.get_num_threads() if settings.labeler == "cnn" and alone_on_cpu else 1
     with _curves_closed(fabric), lost_peers_told(), torch_threads(threads):
         on_step("training set")
-        run = _prepare(load_dataset(dataset), settings, out, fabric)
+        flag = InterruptFlag()
+        # A process that a signal ends at once would have the others wait for it.
+        with nullcontext() if fabric.world_size == 1 else interrupt_flag(flag, again=False):
+            run = _prepare(load_dataset(dataset), settings, out, fabric)
+            with run.kept():
+                run.do_steps(flag, progress, on_step, save_every)
         with run.kept():
-            run.do_steps(progress, on_step, save_every)
             return fabric.broadcast(run.finish(on_step) if fabric.is_global_zero else {})
 
 
@@ -185,29 +189,28 @@ class _Run:
     held_out: MappedRows
     out: Path
 
-    def do_steps(self, progress: Progress, on_step: OnStep, save_every: float) -> None:
+    def do_steps(self, flag: InterruptFlag, progress: Progress, on_step: OnStep, save_every: float) -> None:
         """Do what steps there are to do, and keep the state now and then.
 
         A step is made whole or not at all. Of several processes all end after the same one.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe = batch_recipe(settings, len(self.manifest.marker_names))
-        saved, flag = time.monotonic(), InterruptFlag()
-        with nullcontext() if alone else interrupt_flag(flag, again=False):
-            while self._is_unfinished(on_step):
-                with interrupt_flag(flag, again=alone):
-                    # One generator per step, so that a resumed run makes the same draws; the same one on
-                    # each device.
-                    rng = np.random.default_rng((settings.seed, state.done, 0))
-                    loss = state.step(draw_batch(self.rows, recipe, rng=rng), rng=rng)
-                if flag() if alone else state.is_any(flag()):
-                    raise Stopped(flag.number or signal.SIGTERM)
-                on_step(f"loss {loss:.3f}")
-                progress(min(state.done, settings.samples), settings.samples)
-                if time.monotonic() - saved > save_every:
-                    on_step("checkpoint")
-                    state.save(self.out / CHECKPOINT)
-                    saved = time.monotonic()
+        saved = time.monotonic()
+        while self._is_unfinished(on_step):
+            with interrupt_flag(flag, again=alone):
+                # One generator per step, so that a resumed run makes the same draws; the same one on
+                # each device.
+                rng = np.random.default_rng((settings.seed, state.done, 0))
+                loss = state.step(draw_batch(self.rows, recipe, rng=rng), rng=rng)
+            if flag() if alone else state.is_any(flag()):
+                raise Stopped(flag.number or signal.SIGTERM)
+            on_step(f"loss {loss:.3f}")
+            progress(min(state.done, settings.samples), settings.samples)
+            if time.monotonic() - saved > save_every:
+                on_step("checkpoint")
+                state.save(self.out / CHECKPOINT)
+                saved = time.monotonic()
         on_step("checkpoint")
         state.save(self.out / CHECKPOINT)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 
 import mujoco
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +19,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels import (
     align_rigid,
+    kernel,
     move,
     multiply_rotations,
     pose_digit_axes,
@@ -192,3 +195,18 @@ def test_a_digit_is_where_the_hand_has_it(side, digit, rng):
         wrist = quaternion_matrix(row[3:7]), row[:3]
         pose_digit_axes(wrist, row[7 + 4 * digit : 11 + 4 * digit], parts, ours, scratch)
         np.testing.assert_allclose(ours, expected, atol=1e-14)
+
+
+def test_kernels_that_an_earlier_version_kept_are_compiled_anew(tmp_path, monkeypatch):
+    """Their index may name types of modules that are gone, which Python cannot read."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    def twice(x):
+        return 2.0 * x
+
+    assert kernel(twice)(1.5) == 3.0
+    (index,) = tmp_path.rglob("*.nbi")
+    stale = pickle.dumps(numba.__version__) + b"cmodule_that_is_gone\nName\n."
+    index.write_bytes(stale)
+    assert kernel(twice)(1.5) == 3.0
+    assert index.read_bytes() != stale

@@ -138,7 +138,7 @@ def test_a_planned_rig_is_written_and_told(tmp_path, capsys, monkeypatch):
     rig = load_rig(out)
     assert rig.name == "mine" and len(rig.positions) == 2
     told = capsys.readouterr().out
-    assert "looks at [m]" in told and "after:  two cameras see" in told and "before" not in told
+    assert "looks at" in told and "after:  two cameras see" in told and "before" not in told
 
 
 @pytest.mark.parametrize(
