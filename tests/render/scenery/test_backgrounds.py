@@ -12,8 +12,7 @@ from handsim.errors import HandSimError
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import named_rig
 from render.config import RenderConfig
-from render.frames import RenderedFrame
-from render.painting.rasterizer import Geometry
+from render.frames import Geometry, RenderedFrame
 from render.scenery.backgrounds import (
     KINDS,
     Background,
