@@ -24,7 +24,7 @@ NO_QUANTITY = {
     "Backgrounds", "CameraLoss", "EvaluateSettings", "SuspectSpan", "HandSimError", "HandSimWarning",
     "ImprovedGlove", "Labeler",
     "LiveHeader", "PoseFile", "ScoreGloveSettings", "SinkGroup", "Status", "find_suspect_spans",
-    "load_labeler",
+    "load_labeler", "PoseMix", "SceneMix",
 }  # fmt: skip
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""
 
