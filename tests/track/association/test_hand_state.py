@@ -55,7 +55,7 @@ def test_a_marker_that_is_missing_is_less_certain_than_its_neighbors(moving):
     prediction = moving.predict(30 / RATE)
     target = prediction.positions.copy()
     target[TIP] = np.nan
-    spread = np.trace(moving.fit(target, prediction.qpos, prediction).covariances, axis1=1, axis2=2)
+    spread = np.trace(moving.fit(target, prediction.qpos, prediction).predicted.covariances, axis1=1, axis2=2)
     assert spread.argmax() == TIP
 
 

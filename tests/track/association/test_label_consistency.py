@@ -23,6 +23,7 @@ from track.association.label_consistency import (
 )
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeling
+from train.labelers.storage import load_labeler
 
 RATE = 120.0
 
