@@ -21,7 +21,7 @@ BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
 UNIT = re.compile(r"\[(m|m\^2|rad|s|min|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
 ARRAY = re.compile(r"\b(Float|Int|Bool)(32|64)?\[[^,\]]+, *\"")
 NO_QUANTITY = {
-    "Backgrounds", "CameraLoss", "EvaluateSettings", "SuspectSpan", "HandSimError", "HandSimWarning",
+    "Backgrounds", "CalibrateSettings", "CameraLoss", "EvaluateSettings", "LabelSettings", "SuspectSpan", "HandSimError", "HandSimWarning",
     "ImprovedGlove", "Labeler",
     "LiveHeader", "PoseFile", "ScoreGloveSettings", "SinkGroup", "Status", "find_suspect_spans",
     "load_labeler", "PoseMix", "SceneMix",

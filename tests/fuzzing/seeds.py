@@ -22,8 +22,8 @@ from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
+from track.frames import StreamedFrame
 from track.rigid_body import RigidTemplate, save_body
-from track.streams.frame_source import StreamedFrame
 from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
 from track.user import User
 

@@ -27,9 +27,9 @@ from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.captures import track_capture
 from track.config import TrackerConfig
+from track.frames import capture_frames
 from track.recorder import TakeRecorder
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import capture_frames
 from track.streams.live_stream import open_source
 from track.streams.natnet import ReplayServer
 from track.tracker import Tracker
@@ -196,7 +196,7 @@ from gloves.layout import load_layout
 from track.captures import track_capture
 from track.label_confidence import label_confidence
 from track.tracker import warm_up
-from track.streams.frame_source import checked_frames
+from track.frames import checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 

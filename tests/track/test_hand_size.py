@@ -12,6 +12,7 @@ from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, DIGITS, SIZES, sample_shape, shape_from_measures
 from poses.motion import sample_motion
+from track.frames import StreamedFrame, checked_frames
 from track.hand_size import (
     SizeFit,
     _is_found,
@@ -19,7 +20,6 @@ from track.hand_size import (
     sample_frames,
     usual_breadth,
 )
-from track.streams.frame_source import StreamedFrame, checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 

@@ -19,10 +19,9 @@ from gloves.takes.points import Status
 from gloves.takes.take import LOST, STATUSES, TRACKED, RigidBody, Take, load_take
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.model import join_qpos
-from track.frames import TrackedBody, TrackedFrame, TrackedHand
+from track.frames import StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 

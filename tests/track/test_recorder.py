@@ -19,9 +19,9 @@ from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
 from track import recorder as module
+from track.frames import capture_frames
 from track.recorder import Recorder, TakeRecorder
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import capture_frames
 from track.streams.live_stream import open_source
 from track.streams.natnet import ReplayServer
 from track.tracker import Tracker

@@ -12,10 +12,9 @@ from gloves.layout import load_layout
 from gloves.takes.points import Status
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
-from track.frames import TrackedBody, TrackedFrame, TrackedHand
+from track.frames import StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
 from track.live_message import LiveMessage, MessageEncoder
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
 
 
 @functools.cache

@@ -11,9 +11,8 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from track.frames import TrackedFrame, TrackedHand
+from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.sinks import VALID, SinkGroup, open_sink, open_sinks
-from track.streams.frame_source import StreamedFrame
 
 SOURCE = """
 class Counter:

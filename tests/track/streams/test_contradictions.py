@@ -14,7 +14,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.errors import CaptureError, HandSimWarning
 from tests.track.streams.test_frame_source import Slow
-from track.streams.frame_source import SourceStream, StreamedFrame
+from track.frames import StreamedFrame
+from track.streams.frame_source import SourceStream
 from track.streams.live_stream import FrameOrder, LiveStream
 
 RATE = 120.0

@@ -12,8 +12,9 @@ import pytest
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from tests.waiting import LONG
+from track.frames import StreamedFrame, capture_frames
 from track.streams import live_stream
-from track.streams.frame_source import SourceStream, StreamedFrame, capture_frames
+from track.streams.frame_source import SourceStream
 from track.streams.live_stream import LiveStream
 
 

@@ -19,9 +19,9 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
+from track.frames import StreamedFrame
 from track.rigid_body import BodyTracker, RigidTemplate
 from track.streams import natnet
-from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import LiveStream, open_source
 from track.streams.natnet import Kind, PointStream, ReplayServer, ServerInfo, open_stream
 from train.simulation.takes import simulate_take
