@@ -36,7 +36,7 @@ from track.constellation import (
     track_by_ids,
     transform_markers,
 )
-from track.streams.frame_source import StreamedFrame, capture_frames
+from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
