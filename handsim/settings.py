@@ -170,8 +170,7 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
     if kind is Path and isinstance(value, str):
         return Path(value)
     if getattr(kind, "_is_protocol", False):
-        members = [name for name in vars(kind) if not name.startswith("_")] or ["__call__"]
-        if not all(hasattr(value, member) for member in members):
+        if not all(hasattr(value, member) for member in _members(kind)):
             raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
     elif isinstance(kind, type) and get_origin(kind) is None:
         check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())
@@ -193,14 +192,35 @@ def _checked_union(
     if len(others) == 1:
         return _checked(name, value, Annotated[others[0], limits, expected], field)
     for arm in others:
-        try:
+        if _suits(value, arm):
             return _checked(name, value, Annotated[arm, limits], field)
-        except ArgumentError:
-            continue
     words = " or ".join(_words(arm, None) for arm in others) if expected is None else expected.words
     names = ", ".join(() if expected is None else expected.names())
     told = f"{name} is {shown_value(value)}, expected {words}"
     raise ArgumentError(f"{told}; valid names: {names}" if names else told)
+
+
+def _suits(value: Any, hint: Any) -> bool:
+    """Whether a value is of one of a field's types, whatever its numbers are."""
+    origin = get_origin(hint)
+    if origin is Annotated:
+        return _suits(value, get_args(hint)[0])
+    if origin is Literal:
+        return value in get_args(hint)
+    if origin is tuple:
+        kinds = get_args(hint)[:1]
+        return isinstance(value, tuple | list) and all(_suits(item, *kinds) for item in value)
+    if hint in (int, float):
+        return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if getattr(hint, "_is_protocol", False):
+        return all(hasattr(value, member) for member in _members(hint))
+    kinds = (hint, str) if hint is Path else (origin or hint,)
+    return isinstance(value, kinds) or (dataclasses.is_dataclass(hint) and isinstance(value, Mapping))
+
+
+def _members(protocol: Any) -> list[str]:
+    """What an object must have to be taken for a protocol."""
+    return [name for name in vars(protocol) if not name.startswith("_")] or ["__call__"]
 
 
 def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits | None) -> tuple[Any, ...]:

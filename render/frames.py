@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -46,6 +46,16 @@ class Pictures:
     """
     markers: UInt8[np.ndarray, "H W"] | None = None
     """1 + marker of each pixel, counted over all hands; 0 for no marker."""
+
+
+class Geometry(NamedTuple):
+    """Depth, normals and ids of surfaces in a camera's picture, as in `Pictures`."""
+
+    depth: Float32[np.ndarray, "H W"]
+    normals: Float32[np.ndarray, "H W 3"] | None
+    parts: UInt8[np.ndarray, "H W"]
+    instances: UInt8[np.ndarray, "H W"]
+    markers: UInt8[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

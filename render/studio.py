@@ -31,13 +31,14 @@ from render.frames import (
     Bytes,
     Doubles,
     Floats,
+    Geometry,
     HandTruth,
     Pictures,
     RenderedFrame,
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
-from render.painting.rasterizer import NEAR, Geometry, faces_for, see, warp
+from render.painting.rasterizer import NEAR, faces_for, see, warp
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting

@@ -15,13 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.layout import load_layout
+from gloves import Capture, load_layout, write_capture
 from gloves.takes.archives import write_archive
 from handsim.app import messages
 from handsim.cli.main import main
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'

@@ -41,7 +41,7 @@ from track.glove_score import (
     palm_spread,
     try_layout,
 )
-from track.inputs import AnyGlove
+from track.user import AnyGlove
 from train.data.batches import Corruption, corrupt
 from train.evaluation import LabelCounts
 from train.forecast.settings import ImproveGloveSettings

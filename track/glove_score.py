@@ -27,9 +27,9 @@ from handsim.space.rig import CameraRig, load_rig
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
 from track.config import BOTH
-from track.inputs import AnyGlove
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import known_hand, pose_spreads, tip_lengths
+from track.user import AnyGlove
 from train.data.batches import Corruption, corrupt, paper_corruption
 from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, cast
 
 import tyro
 
+from handsim._checks import check_choice
 from handsim.app.messages import print_line, progress_bar
 from handsim.app.output import place_of
 from handsim.app.workers import chosen_workers
@@ -17,7 +18,7 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.config import RenderConfig
-from render.depth_sensor import DepthSensor
+from render.depth_sensor import SENSORS, DepthSensor
 from render.formats.writer import merge_renderings
 from render.scenery.backgrounds import BackgroundKind, Backgrounds
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
@@ -56,6 +57,8 @@ class RenderOptions(RenderConfig):
         given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(RenderConfig)}
         kinds: dict[str, Any] = dict.fromkeys(self.background or (("photo",) if self.photos else ()), 1.0)
         names = () if self.depth_sensor == ("none",) else self.depth_sensor
+        for name in names if names != ("auto",) else ():
+            check_choice(name, (*SENSORS, "none"), noun="depth sensor")
         return RenderConfig(
             **given
             | {

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens, camera_matrix
-from render.frames import Bytes, Doubles, Flags, Floats, Integers
+from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -39,16 +39,6 @@ class Triangles:
     parts: UInt8[np.ndarray, "F"]  # see `render.frames.Pictures`, as the next two
     instances: UInt8[np.ndarray, "F"]
     markers: UInt8[np.ndarray, "F"]
-
-
-class Geometry(NamedTuple):
-    """What a camera sees of surfaces; see `render.frames.Pictures`."""
-
-    depth: Float32[np.ndarray, "H W"]
-    normals: Float32[np.ndarray, "H W 3"] | None
-    parts: UInt8[np.ndarray, "H W"]
-    instances: UInt8[np.ndarray, "H W"]
-    markers: UInt8[np.ndarray, "H W"]
 
 
 def see(camera: Camera, surfaces: Sequence[Triangles], *, with_normals: bool) -> Geometry:

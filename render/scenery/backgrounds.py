@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -29,11 +29,8 @@ from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
-from render.frames import Bytes, Doubles, Floats
+from render.frames import Bytes, Doubles, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
-
-if TYPE_CHECKING:
-    from render.painting.rasterizer import Geometry
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs

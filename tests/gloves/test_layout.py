@@ -15,17 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gloves.layout
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import (
-    MarkerLayout,
-    MarkerPlace,
-    list_layouts,
-    load_layout,
-    moved_text,
-    shipped_layout,
-    starter_layout,
-    stored_layout,
-)
+from gloves.layout import list_layouts, moved_text, shipped_layout, starter_layout, stored_layout
 from handsim.errors import LayoutError
 from handsim.hand.shape import BONE_NAMES, SIZES
 

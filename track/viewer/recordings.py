@@ -21,9 +21,8 @@ from handsim.callbacks import Progress, no_progress
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.rig import CameraRig, list_rigs, load_rig
-from track.frames import TrackedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
 from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 

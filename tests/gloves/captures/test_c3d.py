@@ -8,9 +8,8 @@ import ezc3d
 import numpy as np
 import pytest
 
+from gloves import Capture, read_capture, write_capture
 from gloves.captures.c3d import read_c3d
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
 from handsim.errors import CaptureError
 
 INTEL, DEC, SGI = 84, 85, 86

@@ -14,16 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.captures.capture import (
-    Capture,
-    check_place,
-    count_gaps,
-    run_lengths,
-    unit_fault,
-    zeros_as_missing,
-)
-from gloves.captures.formats import READABLE, WRITABLE, read_capture, write_capture
-from handsim.errors import CaptureError, HandSimWarning
+from gloves import Capture, read_capture, write_capture
+from gloves.captures.capture import check_place, count_gaps, run_lengths, unit_fault, zeros_as_missing
+from gloves.captures.formats import READABLE, WRITABLE
+from handsim import HandSimWarning
+from handsim.errors import CaptureError
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NAMES = st.one_of(WORDS, st.builds("{} {}".format, WORDS, WORDS), st.just("*12"), st.just("Unlabeled 2379"))

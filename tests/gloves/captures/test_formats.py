@@ -9,16 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import (
-    read_capture,
-    read_markers,
-    read_motive_csv,
-    read_qtm_tsv,
-    read_trc,
-    read_vicon_csv,
-    write_capture,
-)
+from gloves import Capture, read_capture, write_capture
+from gloves.captures.formats import read_markers, read_motive_csv, read_qtm_tsv, read_trc, read_vicon_csv
 from handsim.errors import CaptureError
 
 SIG18 = Path(os.environ.get("HANDSIM_SIG18", Path(__file__).resolve().parents[3].parent / "shared" / "sig18"))

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gloves import GhostConfig
 from gloves.optics.ghosts import (
     MAX_GHOSTS,
-    GhostConfig,
     StrayConfig,
     cameras_by_mirror,
     reflect,

@@ -11,8 +11,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
 from gloves.optics.visibility import (
     MAX_FACING,
     MeshTree,
@@ -24,10 +24,9 @@ from gloves.optics.visibility import (
     pack_cameras,
     visible_cameras,
 )
+from handsim import CameraRig, HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, RigError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.space.rig import CameraRig, load_rig
+from handsim.space.rig import load_rig
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
 from tests.rigs import mixed_rig

@@ -16,17 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import CameraRig, HandModel, Population, join_qpos, load_rig, look_at, sample_shape
 from handsim.errors import ArgumentError, RigError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Population, sample_shape
-from handsim.space.camera import look_at
 from handsim.space.rig import (
     HAND_REACH,
-    CameraRig,
     check_outside,
     check_outside_volume,
     list_rigs,
-    load_rig,
     rig_setting,
 )
 from handsim.space.rig_formats import load_cameras

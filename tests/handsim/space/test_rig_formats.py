@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import HandSimWarning, RigError
+from handsim import CameraRig, HandSimWarning
+from handsim.errors import RigError
 from handsim.space import rig_formats
-from handsim.space.rig import CameraRig
 from handsim.space.rig_formats import LabCamera, import_cameras, load_cameras, read_xml
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from tests.handsim.space.known_rig import (

@@ -8,16 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import HandSimError
-from handsim.space.camera import Camera, look_at, preset
+from handsim import Camera, HandSimError, look_at
+from handsim.space.camera import preset
 from handsim.space.rig import load_rig
-from render.config import RenderConfig
-from render.frames import RenderedFrame
-from render.painting.rasterizer import Geometry
+from render import Backgrounds, RenderConfig, RenderedFrame, ViewConfig, draw
+from render.frames import Geometry
 from render.scenery.backgrounds import (
     KINDS,
     Background,
-    Backgrounds,
     Enclosure,
     draw_background,
     draw_surroundings,
@@ -26,9 +24,7 @@ from render.scenery.backgrounds import (
     sample_background,
 )
 from render.scenery.rooms import draw_room
-from render.session import draw
-from render.viewpoints import ViewConfig
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 SIZE = (160, 120)
 

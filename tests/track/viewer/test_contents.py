@@ -8,19 +8,17 @@ import shutil
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
+from gloves import Capture, write_capture
 from gloves.layout import starter_layout
-from handsim.errors import ArgumentError, CaptureError, HandSimError
-from handsim.hand.model import HandModel
+from handsim import HandModel, HandSimError
+from handsim.errors import ArgumentError, CaptureError
 from handsim.space.rig import load_rig
 from tests.rigs import mixed_rig
-from track.user import User
+from track import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings import CaptureRecording, DatasetRecording, TakeRecording
 from track.viewer.stage import box_edges, camera_counts
-from train.data.shards import Dataset
-from train.simulation.generation import generate_dataset
+from train import Dataset, generate_dataset
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout
+from gloves import load_layout
 from handsim.space.rig import ROOM_CENTER, load_rig
 from train.forecast.rig_forecast import light, sample_work
 from train.simulation.room import RoomConfig

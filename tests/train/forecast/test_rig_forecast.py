@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves import OpticsConfig, load_layout
 from gloves.captures.capture import run_lengths
-from gloves.layout import load_layout
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import reconstruct
+from handsim import look_at
 from handsim.errors import CaptureError
 from handsim.hand.model import BodyMotion
-from handsim.space.camera import look_at
 from handsim.space.rig import load_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
+from train import simulate_take
 from train.forecast.rig_forecast import (
     camera_losses,
     covariances,
@@ -27,7 +28,6 @@ from train.forecast.rig_forecast import (
 )
 from train.simulation.room import RoomConfig
 from train.simulation.scenes import MovingObject, SceneMotion
-from train.simulation.takes import simulate_take
 
 
 def test_shares_are_those_of_the_lines_of_sight(six_lit):

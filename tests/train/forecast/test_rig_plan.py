@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from handsim import CameraRig
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.rig import CameraRig, load_rig
+from handsim.space.rig import load_rig
+from train import plan_rig
 from train.forecast.rig_forecast import light
-from train.forecast.rig_plan import Planning, places, plan_rig, view_candidates
+from train.forecast.rig_plan import Planning, places, view_candidates
 from train.forecast.settings import MOUNTS
 from train.simulation.room import RoomConfig
 

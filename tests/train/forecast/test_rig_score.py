@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.space.camera import look_at
+from handsim import look_at
 from handsim.space.rig import ROOM_CENTER, list_rigs, load_rig
 from tests.rigs import square_rig
-from train.forecast.rig_forecast import CameraLoss
+from train import CameraLoss
 from train.forecast.rig_score import (
     GRID,
     camera_table,

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gloves import OpticsConfig, Take, load_layout, load_take
 from gloves.captures.capture import count_gaps
-from gloves.layout import load_layout
-from gloves.optics.reconstruction import OpticsConfig
-from gloves.takes.take import Take, load_take
-from handsim.errors import ArgumentError, HandSimError, PoseError
-from handsim.hand.model import HandModel
+from handsim import HandModel, HandSimError
+from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
 from handsim.space.rig import ROOM_CENTER, load_rig
 from handsim.space.transforms import pose_matrices, quaternion_matrix
@@ -22,10 +20,11 @@ from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
 from poses.two_hands import two_hands_penetration
 from tests.rigs import mixed_rig
+from train import OpticsOptions, SimulateSettings, simulate_take
 from train.simulation import takes
-from train.simulation.room import TWINS, OpticsOptions
+from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS, RATE
-from train.simulation.takes import WRIST_VOLUME, SimulateSettings, simulate_take
+from train.simulation.takes import WRIST_VOLUME
 
 FRAMES = 200
 SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
