@@ -35,7 +35,6 @@ from track.calibration.hand_parameters import (
     SkinPatch,
     attachment_at,
     build_skin,
-    motion_jacobian,
     nearest_coordinates,
     project_onto_skin,
     shape_at,
@@ -44,6 +43,7 @@ from track.calibration.hand_parameters import (
     skin_points,
     skin_weight_jacobian,
     skin_weights,
+    skinned_shape_jacobian,
     skinning_terms,
 )
 from track.kinematics.pose_spread import resting_prior
@@ -227,10 +227,9 @@ class Problem:
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(estimate))
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        motions = motion_jacobian(self.shape, estimate.parameters, estimate.qpos)
         bone_weights = skin_weights(estimate.coordinates)
-        by_pose, by_shape, by_point, by_bone = _point_jacobians(
-            fit.model, fit.bones, motions, estimate.points, bone_weights, rest[:count]
+        by_pose, by_shape, by_point, by_bone = self._point_jacobians(
+            fit, estimate, slice(None), estimate.points, bone_weights, rest[:count]
         )
         weight_jacobian = skin_weight_jacobian(estimate.coordinates, _part(corners, 0, count))
         by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
@@ -252,7 +251,7 @@ class Problem:
         result = NormalEquations(pose, mixed, shared, pose_gradient, shared_gradient)
         self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
         if estimate.contacts is not None and fit.geometry is not None:
-            self._add_contacts(estimate, fit, rest[2 * count :], motions, result)
+            self._add_contacts(estimate, fit, rest[2 * count :], result)
         return result
 
     def _rest_jacobian(
@@ -316,12 +315,7 @@ class Problem:
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
     def _add_contacts(
-        self,
-        estimate: Estimate,
-        fit: Fit,
-        rest: NDArray[np.float64],
-        motions: NDArray[np.float64],
-        result: NormalEquations,
+        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64], result: NormalEquations
     ) -> None:
         """Add each contact's gap; `rest` (2 K, 3, 53): jacobian of the pads' rest points."""
         contacts, geometry = estimate.contacts, fit.geometry
@@ -331,9 +325,7 @@ class Problem:
         coordinates = self._all_coordinates(estimate)
         pads = SkinCoordinates(*(values[len(values) - 2 * count :] for values in coordinates))
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        jacobians = _point_jacobians(
-            fit.model, fit.bones[frames], motions[frames], points, skin_weights(pads), rest
-        )
+        jacobians = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
         pose, shape = (
             np.einsum("ki,kis->ks", geometry.directions, by[rows, count + rows] - by[rows, rows])
             for by in jacobians[:2]
@@ -346,6 +338,27 @@ class Problem:
         np.add.at(result.pose_gradient, frames, pull * pose)
         result.shared[:] += shared.T @ (precision * shared)
         result.shared_gradient[:] += (pull * shared).sum(axis=0)
+
+    def _point_jacobians(
+        self,
+        fit: Fit,
+        estimate: Estimate,
+        frames: NDArray[np.int64] | slice,
+        points: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        rest: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Jacobians of skinned points in some frames (T, M, 3, ...) by poses, parameters and rest points.
+
+        Also where each bone alone would put them (T, M, L, 3). `rest` (M, 3, 53) is the jacobian of the rest
+        points by the parameters.
+        """
+        bones, qpos = fit.bones[frames], estimate.qpos[frames]
+        by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
+        all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
+        by_pose = skinned_jacobian(fit.model, bones, points, all_bones, weights)
+        by_shape = skinned_shape_jacobian(self.shape, estimate.parameters, qpos, points, weights)
+        return by_pose, by_shape + by_point @ rest, by_point, by_bone
 
     def apply_step(
         self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
@@ -367,33 +380,6 @@ class Problem:
         return dataclasses.replace(
             estimate, parameters=parameters, points=points, coordinates=coordinates, qpos=qpos
         )
-
-
-def _point_jacobians(
-    model: HandModel,
-    T_world_bone: Float[np.ndarray, "T L 4 4"],
-    motions: Float[np.ndarray, "T L 3 4 53"],
-    points: Float[np.ndarray, "M 3"],
-    weights: Float[np.ndarray, "M 16"],
-    rest: Float[np.ndarray, "M 3 53"],
-) -> tuple[
-    Float[np.ndarray, "T M 3 26"],
-    Float[np.ndarray, "T M 3 53"],
-    Float[np.ndarray, "T M 3 3"],
-    Float[np.ndarray, "T M L 3"],
-]:
-    """Jacobians of skinned points by poses, parameters and rest points, and each bone's own points.
-
-    Args:
-        motions: From `motion_jacobian`.
-        rest: Jacobian of the rest points by the parameters.
-    """
-    by_point, by_bone = skinning_terms(model, T_world_bone, points, weights)
-    all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
-    by_pose = skinned_jacobian(model, T_world_bone, points, all_bones, weights)
-    shares = weights[:, :, None] * np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)[:, None]
-    by_shape = np.einsum("tlijs,mlj->tmis", motions, shares, optimize=True)
-    return by_pose, by_shape + by_point @ rest, by_point, by_bone
 
 
 def _part(corners: Corners, first: int, last: int) -> Corners:

@@ -18,7 +18,7 @@ from scipy import sparse
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.model import HandModel, Skeleton, bone_transforms, build_skeleton
+from handsim.hand.model import HandModel, bone_transforms, build_skeleton
 from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
 from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
 
@@ -74,6 +74,7 @@ def shape_jacobian(
     start: HandShape,
     parameters: Float[np.ndarray, "53"],
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
+    count: int = NUM_PARAMETERS,
 ) -> Float[np.ndarray, "*shape 53"]:
     """Derivative of a function of the shape by the parameters, by finite differences.
 
@@ -81,32 +82,38 @@ def shape_jacobian(
         start: Shape of zero parameters.
         parameters: Where to differentiate.
         function: Arrays that depend on shapes, one for each.
+        count: The first parameters, on which alone the function depends.
     """
-    nudged = parameters + _DIFFERENCE_STEP * np.eye(
-        1 + NUM_PARAMETERS, NUM_PARAMETERS, -1
-    )  # the first as it is
+    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # the first as it is
     values = function([shape_at(start, one) for one in nudged])
-    return np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
+    jacobian = np.zeros((*values.shape[1:], NUM_PARAMETERS))
+    jacobian[..., :count] = np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
+    return jacobian
 
 
-def motion_jacobian(
-    start: HandShape, parameters: Float[np.ndarray, "53"], qpos: Float[np.ndarray, "T 27"]
-) -> Float[np.ndarray, "T L 3 4 53"]:
-    """Derivative of `bone_motions` by the parameters, poses held fixed."""
+def skinned_shape_jacobian(
+    start: HandShape,
+    parameters: Float[np.ndarray, "53"],
+    qpos: Float[np.ndarray, "T 27"],
+    points: Float[np.ndarray, "M 3"],
+    weights: Float[np.ndarray, "M 16"],
+) -> Float[np.ndarray, "T M 3 53"]:
+    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed.
 
-    def motions(shapes: list[HandShape]) -> NDArray[np.float64]:
-        skeletons = [build_skeleton(shape) for shape in shapes]
-        return np.array([bone_motions(skeleton, bone_transforms(skeleton, qpos)) for skeleton in skeletons])
+    A longer bone moves all bones beyond it, in the pose and at rest.
+    """
+    homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
-    return shape_jacobian(start, parameters, motions)
+    def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
+        posed = np.empty((len(shapes), 3 * len(qpos), len(points)))
+        for row, shape in zip(posed, shapes, strict=True):
+            skeleton = build_skeleton(shape)
+            local = np.linalg.inv(skeleton.rest_transforms()) @ homogeneous.T  # (L, 4, M)
+            bones = bone_transforms(skeleton, qpos)[:, :, :3].swapaxes(1, 2).reshape(3 * len(qpos), -1)
+            row[:] = bones @ (weights.T[:, None] * local).reshape(-1, len(points))
+        return posed.reshape(len(shapes), len(qpos), 3, -1).swapaxes(2, 3)
 
-
-def bone_motions(
-    skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
-) -> Float[np.ndarray, "T L 3 4"]:
-    """Transforms of all bones from the rest hand to the posed one."""
-    motions: NDArray[np.float64] = (T_world_bone @ np.linalg.inv(skeleton.rest_transforms()))[:, :, :3]
-    return motions
+    return shape_jacobian(start, parameters, skinned, GIRTHS.start)
 
 
 def skinning_terms(
@@ -119,7 +126,7 @@ def skinning_terms(
 
     The hand is a right one, rest points [m] are in the wrist's frame.
     """
-    motion = bone_motions(model.skeleton, T_world_bone)
+    motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
     by_bone += motion[:, None, ..., 3]
