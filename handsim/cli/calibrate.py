@@ -46,13 +46,7 @@ def calibrate(
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("") as bar:
         user = captures.calibrate(
-            capture,
-            glove=glove,
-            hands=hands,
-            size=size,
-            labeler=labeler,
-            progress=bar,
-            on_step=bar.step,
+            capture, glove=glove, hands=hands, size=size, labeler=labeler, progress=bar, on_step=bar.step
         )
     user.save(out)
     print_line(f"{out}: {len(user)} hands in glove {glove}")
@@ -63,7 +57,7 @@ def calibrate(
 
 
 def _report(done: Calibration) -> list[str]:
-    """Held-out frames before and after, and suggestions for a better capture, as lines."""
+    """Lines on the held-out frames before and after, and suggestions for a better capture."""
     line = str(done)
     before, after = 1e3 * done.gaps()
     if done.is_better and np.isfinite(before):

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
-
-if TYPE_CHECKING:
-    from gloves.takes.take import Take
 
 
 def label(
@@ -43,16 +40,14 @@ def label(
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("frames") as bar:
-        take = label_capture(
-            capture,
-            glove=glove,
-            labeler=labeler,
-            progress=bar,
-        )
-    right, left = _hands_there(take)
-    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
-    points = take.point_list
+        take = label_capture(capture, glove=glove, labeler=labeler, progress=bar)
+    points, side_of = take.point_list, np.array([name.split(":")[0] for name in take.label_names])
     labeled = points.labels >= 0
+    sides = np.where(labeled, side_of[points.labels], "")
+    right, left = (
+        np.isin(np.arange(take.num_frames), points.frames[sides == side]) for side in ("right", "left")
+    )
+    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
         f"{out}: {take.num_frames} frames, {labeled.sum()} of {len(labeled)} points labeled{sure}; "
@@ -60,19 +55,8 @@ def label(
     )
 
 
-def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
-    """In which frames there is a right hand, and a left one."""
-    side_of = np.array([name.split(":")[0] for name in take.label_names])
-    points = take.point_list
-    own = np.where(points.labels >= 0, side_of[points.labels], "")
-    right, left = (
-        np.isin(np.arange(take.num_frames), points.frames[own == side]) for side in ("right", "left")
-    )
-    return right, left
-
-
 def _counts(right: Bool[np.ndarray, "T"], left: Bool[np.ndarray, "T"]) -> str:
-    """How many frames hold how many hands, and which."""
+    """The numbers of frames with two hands, one and none, in words."""
     counts = ((right & left, "two hands"), (right & ~left, "a right hand"), (left & ~right, "a left hand"))
     said = [f"{words} in {there.sum()} frames" for there, words in counts if there.any()]
     none = (~right & ~left).sum()

@@ -12,7 +12,7 @@ from handsim.app.messages import LiveStatus, print_line
 from handsim.files.signals import interrupt_flag
 from track.streams.natnet import COMMAND_PORT, ReplayServer, ReplaySettings
 
-_LOOK: Final = 0.1  # [s] between two looks at whether it shall end
+_PERIOD: Final = 0.1  # [s] between two status lines
 _USUAL: Final = ReplaySettings(port=COMMAND_PORT)
 
 
@@ -34,7 +34,7 @@ def replay(
         with LiveStatus() as status:
             while not (ended() or server.finished):
                 status.show(_status_line(server))
-                time.sleep(_LOOK)
+                time.sleep(_PERIOD)
         print_line(f"{server.sent} frames played")
 
 
