@@ -41,11 +41,12 @@ def label(
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("frames") as bar:
         take = label_capture(capture, glove=glove, labeler=labeler, progress=bar)
-    points, side_of = take.point_list, np.array([name.split(":")[0] for name in take.label_names])
+    points = take.point_list
     labeled = points.labels >= 0
-    sides = np.where(labeled, side_of[points.labels], "")
+    side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # -1 is the last one
+    sides = side_of[points.labels]
     right, left = (
-        np.isin(np.arange(take.num_frames), points.frames[sides == side]) for side in ("right", "left")
+        np.bincount(points.frames[sides == side], minlength=take.num_frames) > 0 for side in ("right", "left")
     )
     write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""

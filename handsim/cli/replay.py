@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
 from handsim.app.messages import LiveStatus, print_line
 from handsim.files.signals import interrupt_flag
-from track.streams.natnet import COMMAND_PORT, ReplayServer, ReplaySettings
+from track.streams import COMMAND_PORT, ReplaySettings
+
+if TYPE_CHECKING:
+    from track.streams.natnet import ReplayServer
 
 _PERIOD: Final = 0.1  # [s] between two status lines
 _USUAL: Final = ReplaySettings(port=COMMAND_PORT)
@@ -29,6 +32,8 @@ def replay(
             points and IDs are sent.
         settings: How to play it.
     """
+    from track.streams.natnet import ReplayServer
+
     with ReplayServer(capture, settings) as server, interrupt_flag() as ended:
         print_line(f"{capture}: {server.num_frames} frames at {server.rate:g} Hz on {server.url}")
         with LiveStatus() as status:

@@ -7,15 +7,14 @@ import warnings
 
 import pytest
 
-from gloves.layout import load_layout
-from handsim.errors import ArgumentError, HandSimWarning
-from track import hand_size
-from track.captures import label_capture, measure_hands, track_capture
+from gloves import load_layout
+from handsim import HandSimWarning
+from handsim.errors import ArgumentError
+from track import hand_size, label_capture, measure_hands, track_capture
 from track.frames import checked_frames
 from track.hand_size import check_scale, sample_frames
 from track.user import nominal_user
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from train import load_labeler, simulate_take
 
 FRAMES = 90
 

@@ -11,23 +11,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gloves.captures.capture import Capture
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import Capture, Status, Take
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions, rigid_fit
-from track.rigid_body import (
-    BodyError,
-    BodyFrame,
-    BodyTracker,
-    RigidTemplate,
-    learn_body,
-    load_bodies,
-    load_body,
-    save_body,
-)
-from train.simulation.takes import simulate_take
+from track import RigidTemplate
+from track.rigid_body import BodyError, BodyFrame, BodyTracker, learn_body, load_bodies, load_body, save_body
+from train import simulate_take
 
 NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0

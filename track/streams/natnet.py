@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,13 +28,11 @@ from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
-from handsim.settings import Limits, Settings
 from track.frames import StreamedFrame, read_points
-from track.streams import LOOPBACK, split_address
+from track.streams import COMMAND_PORT, ReplaySettings, split_address
 from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
-COMMAND_PORT: Final = 1510
 LARGEST: Final = 65507  # bytes of a UDP datagram
 OLDEST: Final[Version] = (3, 0)
 NEWEST: Final[Version] = (4, 1)
@@ -489,20 +487,6 @@ class PointFrames(Protocol):
     @property
     def rate(self) -> float:
         """Frames per second [Hz]."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReplaySettings(Settings):
-    """How a capture is played: keyword arguments of `ReplayServer`, and options of `handsim replay`."""
-
-    loop: bool = False
-    """Start again at the end, with later numbers and times, and with points of new IDs."""
-    rate: Annotated[float | None, Limits(0.0, above=True)] = None
-    """Frames per second [Hz]; the capture's own when not given."""
-    host: str = LOOPBACK
-    """Address of this machine to listen at; other machines do not reach the default."""
-    port: Annotated[int, Limits(0, 65535)] = 0
-    """UDP port to listen at; 0 takes a free one."""
 
 
 class ReplayServer(Closing):

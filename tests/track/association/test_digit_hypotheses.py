@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from gloves import attach, load_layout
+from handsim import HandModel, join_qpos
 from poses.shapes import resting_angles, sample_valid_angles
+from track import TrackerConfig
 from track.association.digit_hypotheses import (
     DigitHypotheses,
     DigitModel,
@@ -22,7 +22,6 @@ from track.association.digit_hypotheses import (
     fit_hypothesis,
 )
 from track.association.frame_state import peak_log_odds
-from track.config import TrackerConfig
 from track.kinematics.marker_kinematics import HandArrays, compute_markers, hand_arrays, workspace
 from track.kinematics.pose_solver import RESTING, PoseSolver
 from track.kinematics.pose_spread import digit_prior, predict_joints, predict_markers, resting_prior

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
+from handsim import join_qpos
 from poses.shapes import resting_angles
 from track.association.hand_state import MOST_AGE_LOG_ODDS, SEEN_ELSEWHERE, STRAY_LIFETIME, HandState
 

@@ -8,9 +8,9 @@ from scipy.cluster.hierarchy import fclusterdata
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
+from handsim import join_qpos
 from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles

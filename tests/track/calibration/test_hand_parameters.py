@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel
-from handsim.hand.shape import named_shape, sample_shape
+from handsim import HandModel, sample_shape
+from handsim.hand.shape import named_shape
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     SkinPatch,

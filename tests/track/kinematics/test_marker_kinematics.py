@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import SIDES, sample_shape
+from gloves import GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos, sample_shape
+from handsim.hand.model import skinned_jacobian
+from handsim.hand.shape import SIDES
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles

@@ -8,16 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
+from gloves import GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIDES, sample_shape
+from handsim.hand.shape import SIDES
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.motion import sample_motion
+from poses import sample_motion
 from poses.shapes import resting_angles, sample_valid_angles
-from track.kinematics.pose_solver import AnglePrior, PoseSolver, solve_pose
+from track import solve_pose
+from track.kinematics.pose_solver import AnglePrior, PoseSolver
 
 INDEX = slice(11, 15)  # of qpos
 

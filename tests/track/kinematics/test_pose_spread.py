@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import GloveFit, attach, nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, hand_keypoints
+from gloves import GloveFit, attach, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandModel
+from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import SIDES
-from poses.shapes import sample_poses
+from poses import sample_poses
 from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
