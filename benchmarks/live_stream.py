@@ -33,9 +33,9 @@ from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
 from gloves.takes.archives import GrownArchive
 from gloves.takes.take import Take, load_take
+from track.frames import StreamedFrame
 from track.recorder import Recorder
 from track.streams import LOOPBACK, natnet
-from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream
 from track.streams.natnet import Kind, ReplayServer, ServerInfo, open_stream
 from track.tracker import Tracker

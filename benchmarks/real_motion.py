@@ -32,8 +32,8 @@ from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import load_layout
 from track.captures import label_capture
+from track.frames import StreamedFrame
 from track.hand_size import fit_size, sample_frames
-from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 

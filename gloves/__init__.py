@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from gloves.layout import MarkerLayout as MarkerLayout
     from gloves.layout import MarkerPlace as MarkerPlace
     from gloves.layout import load_layout as load_layout
+    from gloves.optics.ghosts import GhostConfig as GhostConfig
+    from gloves.optics.reconstruction import OpticsConfig as OpticsConfig
     from gloves.takes.points import PointList as PointList
     from gloves.takes.points import Status as Status
     from gloves.takes.take import RigidBody as RigidBody

@@ -13,6 +13,7 @@ from handsim._imports import lazy_exports
 if TYPE_CHECKING:
     from poses.motion import MotionConfig as MotionConfig
     from poses.motion import sample_motion as sample_motion
+    from poses.shapes import PoseMix as PoseMix
     from poses.shapes import PoseSampler as PoseSampler
     from poses.shapes import load_gestures as load_gestures
     from poses.shapes import sample_poses as sample_poses

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from handsim.errors import HandSimError
+from handsim import HandSimError
 from handsim.files.signals import ENDING
 
 ROOT = Path(__file__).resolve().parents[1]

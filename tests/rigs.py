@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from handsim.space.camera import Camera, Lens, focal_of_angle, look_at, pinhole
-from handsim.space.rig import CameraRig
+from handsim import Camera, CameraRig, Lens, look_at
+from handsim.space.camera import focal_of_angle, pinhole
 
 
 def square_rig(name, poses, field_of_view=np.pi / 3, resolution=1280) -> CameraRig:

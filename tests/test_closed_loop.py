@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import true_users
-from gloves.captures.formats import read_capture, write_capture
-from gloves.takes.take import load_take
+from gloves import load_take, read_capture, write_capture
+from handsim import HandModel
 from handsim.cli.simulate import simulate
-from handsim.hand.model import HandModel, hand_keypoints
-from render import RenderConfig, draw
-from render.viewpoints import ViewConfig
-from track.captures import track_capture
-from train.simulation.takes import SimulateSettings
+from handsim.hand.model import hand_keypoints
+from render import RenderConfig, ViewConfig, draw
+from track import track_capture
+from train import SimulateSettings
 
 MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handsim.cli.main import main
-from train.simulation.generation import generate_dataset
+from train import generate_dataset
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "stored_arrays.md"
 ROW = re.compile(r"^\| `(\w+)` \| (\S+) \| \(([^)]*)\) \|", re.M)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from track.captures import measure_hands as measure_hands
     from track.captures import track_capture as track_capture
     from track.config import TrackerConfig as TrackerConfig
+    from track.frames import StreamedFrame as StreamedFrame
     from track.frames import TrackedBody as TrackedBody
     from track.frames import TrackedFrame as TrackedFrame
     from track.frames import TrackedHand as TrackedHand
@@ -41,10 +42,11 @@ if TYPE_CHECKING:
     from track.live_message import LiveSink as LiveSink
     from track.recorder import Recorder as Recorder
     from track.rigid_body import RigidTemplate as RigidTemplate
+    from track.settings import CalibrateSettings as CalibrateSettings
+    from track.settings import LabelSettings as LabelSettings
     from track.settings import TrackSettings as TrackSettings
     from track.sinks import SinkGroup as SinkGroup
     from track.sinks import open_sinks as open_sinks
-    from track.streams.frame_source import StreamedFrame as StreamedFrame
     from track.streams.live_stream import LiveStream as LiveStream
     from track.streams.live_stream import StreamSettings as StreamSettings
     from track.streams.live_stream import open_source as open_source

@@ -20,9 +20,8 @@ from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.hand.shape import NUM_QPOS
-from track.frames import TrackedHand
+from track.frames import StreamedFrame, TrackedHand
 from track.label_confidence import label_confidence
-from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 
 _WORTH: Final = 6.0  # log-odds of a point that lies exactly where its marker is, against a stray

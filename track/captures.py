@@ -31,18 +31,16 @@ from track.association.initialization import FEWEST_POINTS, label_alone
 from track.bidirectional_labeling import label_both_ways
 from track.config import BOTH
 from track.corrected_take import correct_take
-from track.frames import TrackedFrame
+from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
 from track.hand_size import measured_user, sample_frames
-from track.inputs import AnyCapture, AnyGlove, AnyLabeler, capture_of, labeler_of
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
 from track.sinks import SinkGroup
-from track.streams.frame_source import StreamedFrame, checked_frames
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
-from track.user import User, nominal_user
+from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other

@@ -1,4 +1,4 @@
-"""Pose of a rigid constellation of markers from assigned points, by IDs or near a known pose (numba kernels).
+"""Pose of a rigid constellation of markers from points: from assigned ones, or by distances between markers.
 
 Shapes: Q markers, N points. A pose is position [m] and orientation (wxyz) of the body's frame in the world,
 seven numbers. An assignment (Q,) holds the index of each marker's point, -1 for a marker without a point.
@@ -7,26 +7,40 @@ Arrays of floats are contiguous float64, arrays of integers int64.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.kernels import align_rigid, kernel, quaternion_product, squared_distance, write_quaternion_matrix
+from handsim.kernels import align_rigid, kernel, squared_distance, write_quaternion_matrix
 
 FEWEST: Final = 3
 """Markers that determine a pose."""
-_NEW: Final = 1.5  # gate of a point with a new ID, over the tight gate
+_NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, over the tight gate
+# Height of a triangle over its longest side, below which it determines no rotation.
+_LEAST_TRIANGLE_HEIGHT: Final = 0.1
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class _Search(NamedTuple):
+    """The arrays of a search, and the best match so far."""
+
+    positions: Floats  # markers in the body's frame (Q, 3) [m]
+    distances: Floats  # between markers (Q, Q) [m]
+    points: Floats  # points in the world (N, 3) [m]
+    apart: Floats  # distances between points (N, N) [m]
+    near: NDArray[np.bool_]  # whether a point is near enough to a marker's expected position (Q, N)
+    gate: float  # largest residual of a point after the fit [m]
+    assignment: Ints  # the best one (Q,)
+    pose: Floats  # its pose (7,)
+    score: Floats  # number of its markers, its RMS distance [m], number of markers in the best other one
 
 
 @kernel
 def fit_inliers(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-    tight: float,
-    gate: float,
+    positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
 ) -> tuple[int, float]:
     """Fit the pose to the assigned points that agree tightly, and keep those within the gate of it.
 
@@ -34,6 +48,8 @@ def fit_inliers(
     without which the others fit best is removed, one at a time, until all agree.
 
     Args:
+        positions: Markers in the body's frame (Q, 3) [m].
+        points: Points in the world (N, 3) [m].
         assignment: Points that are not kept are overwritten by -1.
         pose: Overwritten; left as it is when fewer than three points agree.
         tight: Largest residual of the points that determine the pose [m].
@@ -67,12 +83,7 @@ def fit_inliers(
 
 
 @kernel
-def _fit_pose(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-) -> tuple[int, float, float]:
+def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats) -> tuple[int, float, float]:
     """Fit the pose to all assigned points; their number, and sum and largest of their squares [m^2]."""
     target, count = np.full_like(positions, np.nan), 0
     for marker in range(len(positions)):
@@ -91,9 +102,7 @@ def _fit_pose(
 
 
 @kernel
-def _worst_outlier(
-    positions: NDArray[np.float64], points: NDArray[np.float64], assignment: NDArray[np.int64]
-) -> tuple[int, bool]:
+def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple[int, bool]:
     """The marker without which the others fit best, and whether they do ten times better than otherwise.
 
     `assignment` (Q,) is changed and restored.
@@ -112,34 +121,8 @@ def _worst_outlier(
 
 
 @kernel
-def assign_by_id(
-    points: NDArray[np.float64],
-    ids: NDArray[np.int64],
-    last_ids: NDArray[np.int64],
-    assignment: NDArray[np.int64],
-) -> int:
-    """Assign to every marker the point that has its ID of the last frame, -1 for none; how many have one."""
-    count = 0
-    for marker in range(len(last_ids)):
-        assignment[marker] = -1
-        if last_ids[marker] < 0:
-            continue
-        for point in range(len(points)):
-            if ids[point] == last_ids[marker]:
-                assignment[marker] = point
-                count += 1
-                break
-    return count
-
-
-@kernel
 def assign_remaining(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-    tight: float,
-    gate: float,
+    positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
 ) -> tuple[int, float]:
     """Assign to the other markers of a known pose the free points nearby, and fit again.
 
@@ -148,14 +131,12 @@ def assign_remaining(
     predicted = transform_markers(positions, pose)
     for marker in range(len(positions)):
         if assignment[marker] < 0:
-            assignment[marker] = nearest_free(points, predicted[marker], _NEW * tight, assignment)
+            assignment[marker] = _nearest_free(points, predicted[marker], _NEW_ID_FACTOR * tight, assignment)
     return fit_inliers(positions, points, assignment, pose, tight, gate)
 
 
 @kernel
-def nearest_free(
-    points: NDArray[np.float64], center: NDArray[np.float64], radius: float, assignment: NDArray[np.int64]
-) -> int:
+def _nearest_free(points: Floats, center: Floats, radius: float, assignment: Ints) -> int:
     """The nearest point within a radius [m] of a center (3,) that no marker has, -1 if there is none."""
     nearest, least = -1, radius * radius
     for point in range(len(points)):
@@ -166,160 +147,67 @@ def nearest_free(
 
 
 @kernel
-def shift_to_points(
-    points: NDArray[np.float64],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    gate: float,
-) -> tuple[int, float]:
-    """Shift a predicted pose to the one or two points that are assigned, if they agree with it; else none is.
-
-    The gate is the largest shift, and the largest residual after it [m]. Returns how many points agree, and
-    their RMS distance from their markers [m].
-    """
-    shift, count = np.zeros(3), 0
-    for marker in range(len(assignment)):
-        if assignment[marker] >= 0:
-            shift += points[assignment[marker]] - predicted[marker]
-            count += 1
-    total, agree = 0.0, count > 0
-    for marker in range(len(assignment)):
-        if assignment[marker] >= 0:
-            square = squared_distance(points[assignment[marker]], predicted[marker] + shift / count)
-            total += square
-            agree = agree and square <= gate * gate
-    if not agree or (shift**2).sum() > (count * gate) ** 2:
-        assignment[:] = -1
-        return 0, np.nan
-    pose[:3] += shift / count
-    return count, np.sqrt(total / count)
-
-
-@kernel
 def track_by_ids(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    ids: NDArray[np.int64],
-    last_ids: NDArray[np.int64],
-    pose: NDArray[np.float64],
+    positions: Floats,
+    points: Floats,
+    ids: Ints,
+    last_ids: Ints,
+    pose: Floats,
     tight: float,
     gate: float,
-    assignment: NDArray[np.int64],
+    assignment: Ints,
 ) -> tuple[int, float]:
     """Assign points by the IDs of the last frame, fit the pose, and assign the rest from it.
 
-    Arguments and result are those of `assign_by_id` and `fit_inliers`.
+    `last_ids` (Q,) are -1 for markers that had no point. The other arguments and the result are those of
+    `fit_inliers`; the assignment is filled.
     """
-    if assign_by_id(points, ids, last_ids, assignment) < FEWEST:
+    found = 0
+    for marker in range(len(last_ids)):
+        assignment[marker] = -1
+        for point in range(len(points)):
+            if last_ids[marker] >= 0 and ids[point] == last_ids[marker]:
+                assignment[marker] = point
+                found += 1
+                break
+    if found < FEWEST:
         return 0, np.nan
     count, rms = fit_inliers(positions, points, assignment, pose, tight, gate)
     if FEWEST <= count < len(positions):
-        fitted: tuple[int, float] = assign_remaining(positions, points, assignment, pose, tight, gate)
-        return fitted
+        count, rms = assign_remaining(positions, points, assignment, pose, tight, gate)
     return count, rms
 
 
 @kernel
-def write_labels(
-    assignment: NDArray[np.int64],
-    ids: NDArray[np.int64],
-    labels: NDArray[np.int64],
-    last_ids: NDArray[np.int64],
-) -> None:
-    """Write an assignment as labels of its points, and as last IDs of its markers, -1 for none."""
-    for marker in range(len(assignment)):
-        last_ids[marker] = -1
-        if assignment[marker] >= 0:
-            labels[assignment[marker]] = marker
-            last_ids[marker] = ids[assignment[marker]]
-
-
-@kernel
-def write_transform(pose: NDArray[np.float64], transform: NDArray[np.float64]) -> None:
-    """Write a pose (7,) as a matrix (4, 4), whose last row is left as it is."""
-    write_quaternion_matrix(transform, pose[3], pose[4], pose[5], pose[6])
-    transform[0, 3], transform[1, 3], transform[2, 3] = pose[0], pose[1], pose[2]
-
-
-@kernel
-def transform_markers(positions: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Markers in the world (Q, 3) [m].
-
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        pose: Pose of the body (7,).
-    """
-    transform, moved = np.empty((4, 4)), np.empty_like(positions)
-    write_transform(pose, transform)
+def transform_markers(positions: Floats, pose: Floats) -> Floats:
+    """Markers in the world (Q, 3) [m] of those in the body's frame."""
+    rotation, moved = np.empty((3, 3)), np.empty_like(positions)
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     for marker in range(len(positions)):
         for i in range(3):
-            moved[marker, i] = transform[i, 3]
+            moved[marker, i] = pose[i]
             for j in range(3):
-                moved[marker, i] += transform[i, j] * positions[marker, j]
+                moved[marker, i] += rotation[i, j] * positions[marker, j]
     return moved
 
 
 @kernel
-def predict_pose(
-    pose: NDArray[np.float64], velocity: NDArray[np.float64], seconds: float
-) -> NDArray[np.float64]:
-    """The pose (7,) after some time at constant velocity.
-
-    Args:
-        pose: Pose now (7,).
-        velocity: Linear [m/s] and angular [rad/s] velocity in world axes (6,).
-    """
-    later = pose.copy()
-    later[:3] += seconds * velocity[:3]
-    half = 0.5 * seconds * velocity[3:]
-    angle = np.sqrt((half**2).sum())
-    if angle > 1e-12:
-        sine, cosine = np.sin(angle) / angle, np.cos(angle)
-        later[3], later[4], later[5], later[6] = quaternion_product(
-            cosine, sine * half[0], sine * half[1], sine * half[2], pose[3], pose[4], pose[5], pose[6]
-        )
-    return later
-
-
-@kernel
-def velocity_between(
-    first: NDArray[np.float64], second: NDArray[np.float64], seconds: float
-) -> NDArray[np.float64]:
-    """The velocity (6,) with which `predict_pose` goes from the first pose (7,) to the second."""
-    velocity = np.empty(6)
-    velocity[:3] = (second[:3] - first[:3]) / seconds
-    rotation = np.empty(4)
-    rotation[0], rotation[1], rotation[2], rotation[3] = quaternion_product(
-        second[3], second[4], second[5], second[6], first[3], -first[4], -first[5], -first[6]
-    )
-    if rotation[0] < 0.0:  # the same rotation by the shorter way
-        rotation = -rotation
-    sine = np.sqrt((rotation[1:] ** 2).sum())
-    velocity[3:] = rotation[1:] * (
-        2.0 / seconds if sine < 1e-12 else 2.0 * np.arctan2(sine, rotation[0]) / sine / seconds
-    )
-    return velocity
-
-
-_FLAT: Final = 0.1  # height of a triangle over its longest side, below which it determines no rotation
-
-
-@kernel
 def search_constellation(
-    positions: NDArray[np.float64],
-    distances: NDArray[np.float64],
-    points: NDArray[np.float64],
-    expected: NDArray[np.float64],
+    positions: Floats,
+    distances: Floats,
+    points: Floats,
+    expected: Floats,
     radius: float,
     gate: float,
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
+    assignment: Ints,
+    pose: Floats,
 ) -> tuple[int, float, int]:
     """The largest set of points in the markers' constellation, from every triangle that fits.
 
     Args:
+        positions: Markers in the body's frame (Q, 3) [m].
         distances: Distances between markers (Q, Q) [m].
+        points: Points in the world (N, 3) [m].
         expected: Expected positions of the markers in the world (Q, 3) [m].
         radius: Largest distance from there [m]; infinite when nothing is known.
         gate: Largest residual of a point after the fit [m].
@@ -341,89 +229,58 @@ def search_constellation(
             )
     slack, score = 2.0 * gate, np.array([0.0, np.inf, 0.0])
     assignment[:] = -1
+    search = _Search(positions, distances, points, apart, near, gate, assignment, pose, score)
     for a in range(len(positions) - 2):
         for b in range(a + 1, len(positions) - 1):
             for i in range(len(points)):
                 for j in range(len(points)):
                     fits = near[a, i] and near[b, j] and abs(apart[i, j] - distances[a, b]) <= slack
                     if fits and i != j:
-                        side = a, b, i, j
-                        _try_triangles(
-                            positions, distances, points, apart, near, gate, side, assignment, pose, score
-                        )
+                        _try_triangles(search, a, b, i, j)
     return int(score[0]), score[1], int(score[2])
 
 
 @kernel
-def _try_triangles(
-    positions: NDArray[np.float64],
-    distances: NDArray[np.float64],
-    points: NDArray[np.float64],
-    apart: NDArray[np.float64],
-    near: NDArray[np.bool_],
-    gate: float,
-    side: tuple[int, int, int, int],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-    score: NDArray[np.float64],
-) -> None:
-    """Try every triangle of a side (two markers and their points) that fits and a later marker.
-
-    `apart` are distances between points (N, N) [m], `near` is whether a point is near enough to a marker's
-    expected position (Q, N); the others are those of `_keep_better`.
-    """
-    a, b, i, j = side
-    trial, slack = np.empty_like(assignment), 2.0 * gate
-    for c in range(b + 1, len(positions)):
-        for k in range(len(points)):
+def _try_triangles(search: _Search, a: int, b: int, i: int, j: int) -> None:
+    """Try every triangle that fits of a side (markers a and b, points i and j) and a later marker."""
+    trial, slack = np.empty_like(search.assignment), 2.0 * search.gate
+    apart, distances = search.apart, search.distances
+    for c in range(b + 1, len(search.positions)):
+        for k in range(len(search.points)):
             if abs(apart[i, k] - distances[a, c]) > slack or abs(apart[j, k] - distances[b, c]) > slack:
                 continue
-            if near[c, k] and k != i and k != j:  # noqa: PLR1714  a tuple costs a kernel time
+            if search.near[c, k] and k != i and k != j:  # noqa: PLR1714  a tuple costs a kernel time
                 trial[:] = -1
                 trial[a], trial[b], trial[c] = i, j, k
-                if _extend_triangle(positions, points, slack, trial, a, b, c) >= max(score[0], FEWEST):
-                    _keep_better(positions, points, gate, trial, assignment, pose, score)
+                least = max(search.score[0], FEWEST)
+                if _extend_triangle(search.positions, search.points, slack, trial, a, b, c) >= least:
+                    _keep_better(search, trial)
 
 
 @kernel
-def _keep_better(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    gate: float,
-    trial: NDArray[np.int64],
-    assignment: NDArray[np.int64],
-    pose: NDArray[np.float64],
-    score: NDArray[np.float64],
-) -> None:
+def _keep_better(search: _Search, trial: Ints) -> None:
     """Keep a trial assignment if it has more markers than the best so far, or as many that fit better.
 
-    Points that do not fit are removed from the trial. `score` (3,) is the number of markers in the best
-    assignment, its RMS distance [m], and the number of markers in the best other assignment; one that shares
-    three pairs with the best is not another one.
+    Points that do not fit are removed from the trial. One that shares three pairs with the best assignment is
+    not another one.
     """
-    trial_pose = np.empty(7)
-    count, rms = fit_inliers(positions, points, trial, trial_pose, gate, gate)
+    pose, score = np.empty(7), search.score
+    count, rms = fit_inliers(search.positions, search.points, trial, pose, search.gate, search.gate)
     if count < max(score[0], FEWEST):
         return
-    other = ((trial >= 0) & (trial == assignment)).sum() < FEWEST
+    other = ((trial >= 0) & (trial == search.assignment)).sum() < FEWEST
     if count > score[0] or rms < score[1]:
         if other:
             score[2] = score[0]
         score[0], score[1] = count, rms
-        assignment[:], pose[:] = trial, trial_pose
+        search.assignment[:], search.pose[:] = trial, pose
     elif other:
         score[2] = count
 
 
 @kernel
 def _extend_triangle(
-    positions: NDArray[np.float64],
-    points: NDArray[np.float64],
-    slack: float,
-    assignment: NDArray[np.int64],
-    a: int,
-    b: int,
-    c: int,
+    positions: Floats, points: Floats, slack: float, assignment: Ints, a: int, b: int, c: int
 ) -> int:
     """Assign to the other markers the free points where a triangle of markers predicts them.
 
@@ -438,18 +295,13 @@ def _extend_triangle(
     for marker in range(len(positions)):
         if assignment[marker] < 0:
             predicted = points[assignment[a]] + rotation @ (positions[marker] - positions[a])
-            assignment[marker] = nearest_free(points, predicted, slack, assignment)
+            assignment[marker] = _nearest_free(points, predicted, slack, assignment)
             count += assignment[marker] >= 0
     return count
 
 
 @kernel
-def _triangle_axes(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    third: NDArray[np.float64],
-    axes: NDArray[np.float64],
-) -> bool:
+def _triangle_axes(first: Floats, second: Floats, third: Floats, axes: Floats) -> bool:
     """Write the axes of a triangle as rows: first side, in its plane, normal; False where it is too flat."""
     along, across = second - first, third - first
     length = np.sqrt((along**2).sum())
@@ -460,4 +312,4 @@ def _triangle_axes(
     axes[2, 0] = axes[0, 1] * axes[1, 2] - axes[0, 2] * axes[1, 1]
     axes[2, 1] = axes[0, 2] * axes[1, 0] - axes[0, 0] * axes[1, 2]
     axes[2, 2] = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
-    return bool(length > 0.0 and height > _FLAT * length)
+    return bool(length > 0.0 and height > _LEAST_TRIANGLE_HEIGHT * length)

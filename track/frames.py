@@ -1,25 +1,33 @@
-"""Frames of a stream: checked before anything relies on them, and as the tracker gives them back.
+"""Frames of points: those of a capture, checked before anything relies on them, and as they are tracked.
 
 A bad frame does not stop a stream. What cannot be used is left out, and a note says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, NamedTuple, Protocol, cast
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from gloves.captures.capture import Capture, check_place, check_unit
+from gloves.captures.formats import READABLE, read_capture
+from gloves.optics.reconstruction import number_runs
 from gloves.takes.points import Status
-from handsim._checks import check_type, shown_value
+from gloves.takes.take import Take, load_take
+from handsim._checks import shown_value
 from handsim.errors import ArgumentError
 from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
 
+AnyCapture = Capture | Take | str | Path
+"""A capture, or a take, of which only the points are used; or the path of one."""
 FARTHEST: Final = 1e3
 """Largest coordinate of a point [m]; no capture volume is larger."""
 LATEST_TIME: Final = 1e11
@@ -28,6 +36,83 @@ _USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own; us
 _INTERVAL_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
 _SHORTEST_INTERVAL: Final = 0.1  # of the usual interval, at least between two frames on the tracker's clock
 _LONGEST_INTERVAL: Final = 2.0  # of the usual interval, which counts in it at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamedFrame:
+    """The points of one frame."""
+
+    number: int
+    """The server's number of the frame."""
+    time: float
+    """The server's time [s]."""
+    points: Float[np.ndarray, "N 3"]
+    """[m], in the server's axes."""
+    ids: Int[np.ndarray, "N"]
+    """The server's ID of each point, -1 where it gives none."""
+    silent: bool = False
+    """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
+    restarted: bool = False
+    """The server's time began anew: it does not continue that of the frame before."""
+    arrived: float = math.nan
+    """Monotonic time of its arrival on this machine [s]; NaN where it did not come live."""
+
+
+def capture_of(capture: AnyCapture) -> Capture:
+    """The points of a capture or a take, without labels.
+
+    Raises:
+        CaptureError: The file is missing, damaged or of another kind.
+    """
+    if isinstance(capture, str | Path):
+        capture = read_points(capture)
+    if not isinstance(capture, Capture | Take):
+        names = ", ".join((*READABLE, ".npz"))
+        raise ArgumentError(
+            f"capture is {shown_value(capture)}, expected a Capture, a Take, or the path of a file; valid "
+            f"names: {names}"
+        )
+    return capture if isinstance(capture, Capture) else capture.capture()
+
+
+def read_points(path: str | Path) -> Capture | Take:
+    """The capture or take of a file.
+
+    Raises:
+        CaptureError: The file is missing, damaged or of another kind.
+    """
+    if str(path).lower().endswith((".npz", ".npz.part")):
+        return load_take(path)
+    return read_capture(path)
+
+
+def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
+    """The frames of a capture as of a stream: points [m], IDs and times [s].
+
+    Marker files have no IDs. Every format that is read has one column per trajectory, so a column is an ID
+    for as long as it has a point. After a gap it is a new ID, because a column of unlabeled points may
+    continue with another marker. Column names are not used.
+    """
+    present = np.isfinite(capture.positions[..., 0])
+    ids = number_runs(present)
+    for number, (points, seen) in enumerate(zip(capture.positions, present, strict=True)):
+        yield StreamedFrame(number, number / capture.rate, points[seen], ids[number, seen])
+
+
+def checked_frames(capture: Capture) -> list[StreamedFrame]:
+    """The frames of a capture, if their points can be hands' markers.
+
+    Args:
+        capture: Positions (T, N, 3) [m].
+
+    Raises:
+        ArgumentError: The capture is not in meters.
+        CaptureError: Most of its points are far from any room.
+    """
+    frames = list(capture_frames(capture))
+    check_unit([frame.points for frame in frames])
+    check_place(capture, FARTHEST)
+    return frames
 
 
 class IncomingFrame(NamedTuple):
@@ -71,8 +156,9 @@ class FrameValidator:
         if ids.ndim != 1 or points.shape != (len(ids), 3):
             count = ids.size
             raise ArgumentError(f"points have shape {points.shape}, expected ({count}, 3) for {count} IDs")
-        check_type("time", time, (int, float, np.integer, np.floating), "the time of the frame in seconds")
-        stamp = float(cast("float", time))
+        if not isinstance(time, int | float | np.integer | np.floating):
+            raise ArgumentError(f"time is {shown_value(time)}, expected the time of the frame in seconds")
+        stamp = float(time)
         notes = self._tick(stamp)
         with np.errstate(invalid="ignore"):
             usable = np.abs(points).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not

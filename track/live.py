@@ -20,11 +20,10 @@ from gloves.takes.take import Take, load_take
 from handsim.app.messages import LiveStatus
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
-from track.frames import FARTHEST, TrackedFrame
+from track.frames import FARTHEST, StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
-from track.streams.frame_source import StreamedFrame
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 from track.tracker import warm_up
 

@@ -22,9 +22,8 @@ from handsim import __version__
 from handsim._plugins import import_extra
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import JOINT_NAMES, Side
-from track.frames import TrackedFrame, TrackedHand
+from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""

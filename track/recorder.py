@@ -31,8 +31,7 @@ from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import remove_abandoned
 from handsim.files.signals import interrupt_behind
-from track.frames import FARTHEST, LATEST_TIME, TrackedFrame
-from track.streams.frame_source import StreamedFrame
+from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary

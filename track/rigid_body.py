@@ -26,39 +26,46 @@ from handsim.errors import ArgumentError, CalibrationError, HandSimError, choice
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import SIDES
+from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
 from track.constellation import (
     FEWEST,
-    assign_by_id,
     assign_remaining,
     fit_inliers,
-    predict_pose,
     search_constellation,
-    shift_to_points,
     track_by_ids,
     transform_markers,
-    velocity_between,
-    write_labels,
-    write_transform,
 )
-from track.streams.frame_source import StreamedFrame, capture_frames
+from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
 _TIGHT: Final = 0.001  # [m], the same for points that determine the pose, and in a search
 _TIGHTEST: Final = 0.0005  # [m], the same in a search that finds three points, which may fit by chance
-_THINNEST: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
-_CLOSEST: Final = 2.0 * GATE  # [m]: markers nearer to each other than this could exchange labels
+_LEAST_WIDTH: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
+_LEAST_MARKER_DISTANCE: Final = (
+    2.0 * GATE
+)  # [m]: markers nearer to each other than this could exchange labels
 _LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
 _VELOCITY_FITS: Final = 5  # consecutive fits from which the velocity is known
-_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
+_VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
 _LONGEST_PREDICTION: Final = 0.25  # [s] without a fit, after which the body may be anywhere
 _FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius without a known velocity
 _RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with one
 _CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers are accepted at once
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
-_MOST_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
+_MOST_SEARCHED_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
 _FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
+SUFFIX: Final = ".toml"
+_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
+_BODY_KEYS: Final = ("name", "description", "marker")
+_MARKER_KEYS: Final = ("name", "place_mm")
+_MOST_LEARNED_MARKERS: Final = 20
+_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
+_TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
+_AVERAGING_ROUNDS: Final = 3  # of averaging the markers over all frames
+_LEAST_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
+_LEAST_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,26 +101,21 @@ class RigidTemplate(RigidBody):
 def template_fault(
     name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
 ) -> str | None:
-    """Why these markers are not a body that can be tracked, as a sentence; None if they are.
-
-    Args:
-        marker_names: Names of its Q markers.
-        positions: Markers in the body's frame [m].
-    """
+    """Why these markers [m] are not a body that can be tracked, as a sentence; None if they are."""
     if positions.ndim != 2 or len(positions) < FEWEST:
         return f"{name}: {positions.shape[-2]} markers, expected at least {FEWEST}, which determine a pose"
     if len(set(marker_names)) < len(marker_names):
         return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
     distances = _distances_between(positions)
     apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
-    if apart.min() < _CLOSEST:
+    if apart.min() < _LEAST_MARKER_DISTANCE:
         first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
         return (
             f"{name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
-            f"{1e3 * _CLOSEST:.0f} mm"
+            f"{1e3 * _LEAST_MARKER_DISTANCE:.0f} mm"
         )
     off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
-    if off_line < _THINNEST * np.sqrt(len(positions)):
+    if off_line < _LEAST_WIDTH * np.sqrt(len(positions)):
         return f"{name}: its markers lie on one line, expected three that do not"
     order = _symmetry(positions, distances)
     if order is not None:
@@ -238,7 +240,7 @@ class BodyTracker:
             self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
         )
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
-            predicted = predict_pose(self._pose, self._velocity, elapsed)
+            predicted = self._predict(elapsed)
             count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
         if count < FEWEST:
             return None
@@ -254,10 +256,19 @@ class BodyTracker:
         """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
         if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
-        pose = predict_pose(self._pose, self._velocity, elapsed)
-        assignment = np.empty(len(self._positions), dtype=np.int64)
-        assign_by_id(points, ids, self._last_ids, assignment)
-        _, rms = shift_to_points(points, assignment, pose, transform_markers(self._positions, pose), GATE)
+        pose = self._predict(elapsed)
+        there = (self._last_ids[:, None] == ids) & (ids >= 0)
+        assignment, rms = np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1), np.nan
+        seen = np.flatnonzero(assignment >= 0)
+        if len(seen):  # one or two points shift the body, if they agree with its pose
+            off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
+            shift = off.mean(axis=0)
+            distances = np.linalg.norm(off - shift, axis=1)
+            if max(distances.max(), np.linalg.norm(shift)) <= GATE:
+                pose[:3] += shift
+                rms = float(np.sqrt((distances**2).mean()))
+            else:
+                assignment[:] = -1
         self._status = Status.COASTING
         return self._result(pose, rms, assignment, ids)
 
@@ -269,7 +280,7 @@ class BodyTracker:
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius, predicted = (
                 self._search_radius(elapsed),
-                predict_pose(self._pose, self._velocity, elapsed),
+                self._predict(elapsed),
             )
             count, rms = self._match(points, predicted, radius, assignment, pose)
             if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
@@ -286,6 +297,10 @@ class BodyTracker:
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
+
+    def _predict(self, elapsed: float) -> NDArray[np.float64]:
+        """The pose after some time [s] at constant velocity."""
+        return move(self._pose[None], elapsed * self._velocity[None])[0]  # type: ignore[no-any-return]
 
     def _search_radius(self, elapsed: float) -> float:
         """Largest distance of a marker from its predicted position [m]."""
@@ -305,7 +320,7 @@ class BodyTracker:
 
         Returns the number of markers that match, 0 if there is no unique match, and their RMS distance [m].
         """
-        if len(points) > _MOST_POINTS:
+        if len(points) > _MOST_SEARCHED_POINTS:
             return 0, np.nan
         expected = self._positions if near is None else transform_markers(self._positions, near)
         count, _, rival = search_constellation(
@@ -333,8 +348,8 @@ class BodyTracker:
         if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _LONGEST_PREDICTION:
-            weight = _SMOOTHING if self._fits > 1 else 1.0
-            self._velocity += weight * (velocity_between(self._pose, pose, elapsed) - self._velocity)
+            weight = _VELOCITY_SMOOTHING if self._fits > 1 else 1.0
+            self._velocity += weight * (velocity_of(self._pose, pose, elapsed) - self._velocity)
         self._fits += 1
         self._pose, self._time, self._status = pose, time, status
         self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
@@ -344,9 +359,12 @@ class BodyTracker:
         self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> BodyFrame:
         """The result of a fit; the IDs are kept for the next frame."""
-        labels, transform = np.full(len(ids), -1), np.eye(4)
-        write_labels(assignment, ids, labels, self._last_ids)
-        write_transform(pose, transform)
+        seen, labels, transform = np.flatnonzero(assignment >= 0), np.full(len(ids), -1), np.eye(4)
+        labels[assignment[seen]] = seen
+        self._last_ids[:] = -1
+        self._last_ids[seen] = ids[assignment[seen]]
+        write_quaternion_matrix(transform, *pose[3:])
+        transform[:3, 3] = pose[:3]
         return BodyFrame(self._status, transform, labels, rms)
 
 
@@ -362,12 +380,8 @@ def _frames_to_confirm(count: int, markers: int) -> float:
     return 2 if count == FEWEST + 1 < markers else 1
 
 
-SUFFIX: Final = ".toml"
 AnyBody = RigidTemplate | str | Path
 """A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
-_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
-_BODY_KEYS: Final = ("name", "description", "marker")
-_MARKER_KEYS: Final = ("name", "place_mm")
 
 
 class BodyError(HandSimError):
@@ -458,14 +472,6 @@ def _printable(what: str, name: str) -> str:
     return name
 
 
-_MOST_MARKERS: Final = 20
-_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
-_CANDIDATES: Final = 5  # frames that are tried as the first template
-_ROUNDS: Final = 3  # of averaging the markers over all frames
-_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
-_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
-
-
 def learn_body(capture: Capture, name: str) -> RigidTemplate:
     """The markers of a body from a capture of it; the origin of its frame is the mean of its markers.
 
@@ -485,12 +491,12 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
     counts = np.array([len(frame.points) for frame in frames])
     body, tracked = _best_template(name, frames, counts)
     labeled = _num_labeled(tracked)
-    if labeled < _LABELED_SHARE * counts.sum():
+    if labeled < _LEAST_LABELED_SHARE * counts.sum():
         raise CalibrationError(
             f"{100.0 * labeled / counts.sum():.0f} % of the points keep their positions on one rigid body, "
             "expected a capture with nothing else in it"
         )
-    for _ in range(_ROUNDS):
+    for _ in range(_AVERAGING_ROUNDS):
         positions = _median_positions(body, frames, tracked)
         fault = _fault(name, positions)
         if fault is not None:
@@ -505,12 +511,13 @@ def _best_template(
 ) -> tuple[RigidTemplate, list[BodyFrame]]:
     """Of several frames' points the template that labels most points, and its track through all frames."""
     count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
-    if not 3 <= count <= _MOST_MARKERS:
+    if not 3 <= count <= _MOST_LEARNED_MARKERS:
         raise CalibrationError(
-            f"a capture of {count} points per frame, expected 3 to {_MOST_MARKERS}: one body and nothing else"
+            f"a capture of {count} points per frame, expected 3 to {_MOST_LEARNED_MARKERS}: one body and "
+            "nothing else"
         )
     chosen = np.flatnonzero(counts == count)
-    chosen = chosen[np.linspace(0, len(chosen) - 1, _CANDIDATES).round().astype(int)]
+    chosen = chosen[np.linspace(0, len(chosen) - 1, _TEMPLATE_CANDIDATES).round().astype(int)]
     candidates = []
     faults = {number: _fault(name, frames[number].points) for number in np.unique(chosen)}
     for number, fault in faults.items():
@@ -556,6 +563,6 @@ def _median_positions(
             rotation, translation = one.T_world_body[:3, :3], one.T_world_body[:3, 3]
             seen[number, one.labels[labeled]] = (frame.points[labeled] - translation) @ rotation
     present = np.isfinite(seen[..., 0])
-    kept = present.sum(axis=0) >= _SEEN_SHARE * present.any(axis=1).sum()
+    kept = present.sum(axis=0) >= _LEAST_SEEN_SHARE * present.any(axis=1).sum()
     median: NDArray[np.float64] = np.nanmedian(seen[:, kept], axis=0)
     return median

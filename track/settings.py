@@ -15,13 +15,11 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
 from track.config import BOTH, Size, TrackerConfig
-from track.hand_check import check_hands, check_scale
-from track.hand_size import measured_user
-from track.inputs import AnyGlove, AnyLabeler, labeler_of
+from track.frames import StreamedFrame
+from track.hand_size import check_hands, check_scale, measured_user
 from track.rigid_body import AnyBody, RigidTemplate, load_bodies
-from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from track.user import User, as_user, nominal_user
+from track.user import AnyGlove, AnyLabeler, User, as_user, labeler_of, nominal_user
 from train.labelers.protocol import Labeler
 
 AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path

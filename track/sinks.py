@@ -28,7 +28,7 @@ from handsim._checks import check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
-from track.frames import TrackedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.live_message import (
     FORMATS,
     SCHEMA,
@@ -41,7 +41,6 @@ from track.live_message import (
 )
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
-from track.streams.frame_source import StreamedFrame
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

@@ -35,9 +35,8 @@ from track.association.label_consistency import (
 from track.association.label_new_points import SETTLED_EVIDENCE, digit_table, label_new_points
 from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
-from track.inputs import AnyLabeler, labeler_of
 from track.rigid_body import BodyTracker, RigidTemplate
-from track.user import User, as_user
+from track.user import AnyLabeler, User, as_user, labeler_of
 from train.labelers.protocol import Labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance

@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
-from gloves.layout import MarkerLayout, stored_layout
+from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.inputs import read_bytes
@@ -22,7 +22,12 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, Size
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
 
+AnyGlove = MarkerLayout | str | Path
+AnyLabeler = Labeler | str | Path | None
+"""A labeler, what `load_labeler` reads, or None for the one of the glove."""
 SCHEMA: Final = 1
 MEASURED: Final = "auto, "
 """How the notes on hands begin whose size was measured; the size follows."""
@@ -274,3 +279,17 @@ def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> GloveFit:
     }
     markers = {name: np.asarray(stored["markers"][name], dtype) for name, dtype in _ARRAYS.items()}
     return GloveFit(HandModel(HandShape(**values)), Attachment(layout, **markers))
+
+
+def labeler_of(worn: MarkerLayout, labeler: AnyLabeler) -> Labeler:
+    """A labeler that knows the markers of a glove; see `load_labeler` for errors."""
+    return load_labeler(worn if hasattr(labeler, "label_frames") else designed_glove(worn), labeler)
+
+
+def designed_glove(worn: MarkerLayout) -> MarkerLayout:
+    """The shipped layout of a glove as it is worn, whose markers may have slipped: labelers know that one."""
+    if worn.name not in list_layouts():
+        return worn
+    designed = load_layout(worn.name)
+    places, own = ([(one.name, one.bone) for one in glove.markers] for glove in (designed, worn))
+    return designed if places == own else worn

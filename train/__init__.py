@@ -40,9 +40,11 @@ if TYPE_CHECKING:
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
+    from train.simulation.room import OpticsOptions as OpticsOptions
     from train.simulation.takes import SimulateSettings as SimulateSettings
     from train.simulation.takes import simulate_take as simulate_take
     from train.simulation.training_frames import GenerateSettings as GenerateSettings
+    from train.simulation.training_frames import SceneMix as SceneMix
 
 __getattr__, __dir__ = lazy_exports(__name__)
 

@@ -17,9 +17,8 @@ from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
-from track.frames import FrameTracker, TrackedFrame
+from track.frames import FrameTracker, StreamedFrame, TrackedFrame
 from track.hand_size import fit_size, sample_frames
-from track.streams.frame_source import StreamedFrame
 from train.labelers.protocol import Labeler
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))

@@ -22,8 +22,7 @@ from gloves.fit import GloveFit
 from handsim.files.outputs import claim
 from handsim.hand.shape import NUM_QPOS
 from track.captures import measure_hands
-from track.frames import FrameTracker
-from track.streams.frame_source import capture_frames
+from track.frames import FrameTracker, capture_frames
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler

@@ -41,19 +41,13 @@ def calibrate(
             not given.
     """
     from track import captures
+    from track.settings import CalibrateSettings
 
     check_ending(out, ".json")
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("") as bar:
-        user = captures.calibrate(
-            capture,
-            glove=glove,
-            hands=hands,
-            size=size,
-            labeler=labeler,
-            progress=bar,
-            on_step=bar.step,
-        )
+        settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
+        user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)
     user.save(out)
     print_line(f"{out}: {len(user)} hands in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}

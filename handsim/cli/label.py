@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
-
-if TYPE_CHECKING:
-    from gloves.takes.take import Take
 
 
 def label(
@@ -49,26 +46,19 @@ def label(
             labeler=labeler,
             progress=bar,
         )
-    right, left = _hands_there(take)
-    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     points = take.point_list
+    side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # the last one of label -1
+    own = side_of[points.labels]
+    right, left = (
+        np.bincount(points.frames[own == side], minlength=take.num_frames) > 0 for side in ("right", "left")
+    )
+    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     labeled = points.labels >= 0
     sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
         f"{out}: {take.num_frames} frames, {labeled.sum()} of {len(labeled)} points labeled{sure}; "
         f"{_counts(right, left)}"
     )
-
-
-def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
-    """In which frames there is a right hand, and a left one."""
-    side_of = np.array([name.split(":")[0] for name in take.label_names])
-    points = take.point_list
-    own = np.where(points.labels >= 0, side_of[points.labels], "")
-    right, left = (
-        np.isin(np.arange(take.num_frames), points.frames[own == side]) for side in ("right", "left")
-    )
-    return right, left
 
 
 def _counts(right: Bool[np.ndarray, "T"], left: Bool[np.ndarray, "T"]) -> str:

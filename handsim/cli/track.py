@@ -18,11 +18,10 @@ from handsim.files.outputs import check_outputs, written_together
 if TYPE_CHECKING:
     from gloves.takes.take import Take
     from track.captures import OnFrame
-    from track.frames import TrackedFrame
+    from track.frames import StreamedFrame, TrackedFrame
     from track.live import LiveTake
     from track.settings import TrackSettings
     from track.sinks import SinkGroup
-    from track.streams.frame_source import StreamedFrame
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
 

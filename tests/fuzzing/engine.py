@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from handsim.errors import HandSimError
+from handsim import HandSimError
 from tests.fuzzing.mutations import mutate
 
 CORPUS: Final = Path(__file__).parent / "corpus"

@@ -11,21 +11,17 @@ import cv2
 import numpy as np
 import trimesh
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit, attach
-from gloves.layout import load_layout, starter_layout
+from gloves import Capture, GloveFit, RigidBody, Take, attach, load_layout, load_take, write_capture
+from gloves.layout import starter_layout
 from gloves.takes import points as table
 from gloves.takes.archives import GrowingArchive, growing_path
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take, take_header, worn_arrays
-from handsim.hand.model import HandModel
-from handsim.hand.shape import sample_shape
+from gloves.takes.take import STATUSES, keypoints_of, take_header, worn_arrays
+from handsim import HandModel, sample_shape
 from handsim.space.objects import named_object
-from track.rigid_body import RigidTemplate, save_body
-from track.streams.frame_source import StreamedFrame
+from track import RigidTemplate, StreamedFrame, User
+from track.rigid_body import save_body
 from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
-from track.user import User
 
 FRAMES, COLUMNS = 4, 24
 SETTINGS = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
@@ -274,9 +270,9 @@ def photos(folder: Path) -> list[Path]:
 def weights(folder: Path) -> list[Path]:
     import torch
 
+    from train import SetLabelerConfig
     from train.labelers.networks import new_network
     from train.labelers.storage import CARD, WEIGHTS, save_network
-    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
@@ -287,9 +283,9 @@ def weights(folder: Path) -> list[Path]:
 def onnx(folder: Path) -> list[Path]:
     import torch
 
+    from train import SetLabelerConfig
     from train.labelers.networks import new_network
     from train.labelers.storage import export_onnx
-    from train.settings import SetLabelerConfig
 
     torch.manual_seed(0)
     network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))

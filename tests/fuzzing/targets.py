@@ -14,24 +14,22 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.formats import read_capture
-from gloves.layout import load_layout
+from gloves import load_layout, load_take, read_capture
 from gloves.takes.corrections import applied_corrections, load_corrections
-from gloves.takes.take import load_take
-from handsim.errors import HandSimError, HandSimWarning
+from handsim import CameraRig, HandSimError, HandSimWarning, load_rig
 from handsim.files.inputs import load_json
 from handsim.files.outputs import claim
 from handsim.space.objects import load_object
-from handsim.space.rig import CameraRig, load_rig
 from handsim.space.rig_formats import import_cameras, load_cameras
+from render import PoseFile
 from render.scenery.backgrounds import draw_photo, photo_files
-from render.subject import PoseFile, load_subject
+from render.subject import load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
+from track import load_user
 from track.rigid_body import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
-from track.user import load_user
 
 _CLOUD: Final = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.07, 0.0], [0.0, 0.02, 0.08]])
 
@@ -89,20 +87,21 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 
 
 def _read_dataset(path: Path) -> None:
     """With checksums of what is there, so that more than the checksum is tried."""
-    from train.data.shards import MANIFEST, Dataset
+    from train import Dataset
+    from train.data.shards import MANIFEST
 
     manifest = path.with_name(MANIFEST)
     if path != manifest:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from train import SetLabelerConfig, TrainSettings
 from train.data.shards import row_dtype
 from train.fabric import start_fabric
 from train.loop import TrainingState
-from train.settings import SetLabelerConfig, TrainSettings
 
 
 @cache

@@ -11,11 +11,12 @@ import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import _ray, attach, attach_markers, nearest_markers, nominal_fit, place_marker, vary_layout
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, attach, load_layout
+from gloves.fit import _ray, attach_markers, nearest_markers, nominal_fit, place_marker, vary_layout
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import LayoutError
-from handsim.hand.model import HandModel, build_spec, join_qpos
-from handsim.hand.shape import EVERYBODY, sample_shape
+from handsim.hand.model import build_spec
+from handsim.hand.shape import EVERYBODY
 from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR
 from tests.handsim.hand.blending import blend_skin

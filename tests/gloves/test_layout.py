@@ -15,19 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gloves.layout
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import (
-    MarkerLayout,
-    MarkerPlace,
-    list_layouts,
-    load_layout,
-    moved_text,
-    shipped_layout,
-    starter_layout,
-    stored_layout,
-)
+from gloves.layout import list_layouts, moved_text, shipped_layout, starter_layout, stored_layout
 from handsim.errors import LayoutError
 from handsim.hand.shape import BONE_NAMES, SIZES
+from tests.sentences import assert_names
 
 DENSE19 = (
     "ThumbCMC ThumbMCP ThumbIP ThumbTip IndexMCP IndexPIP IndexTip MiddleMCP MiddlePIP MiddleTip "
@@ -169,77 +162,97 @@ def text(*, head: str = 'name = "g"\nradius_mm = 3.2', count: int = 5, **keys: s
 
 
 BAD = {
-    "unknown bone": text(bone='"index_proximl"'),
-    "on the wrist": text(bone='"wrist"'),
-    "on the forearm": text(bone='"forearm"'),
-    "two of one name": text(name='"m0"'),
-    "too few": text(count=2),
-    "too many": text(count=61),
-    "no markers": 'name = "g"\nradius_mm = 3.2',
-    "markers are no list": 'name = "g"\nradius_mm = 3.2\nmarker = 3',
-    "one table": 'name = "g"\nradius_mm = 3.2\n[marker]\nname = "m"',
-    "list of numbers": 'name = "g"\nradius_mm = 3.2\nmarker = [1, 2, 3, 4, 5]',
-    "radius too large": text(head='name = "g"\nradius_mm = 32'),
-    "radius in meters": text(head='name = "g"\nradius_mm = 0.0032'),
-    "radius is NaN": text(head='name = "g"\nradius_mm = nan'),
-    "radius missing": text(head='name = "g"'),
-    "radius is text": text(head='name = "g"\nradius_mm = "3.2"'),
-    "radius is true": text(head='name = "g"\nradius_mm = true'),
-    "huge integer": text(head=f'name = "g"\nradius_mm = 1{"0" * 400}'),
-    "name is a number": text(head="name = 3\nradius_mm = 3.2"),
-    "name is empty": text(head='name = ""\nradius_mm = 3.2'),
-    "description is a number": text(head='name = "g"\nradius_mm = 3.2\ndescription = 3'),
-    "extra key": text(head='name = "g"\nradius_mm = 3.2\nradius = 3'),
-    "extra marker key": text(allong="0.5"),
-    "missing marker key": text(along=""),
-    "missing marker name": text(name=""),
-    "marker name is a number": text(name="3"),
-    "marker name is empty": text(name='""'),
-    "marker name has a tab": text(name='"a\\tb"'),
-    "along is text": text(along='"half"'),
-    "along is NaN": text(along="nan"),
-    "along is a list": text(along="[0.5, 0.5]"),
-    "along far off": text(along="1.4"),
-    "around too large": text(around="181"),
-    "across on a finger": text(bone='"index_middle"', across="0.1"),
-    "across too large": text(across="-1.5"),
-    "height below the skin": text(height_mm="-1"),
-    "height far off": text(height_mm="51"),
-    "height is NaN": text(height_mm="nan"),
-    "height is text": text(height_mm='"10"'),
-    "source is a number": text(head='name = "g"\nradius_mm = 3.2\nsource = 3'),
-    "unknown side": text(head='name = "g"\nradius_mm = 3.2\nsides = ["rihgt"]'),
-    "no side": text(head='name = "g"\nradius_mm = 3.2\nsides = []'),
-    "one side twice": text(head='name = "g"\nradius_mm = 3.2\nsides = ["left", "left"]'),
-    "sides is text": text(head='name = "g"\nradius_mm = 3.2\nsides = "left"'),
-    "sides is a list of numbers": text(head='name = "g"\nradius_mm = 3.2\nsides = [1]'),
-    "not TOML": "name = ",
-    "nested too deep": "name = " + "[" * 5000,
-    "empty file": "",
+    "unknown bone": (
+        text(bone='"index_proximl"'),
+        "m1 | index_proximl | index_proximal | palm | little_distal",
+    ),
+    "on the wrist": (text(bone='"wrist"'), "m1 | wrist | palm | -0.15 to 0"),
+    "on the forearm": (text(bone='"forearm"'), "m1 | forearm | not a bone"),
+    "two of one name": (text(name='"m0"'), "two markers | 'm0'"),
+    "too few": (text(count=2), "5 to 60 | got 2"),
+    "too many": (text(count=61), "5 to 60 | got 61"),
+    "no markers": ('name = "g"\nradius_mm = 3.2', "5 to 60 | got 0"),
+    "markers are no list": ('name = "g"\nradius_mm = 3.2\nmarker = 3', "marker | [[marker]] table"),
+    "one table": ('name = "g"\nradius_mm = 3.2\n[marker]\nname = "m"', "marker | [[marker]] table"),
+    "list of numbers": ('name = "g"\nradius_mm = 3.2\nmarker = [1, 2, 3, 4, 5]', "marker | [[marker]] table"),
+    "radius too large": (text(head='name = "g"\nradius_mm = 32'), "radius | 32 mm | 0.5 to 15 mm"),
+    "radius in meters": (text(head='name = "g"\nradius_mm = 0.0032'), "radius | 0.0032 mm | 0.5 to 15 mm"),
+    "radius is NaN": (text(head='name = "g"\nradius_mm = nan'), "radius_mm is NaN | a number"),
+    "radius missing": (text(head='name = "g"'), "lacks | 'radius_mm'"),
+    "radius is text": (text(head='name = "g"\nradius_mm = "3.2"'), 'radius_mm is "3.2" | a number'),
+    "radius is true": (text(head='name = "g"\nradius_mm = true'), "radius_mm is true | a number"),
+    "huge integer": (text(head=f'name = "g"\nradius_mm = 1{"0" * 400}'), "not a TOML file | 64 bits"),
+    "name is a number": (text(head="name = 3\nradius_mm = 3.2"), "name is 3 | text in quotes"),
+    "name is empty": (text(head='name = ""\nradius_mm = 3.2'), "name '' | printable"),
+    "description is a number": (
+        text(head='name = "g"\nradius_mm = 3.2\ndescription = 3'),
+        "description is 3 | text in quotes",
+    ),
+    "extra key": (
+        text(head='name = "g"\nradius_mm = 3.2\nradius = 3'),
+        "unknown key 'radius' | 'radius_mm' | sides",
+    ),
+    "extra marker key": (text(allong="0.5"), "m1 | 'allong' | 'along' | height_mm"),
+    "missing marker key": (text(along=""), "m1 | lacks | 'along'"),
+    "missing marker name": (text(name=""), "number 2 | lacks | 'name'"),
+    "marker name is a number": (text(name="3"), "number 2 | name is 3 | text in quotes"),
+    "marker name is empty": (text(name='""'), "marker name '' | printable"),
+    "marker name has a tab": (text(name='"a\\tb"'), "a\\tb | printable"),
+    "along is text": (text(along='"half"'), 'm1 | along is "half" | a number'),
+    "along is NaN": (text(along="nan"), "m1 | along is NaN | a number"),
+    "along is a list": (text(along="[0.5, 0.5]"), "m1 | along is [0.5, 0.5] | a number"),
+    "along far off": (text(along="1.4"), "m1 | along is 1.4 | -0.3 to 1.3"),
+    "around too large": (text(around="181"), "m1 | around is 181 degrees | -180 to 180"),
+    "across on a finger": (text(bone='"index_middle"', across="0.1"), "m1 | across | palm | index_middle"),
+    "across too large": (text(across="-1.5"), "m1 | across is -1.5 | -1 to 1"),
+    "height below the skin": (text(height_mm="-1"), "m1 | height is -1 mm | 0 to 50 mm"),
+    "height far off": (text(height_mm="51"), "m1 | height is 51 mm | 0 to 50 mm"),
+    "height is NaN": (text(height_mm="nan"), "m1 | height_mm is NaN | a number"),
+    "height is text": (text(height_mm='"10"'), 'm1 | height_mm is "10" | a number'),
+    "source is a number": (
+        text(head='name = "g"\nradius_mm = 3.2\nsource = 3'),
+        "source is 3 | text in quotes",
+    ),
+    "unknown side": (text(head='name = "g"\nradius_mm = 3.2\nsides = ["rihgt"]'), "'rihgt' | 'right' | left"),
+    "no side": (text(head='name = "g"\nradius_mm = 3.2\nsides = []'), 'sides | "right", "left" or both'),
+    "one side twice": (
+        text(head='name = "g"\nradius_mm = 3.2\nsides = ["left", "left"]'),
+        'sides | "right", "left" or both',
+    ),
+    "sides is text": (text(head='name = "g"\nradius_mm = 3.2\nsides = "left"'), "sides is 'left' | a list"),
+    "sides is a list of numbers": (
+        text(head='name = "g"\nradius_mm = 3.2\nsides = [1]'),
+        "sides is [1] | a list",
+    ),
+    "not TOML": ("name = ", "not a TOML file | end of document"),
+    "nested too deep": ("name = " + "[" * 5000, "not a TOML file | nested too deep"),
+    "empty file": ("", "lacks | 'name'"),
 }
 
 
-def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]], None]) -> None:
+@pytest.mark.parametrize("case", BAD)
+def test_damage_is_told(tmp_path: Path, case: str) -> None:
     path = tmp_path / "glove.toml"
-    actual = {}
-    for case, content in BAD.items():
-        path.write_text(content)
-        with pytest.raises(LayoutError) as caught:
-            load_layout(path)
-        actual[case] = str(caught.value).replace(str(path), "glove.toml")
-    for case, name in {"unknown glove": "dense91", "missing file": "missing.toml"}.items():
-        with pytest.raises(LayoutError) as caught:
-            load_layout(name)
-        actual[case] = str(caught.value)
-    path.write_bytes(b"name = '\xff'")
+    content, words = BAD[case]
+    path.write_text(content)
     with pytest.raises(LayoutError) as caught:
         load_layout(path)
-    actual["not UTF-8"] = str(caught.value).replace(str(path), "glove.toml")
-    with pytest.raises(LayoutError) as caught:
-        load_layout("dense19").save(tmp_path)
-    actual["save onto a folder"] = str(caught.value).replace(str(tmp_path), "folder")
-    assert not any("\n" in sentence for sentence in actual.values())
-    golden("layout_errors", actual)
+    assert_names(caught.value, f"{path} | {words}")
+
+
+def test_what_is_no_layout_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "glove.toml"
+    path.write_bytes(b"name = '\xff'")
+    cases: list[tuple[Callable[[], object], str]] = [
+        (lambda: load_layout("dense91"), "'dense91' | 'dense19' | tips8 | path of a .toml file"),
+        (lambda: load_layout("missing.toml"), "missing.toml | No such file"),
+        (lambda: load_layout(path), f"{path} | not a TOML file | UTF-8"),
+        (lambda: load_layout("dense19").save(tmp_path), f"{tmp_path} | cannot be written"),
+    ]
+    for call, words in cases:
+        with pytest.raises(LayoutError) as caught:
+            call()
+        assert_names(caught.value, words)
 
 
 def test_what_was_stored_before_stalks_and_sides_loads() -> None:

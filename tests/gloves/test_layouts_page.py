@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from gloves.layout import list_layouts, load_layout, parse_layout
+from gloves import load_layout
+from gloves.layout import list_layouts, parse_layout
 
 PAGE = (Path(__file__).parents[2] / "docs" / "layouts.md").read_text("utf-8")
 

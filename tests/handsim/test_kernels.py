@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels import (
     align_rigid,

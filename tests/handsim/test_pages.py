@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves import Take, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.take import Take
-from handsim import write_page
+from handsim import join_qpos, write_page
 from handsim.errors import ArgumentError
-from handsim.hand.model import join_qpos
 
 
 def test_a_take_has_a_page_and_tables(tmp_path):

@@ -7,8 +7,9 @@ import sys
 import numpy as np
 import pytest
 
+from handsim import HandSimError
 from handsim._plugins import call_plugin, is_plugin, list_plugins, load_plugin
-from handsim.errors import ArgumentError, HandSimError, PoseError
+from handsim.errors import ArgumentError, PoseError
 
 SOURCE = """
 class Maker:

@@ -10,18 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import HandModel, HandMotion, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, HandMotion, join_qpos
-from handsim.hand.shape import SIDES, sample_shape
+from handsim.hand.shape import SIDES
 from handsim.space.transforms import quaternion_matrix
+from poses import MotionConfig, sample_motion
 from poses.motion import (
-    MotionConfig,
     WristConfig,
     can_be_left,
     minimum_jerk,
     motion_through,
     path_to_rest,
-    sample_motion,
     script_names,
     script_poses,
     scripted_motion,

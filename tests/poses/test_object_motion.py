@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
+from handsim import HandModel, HandMotion, RigidObject, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, HandMotion, join_qpos
-from handsim.hand.shape import DIGITS, bones_of, sample_shape, shape_from_measures
-from handsim.space.objects import RigidObject, load_object, named_object, object_names
+from handsim.hand.shape import DIGITS, bones_of, shape_from_measures
+from handsim.space.objects import load_object, named_object, object_names
 from handsim.space.transforms import MIRROR, pose_matrices
+from poses import MotionConfig
 from poses.grasps import (
     MAX_OBJECT_PENETRATION,
     GraspScene,
@@ -31,7 +32,6 @@ from poses.grasps import (
     sample_held_poses,
     settle_hold,
 )
-from poses.motion import MotionConfig
 from poses.object_motion import (
     DISTANCE,
     PATH,

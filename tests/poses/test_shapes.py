@@ -9,28 +9,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import EVERYBODY, SIDES, SIZES, sample_shape
+from handsim.hand.shape import EVERYBODY, SIDES, SIZES
+from poses import PoseMix, load_gestures, sample_poses, validate
 from poses.shapes import (
     HIGH,
     LIBRARIES,
     LOW,
     MAX_PENETRATION,
-    PoseMix,
     all_gestures,
     apply_couplings,
     gesture,
     gesture_names,
     gestures_of,
     is_valid,
-    load_gestures,
     make_valid,
     resting_angles,
     sample_angles,
-    sample_poses,
     sample_valid_angles,
-    validate,
 )
 
 # Random poses blend exactly these, in this order: another sum here means other training sets.

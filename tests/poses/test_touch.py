@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import DIGITS, SIDES, SIZES, sample_shape
+from handsim.hand.shape import DIGITS, SIDES, SIZES
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
 from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
 

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
-from handsim.hand.model import HandModel, build_spec, join_qpos
-from handsim.hand.shape import EVERYBODY, sample_shape
+from handsim.hand.model import build_spec
+from handsim.hand.shape import EVERYBODY
 from handsim.space.transforms import random_quaternions
 from poses.contact import (
     MAX_ACCELERATION,

@@ -5,12 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gloves.fit import Attachment, attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, hand_keypoints, join_qpos
+from gloves import Attachment, load_layout
+from gloves.fit import attach_markers
+from handsim import Camera, HandModel, join_qpos, look_at
+from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import Side
-from handsim.space.camera import Camera, look_at, pinhole
-from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
+from handsim.space.camera import pinhole
+from render import BodyTruth, HandTruth, Pictures, RenderedFrame
+from render.frames import PARTS_A_HAND
 
 
 @pytest.fixture(scope="session")

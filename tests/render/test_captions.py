@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.errors import HandSimError
+from handsim import HandSimError
+from render import Pictures
 from render.captions import (
     colored_depth,
     contact_sheet,
@@ -21,7 +22,6 @@ from render.captions import (
     with_names,
     write_png,
 )
-from render.frames import Pictures
 
 
 @given(st.lists(st.floats(0.0, 1000.0), max_size=20).map(sorted), st.floats(1.0, 30.0))

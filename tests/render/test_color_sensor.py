@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from render import ExposureConfig, ShutterConfig
 from render.color_sensor import (
     Exposure,
-    ExposureConfig,
     Shutter,
-    ShutterConfig,
     combine,
     expose,
     linear_of,

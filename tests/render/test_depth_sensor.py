@@ -6,12 +6,13 @@ import json
 import numpy as np
 import pytest
 
+from handsim import Camera
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera, pinhole
+from handsim.space.camera import pinhole
+from render import DepthSensor
 from render.depth_sensor import (
     DEPTH_NOISES,
     SENSORS,
-    DepthSensor,
     StructuredLight,
     TimeOfFlight,
     apply_depth_noise,

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import Attachment, GloveFit
-from handsim.hand.model import HandModel, join_qpos
-from handsim.space.camera import Camera, look_at, pinhole
+from gloves import Attachment, GloveFit
+from handsim import Camera, HandModel, join_qpos, look_at
+from handsim.space.camera import pinhole
 from poses.shapes import gesture
 from render.illustrations import Balls, PosedHand, draw_things, unoccluded, view_along
 

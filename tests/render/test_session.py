@@ -11,24 +11,22 @@ import cv2
 import numpy as np
 import pytest
 
-from gloves.takes.take import load_take
-from handsim import Camera, HandModel
+from gloves import load_take
+from handsim import Camera, HandModel, HandSimError, join_qpos, look_at
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, CaptureError, HandSimError
-from handsim.hand.model import hand_keypoints, join_qpos
-from handsim.space.camera import look_at, pinhole, preset
+from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.model import hand_keypoints
+from handsim.space.camera import pinhole, preset
 from poses import sample_poses
-from render import Backgrounds
-from render.config import RenderConfig
-from render.depth_sensor import DepthSensor
+from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
 from render.scenery.backgrounds import photo_files
-from render.session import SHEET, Drawing, cut_off_pictures, draw, left_out_frames, open_studio, render_take
+from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, open_studio
 from render.skin.look import TONES
 from render.studio import Moment
 from render.subject import subject_of_take
-from render.viewpoints import PLACEMENTS, ViewConfig, Viewpoints
+from render.viewpoints import PLACEMENTS, Viewpoints
 from tests.render.formats.reading import depth_of
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 ABOVE = Camera(

@@ -9,11 +9,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from handsim.errors import HandSimError
-from handsim.hand.model import HandModel, join_qpos
-from render import PictureStream, RenderConfig, render_take
-from render.color_sensor import ShutterConfig
-from train.simulation.takes import simulate_take
+from handsim import HandModel, HandSimError, join_qpos
+from render import PictureStream, RenderConfig, ShutterConfig, render_take
+from train import simulate_take
 
 BARE = RenderConfig(passes=("depth", "ids"), depth_sensor=None)
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos, keypoint_thickness
+from gloves import attach, load_layout
+from handsim import Camera, HandModel, join_qpos, look_at
+from handsim.hand.model import KEYPOINT_DIGITS, hand_keypoints, keypoint_thickness
 from handsim.hand.shape import DIGITS, PALM, bones_of
-from handsim.space.camera import Camera, look_at, pinhole
+from handsim.space.camera import pinhole
 from poses import sample_poses
-from render.frames import FOREARM, Pictures
+from render import Pictures
+from render.frames import FOREARM
 from render.painting.figures import HandFigure, sample_people
 from render.painting.rasterizer import Triangles, join, rasterize
 from render.skin.look import ALL_TONES

@@ -9,19 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from gloves.fit import attach
-from gloves.takes.take import Take
+from gloves import Take, attach
+from handsim import HandModel, HandSimError, HandSimWarning, join_qpos, sample_shape
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
-from handsim.hand.model import HandModel, hand_keypoints, join_qpos
-from handsim.hand.shape import HAND_DTYPE, named_shape, pack_hand, sample_shape
+from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.model import hand_keypoints
+from handsim.hand.shape import HAND_DTYPE, named_shape, pack_hand
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
-from render.color_sensor import ShutterConfig
-from render.config import RenderConfig
-from render.session import Drawing, render_take
-from render.subject import PoseFile, load_subject, source_of
-from render.viewpoints import ViewConfig
+from render import PoseFile, RenderConfig, ShutterConfig, ViewConfig, render_take
+from render.session import Drawing
+from render.subject import load_subject, source_of
 
 K = np.array([[300.0, 0, 161.5], [0, 302.0, 118.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])

@@ -7,14 +7,18 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from gloves.takes.take import LOST, Take
-from handsim.errors import ArgumentError, HandSimWarning, RigError
+from gloves import Take
+from gloves.takes.take import LOST
+from handsim import HandSimWarning, look_at
+from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import hand_keypoints
-from handsim.space.camera import look_at, pinhole
+from handsim.space.camera import pinhole
 from handsim.space.transforms import quaternion_matrix
+from render import ViewConfig
 from render.subject import subject_of_poses
-from render.viewpoints import PLACEMENTS, Framing, ViewConfig, Viewpoints, check_hands_in_view
-from train.simulation.takes import SimulatedKind, simulate_take
+from render.viewpoints import PLACEMENTS, Framing, Viewpoints, check_hands_in_view
+from train import simulate_take
+from train.simulation.takes import SimulatedKind
 
 
 @pytest.fixture(scope="module")

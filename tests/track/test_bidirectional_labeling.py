@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from gloves.takes.points import PointList
+from gloves import PointList
 from gloves.takes.take import LOST, TRACKED
 from track.bidirectional_labeling import _events_of, _exchanges, _is_likelier
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from track.captures import label_capture, track_capture
-from train.evaluation import evaluate_labeler
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from gloves import Capture
+from track import label_capture, track_capture
+from train import evaluate_labeler, load_labeler, simulate_take
 
 FRAMES, RATE = 120, 120.0
 

@@ -11,30 +11,15 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
-from gloves.takes.take import (
-    LOST,
-    STATUSES,
-    TRACKED,
-    Take,
-    load_take,
-)
+from gloves import Capture, GloveFit, Status, Take, load_take, read_capture, write_capture
+from gloves.takes.take import LOST, STATUSES, TRACKED
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
-from track.captures import track_capture
-from track.config import TrackerConfig
+from track import ReplayServer, RigidTemplate, Tracker, TrackerConfig, open_source, track_capture
+from track.frames import capture_frames
 from track.recorder import TakeRecorder
-from track.rigid_body import RigidTemplate
-from track.streams.frame_source import capture_frames
-from track.streams.live_stream import open_source
-from track.streams.natnet import ReplayServer
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from train import load_labeler, simulate_take
 
 FRAMES = 60
 
@@ -196,7 +181,7 @@ from gloves.layout import load_layout
 from track.captures import track_capture
 from track.label_confidence import label_confidence
 from track.tracker import warm_up
-from track.streams.frame_source import checked_frames
+from track.frames import checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
 

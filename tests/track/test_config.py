@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from handsim.errors import ArgumentError
+from track import TrackerConfig
 from track.association.initialization import HandInitializer
-from track.config import TrackerConfig
 
 
 def test_settings_are_json():

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gloves import Take, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
 from gloves.takes.corrections import NO_MARKER, Correction
-from gloves.takes.take import LOST, TRACKED, Take
+from gloves.takes.take import LOST, TRACKED
+from handsim import join_qpos
 from handsim.errors import CaptureError
-from handsim.hand.model import join_qpos
-from poses.shapes import sample_poses
+from poses import sample_poses
+from track import solve_pose
 from track.corrected_take import correct_take
-from track.kinematics.pose_solver import solve_pose
 
 FRAMES, COUNT = 50, 19
 SWAPPED = (3, 7)
@@ -98,7 +98,7 @@ def test_corrected_labels_bring_the_pose_back(right, wrong):
 
 
 def test_the_file_says_what_was_corrected_and_again_is_the_same(wrong, tmp_path):
-    from gloves.takes.take import load_take
+    from gloves import load_take
 
     one = [correction(wrong, 3, NO_MARKER)]
     once = correct_take(wrong, one).take

@@ -7,11 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, load_layout
+from handsim import HandModel, load_rig
 from handsim.errors import LayoutError
-from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES
-from handsim.space.rig import load_rig
 from track import glove_improvement
 from track.glove_improvement import Improvement
 from track.glove_score import palm_spread

@@ -7,20 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.fit import attach
-from gloves.layout import MarkerPlace, load_layout
-from gloves.takes.take import Take
+from gloves import MarkerPlace, Take, attach, load_layout
+from handsim import HandModel, load_rig
 from handsim.errors import CaptureError
-from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, JOINTS
-from handsim.space.rig import load_rig
-from poses.shapes import sample_poses
+from poses import sample_poses
+from track import Trial
 from track.glove_improvement import verdict
 from track.glove_page import trial_rows
 from track.glove_score import (
     METHODS,
     NOISE,
-    Trial,
     free_spreads,
     joint_spreads,
     layout_spreads,
@@ -29,10 +26,9 @@ from track.glove_score import (
     try_take,
 )
 from track.kinematics.pose_solver import PoseSolver
+from train import load_labeler, simulate_take
 from train.forecast.rig_forecast import observe_motion, observe_poses
 from train.labelers.layout_labeler import LayoutLabeler
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
 
 
 def test_seen_and_near_are_counted(tips, tips_hands, tips_score):

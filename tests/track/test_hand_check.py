@@ -7,16 +7,14 @@ import warnings
 
 import pytest
 
-from gloves.layout import load_layout
-from handsim.errors import ArgumentError, HandSimWarning
-from track import hand_check
-from track.captures import label_capture, measure_hands, track_capture
-from track.hand_check import check_scale
-from track.hand_size import sample_frames
-from track.streams.frame_source import checked_frames
+from gloves import load_layout
+from handsim import HandSimWarning
+from handsim.errors import ArgumentError
+from track import hand_size, label_capture, measure_hands, track_capture
+from track.frames import checked_frames
+from track.hand_size import check_scale, sample_frames
 from track.user import nominal_user
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from train import load_labeler, simulate_take
 
 FRAMES = 90
 
@@ -64,7 +62,7 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
 )
 def test_another_unit_is_named(scale, said, monkeypatch):
     few = [(name, load_layout(name)) for name in ("sparse13", "tips8")]  # of all that are shipped
-    monkeypatch.setattr(hand_check, "_gloves", lambda: few)
+    monkeypatch.setattr(hand_size, "_gloves", lambda: few)
     both = simulate_take("single-hand", num_frames=20).capture()
     with pytest.raises(ArgumentError, match=said):
         track_capture(dataclasses.replace(both, positions=scale * both.positions))

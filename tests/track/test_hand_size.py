@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.fit import attach
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, DIGITS, SIZES, sample_shape, shape_from_measures
-from poses.motion import sample_motion
+from gloves import MarkerLayout, MarkerPlace, attach, load_layout
+from handsim import HandModel, join_qpos, sample_shape
+from handsim.hand.shape import ADULTS, DIGITS, SIZES, shape_from_measures
+from poses import sample_motion
+from track import StreamedFrame
+from track.frames import checked_frames
 from track.hand_size import (
     SizeFit,
     _is_found,
@@ -19,9 +20,7 @@ from track.hand_size import (
     sample_frames,
     usual_breadth,
 )
-from track.streams.frame_source import StreamedFrame, checked_frames
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from train import load_labeler, simulate_take
 
 RATE = 120.0
 

@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.takes.take import LOST, Take
-from track.captures import track_capture
+from gloves import Take
+from gloves.takes.take import LOST
+from track import track_capture
 from track.label_confidence import evidence_of, label_confidence
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 FRAMES = 120
 

@@ -12,19 +12,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gloves import RigidBody, Status, Take, load_layout, load_take
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
-from gloves.takes.points import Status
-from gloves.takes.take import LOST, STATUSES, TRACKED, RigidBody, Take, load_take
+from gloves.takes.take import LOST, STATUSES, TRACKED
+from handsim import join_qpos
 from handsim.errors import ArgumentError, CaptureError
-from handsim.hand.model import join_qpos
-from track.frames import TrackedBody, TrackedFrame, TrackedHand
-from track.recorder import Recorder
-from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from track import Recorder, RigidTemplate, StreamedFrame, TrackedBody, TrackedFrame, TrackedHand, Tracker
+from train import load_labeler
 
 PEN = RigidBody("pen", ("Pen1", "Pen2", "Pen3"), np.diag([0.03, 0.05, 0.08]))
 

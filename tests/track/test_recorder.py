@@ -11,22 +11,17 @@ import threading
 import numpy as np
 import pytest
 
+from gloves import Take, load_layout, load_take
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
-from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
+from track import Recorder, ReplayServer, RigidTemplate, Tracker, open_source
 from track import recorder as module
-from track.recorder import Recorder, TakeRecorder
-from track.rigid_body import RigidTemplate
-from track.streams.frame_source import capture_frames
-from track.streams.live_stream import open_source
-from track.streams.natnet import ReplayServer
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track.frames import capture_frames
+from track.recorder import TakeRecorder
+from train import load_labeler, simulate_take
 
 FRAMES = 24
 COUNTS = {"missing_frames": 2}

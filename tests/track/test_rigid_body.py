@@ -11,24 +11,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gloves.captures.capture import Capture
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import Capture, Status, Take
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions, rigid_fit
-from track.constellation import predict_pose, transform_markers, velocity_between
-from track.rigid_body import (
-    BodyError,
-    BodyFrame,
-    BodyTracker,
-    RigidTemplate,
-    learn_body,
-    load_bodies,
-    load_body,
-    save_body,
-)
-from train.simulation.takes import simulate_take
+from track import RigidTemplate
+from track.rigid_body import BodyError, BodyFrame, BodyTracker, learn_body, load_bodies, load_body, save_body
+from train import simulate_take
 
 NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0
@@ -316,24 +305,6 @@ def test_a_crowd_of_points_is_not_searched_but_a_body_in_it_is_followed(rng):
     assert tracker.step(points, labels, STEP).status == Status.INITIALIZED
     points, labels = seen(body, pose, rng, strays=2000)
     assert tracker.step(points, labels, 2 * STEP).status == Status.TRACKED
-
-
-def test_velocities_carry_poses_on(rng):
-    places = rng.normal(size=(5, 3))
-    for _ in range(20):
-        first, second = (np.append(rng.normal(size=3), random_quaternions(1, rng=rng)[0]) for _ in range(2))
-        velocity = velocity_between(first, second, 0.5)
-        np.testing.assert_allclose(
-            transform_markers(places, predict_pose(first, velocity, 0.5)),
-            transform_markers(places, second),
-            atol=1e-9,
-        )
-        assert np.linalg.norm(velocity[3:]) * 0.5 <= np.pi + 1e-9, "the short way round"
-        np.testing.assert_array_equal(predict_pose(first, np.zeros(6), 3.0), first)
-        rotation = quaternion_matrix(first[3:])
-        np.testing.assert_allclose(
-            transform_markers(places, first), places @ rotation.T + first[:3], atol=1e-12
-        )
 
 
 FILE_NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)

@@ -6,11 +6,11 @@ import json
 
 import pytest
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
 from handsim.errors import ArgumentError
-from track.config import BOTH, TrackerConfig
-from track.settings import TrackSettings
+from track import TrackerConfig, TrackSettings
+from track.config import BOTH
 
 
 def test_settings_come_back_from_json():

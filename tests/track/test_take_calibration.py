@@ -7,15 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gloves import Take, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.take import LOST, Take
-from handsim.errors import CalibrationError, HandSimWarning
-from track.captures import track_capture
+from gloves.takes.take import LOST
+from handsim import HandSimWarning
+from handsim.errors import CalibrationError
+from track import User, track_capture
 from track.kinematics.pose_solver import PoseSolver
 from track.take_calibration import calibrate_take, kept_user
-from track.user import MEASURED, User, nominal_user
-from train.simulation.takes import simulate_take
+from track.user import MEASURED, nominal_user
+from train import simulate_take
 
 FRAMES, FRESH = 900, 600
 

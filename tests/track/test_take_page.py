@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED, Take
+from gloves import Take
+from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED
 from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES, JOINTS
-from track.captures import track_capture
+from track import track_capture
 from track.take_page import decimated, hand_figures, shaded, table_paths, write_take_page
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 FRAMES = 60
 

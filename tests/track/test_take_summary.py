@@ -7,13 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.takes.take import LOST, Take
+from gloves import Capture, Take, write_capture
+from gloves.takes.take import LOST
 from handsim.cli.main import main
-from track.captures import track_capture
-from track.take_summary import find_suspect_spans, frame_confidence, runs_of, summarize, suspicions
-from train.simulation.takes import simulate_take
+from track import find_suspect_spans, track_capture
+from track.take_summary import frame_confidence, runs_of, summarize, suspicions
+from train import simulate_take
 
 FRAMES = 40
 

@@ -7,16 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.points import Status
-from gloves.takes.take import Take
-from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.model import HandModel
-from track.frames import TrackedFrame
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from gloves import GloveFit, Status, Take, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandModel, HandSimError
+from handsim.errors import ArgumentError
+from track import TrackedFrame, Tracker
+from train import load_labeler, simulate_take
 
 
 @pytest.fixture(scope="module")

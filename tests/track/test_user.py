@@ -10,13 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import load_layout
+from gloves import GloveFit, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandModel, HandSimError, sample_shape
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.model import HandModel
-from handsim.hand.shape import SIDES, sample_shape
-from track.user import AS_MEASURED, MEASURED, User, UserError, as_user, load_user
+from handsim.errors import ArgumentError
+from handsim.hand.shape import SIDES
+from track import User, load_user
+from track.user import AS_MEASURED, MEASURED, UserError, as_user
 
 
 @pytest.fixture

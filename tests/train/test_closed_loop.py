@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import true_users
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
+from gloves import Capture, read_capture, write_capture
 from handsim.cli.main import main
 from handsim.hand.model import hand_keypoints
-from render import RenderConfig, draw
-from render.viewpoints import ViewConfig
-from track.captures import track_capture
-from train.data.shards import Dataset
-from train.simulation.takes import simulate_take
+from render import RenderConfig, ViewConfig, draw
+from track import track_capture
+from train import Dataset, simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
@@ -108,8 +105,7 @@ def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
 def test_training_goes_on_to_the_same_weights(run, tmp_path):
     from safetensors.numpy import load_file
 
-    from train.loop import train_labeler
-    from train.settings import SetLabelerConfig, TrainSettings
+    from train import SetLabelerConfig, TrainSettings, train_labeler
 
     config = TrainSettings(samples=2560, network=SetLabelerConfig(width=16, gates=4, depth=1))
     dataset = Dataset(run / "set")

@@ -9,14 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from train.data.batches import Corruption
-from train.data.shards import Dataset
-from train.evaluation import evaluate_labeler
-from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
-from train.loop import train_labeler
-from train.settings import CNNConfig, usual_settings
+from train import (
+    CNNConfig,
+    Corruption,
+    Dataset,
+    GenerateSettings,
+    SceneMix,
+    evaluate_labeler,
+    load_labeler,
+    train_labeler,
+)
+from train.labelers.storage import CARD, WEIGHTS, load_network
+from train.settings import usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 CONFIG = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
 

@@ -10,20 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from train.data.batches import Corruption
+from train import Corruption, Labeling, evaluate_labeler
 from train.evaluation import (
     BINS,
     History,
     LabelCounts,
     error_without,
-    evaluate_labeler,
     expected_calibration_error,
     macro_f1,
     percent,
     print_figures,
     reliability,
 )
-from train.labelers.protocol import Labeling
 
 
 def _one_each(pairs):

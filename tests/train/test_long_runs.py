@@ -13,12 +13,18 @@ import torch
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
-from train.data.shards import Dataset
-from train.labelers.storage import WEIGHTS, load_labeler
-from train.loop import CHECKPOINT, TrainingError, train_labeler
-from train.settings import SetLabelerConfig, TrainSettings
+from train import (
+    Dataset,
+    GenerateSettings,
+    SceneMix,
+    SetLabelerConfig,
+    TrainSettings,
+    load_labeler,
+    train_labeler,
+)
+from train.labelers.storage import WEIGHTS
+from train.loop import CHECKPOINT, TrainingError
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)

@@ -18,17 +18,16 @@ import torch
 
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.signals import Stopped
+from train import Dataset, GenerateSettings, SceneMix, SetLabelerConfig, TrainSettings, train_labeler
 from train.data.batches import Part, draw_batch
-from train.data.shards import Dataset
 from train.fabric import start_fabric
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.networks import batch_loss, new_network, prepare_network
 from train.labelers.storage import CARD, WEIGHTS, load_network
-from train.loop import CHECKPOINT, train_labeler
+from train.loop import CHECKPOINT
 from train.reports.run_page import PAGE
-from train.settings import SetLabelerConfig, TrainSettings, batch_recipe, usual_settings
+from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from benchmarks.held_out import held_out_markers
+from train import CNNConfig
 from train.evaluation import paper_report
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.networks import cnn_labeler, prepare_network
 from train.loop import choose_costs
-from train.settings import CNNConfig
 
 NAMES = tuple(f"marker{label}" for label in range(19))
 

@@ -9,15 +9,15 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.captures.formats import read_capture
+from gloves import read_capture
+from handsim import HandSimError
 from handsim._plugins import load_plugin
 from handsim.app.workers import run_jobs
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError
 from poses.shapes import load_sampler
+from train import Dataset, load_labeler
 from train.data.batches import own_cloud
-from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
 
 SOURCE = '''
 import numpy as np

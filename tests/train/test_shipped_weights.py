@@ -8,12 +8,11 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.captures.formats import read_markers
-from gloves.layout import load_layout
 from handsim.errors import ArgumentError, WeightsError
-from train.data.batches import Corruption
-from train.evaluation import evaluate_labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train import Corruption, evaluate_labeler, load_labeler
+from train.labelers.storage import shipped_labelers
 
 
 def test_cards_say_where_the_weights_come_from():

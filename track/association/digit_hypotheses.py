@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from handsim.hand.shape import NUM_JOINTS
 from handsim.kernels import kernel, point_distance, write_quaternion_matrix
 from track.kinematics.marker_kinematics import (
+    LIMIT_PRECISION,
     HandArrays,
     Workspace,
     compute_digit,
@@ -31,66 +32,20 @@ from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_pri
 
 IMPOSSIBLE: Final = 1e9
 """Minus the score of a hypothesis that is excluded."""
-_GRID: Final = 5  # angles of each hinge at which distances are taken
+_ANGLES_PER_HINGE: Final = 5  # angles of each hinge at which distances are taken
 _LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
 _PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
-_START_DISTANCE: Final = float(
-    np.deg2rad(5.0)
-)  # largest difference of a hinge of starts of which one is enough
+_START_DISTANCE: Final = float(np.deg2rad(5.0))  # two starts are one if no hinge differs by more
+_MOST_FIT_STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
+_SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
+_ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
 
 
 class DigitRanges(NamedTuple):
     """Range of the distance between two markers of one digit over all poses."""
 
-    nearest: Float[np.ndarray, "M M"]
-    """Least distance [m]."""
-    farthest: Float[np.ndarray, "M M"]
-    """Largest distance [m]."""
-
-
-@kernel
-def digit_ranges(hand: HandArrays) -> DigitRanges:
-    """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
-    count, work = len(hand.digits), workspace(len(hand.digits))
-    nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
-    np.fill_diagonal(nearest, 0.0)
-    angles = np.empty(NUM_JOINTS)
-    for number in range(_GRID**4):
-        for hinge in range(NUM_JOINTS):
-            share = number // _GRID ** (3 - hinge % 4) % _GRID / (_GRID - 1)
-            low, high = hand.ranges[hinge]
-            angles[hinge] = low + share * (high - low)
-        compute_markers(hand, angles, work)
-        for one in range(count):
-            for other in range(one):
-                distance = point_distance(work.markers[one], work.markers[other])
-                nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
-                farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
-    return DigitRanges(nearest, farthest)
-
-
-class DigitHypotheses(NamedTuple):
-    """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
-
-    scores: Float[np.ndarray, "D S"]
-    """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
-    runners_up: Float[np.ndarray, "D S"]
-    """The same of the next best assignment of the same points."""
-    assignments: Int[np.ndarray, "D S K"]
-    """Candidate of each of the digit's markers, -1 for none."""
-
-
-def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:
-    """`DigitHypotheses` to be filled.
-
-    Args:
-        num_candidates: Candidates of each digit at most.
-        num_markers: Markers of each digit at most.
-    """
-    sets = num_digits, 1 << num_candidates
-    return DigitHypotheses(
-        np.full(sets, -IMPOSSIBLE), np.full(sets, -IMPOSSIBLE), np.full((*sets, num_markers), -1)
-    )
+    nearest: Float[np.ndarray, "M M"]  # least distance [m]
+    farthest: Float[np.ndarray, "M M"]  # largest distance [m]
 
 
 class DigitModel(NamedTuple):
@@ -110,6 +65,60 @@ class DigitModel(NamedTuple):
     """Distances between markers of a digit over all poses."""
 
 
+class DigitHypotheses(NamedTuple):
+    """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
+
+    scores: Float[np.ndarray, "*D S"]
+    """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
+    runners_up: Float[np.ndarray, "*D S"]
+    """The same of the next best assignment of the same points."""
+    assignments: Int[np.ndarray, "*D S K"]
+    """Candidate of each of the digit's markers, -1 for none."""
+
+
+class DigitPoints(NamedTuple):
+    """A digit, its candidate points and its prior."""
+
+    hand: HandArrays  # the hand, its markers shifted by their biases
+    digit: int  # index of the digit
+    markers: Int[np.ndarray, "K"]  # markers of the digit
+    points: Float[np.ndarray, "C 3"]  # the candidates in the wrist's frame [m]
+    variance: Float[np.ndarray, "M"]  # variance of each marker of the hand [m^2]
+    mean: Float[np.ndarray, "4"]  # mean of the digit's prior [rad]
+    precision: Float[np.ndarray, "4 4"]  # its precision [1/rad^2]
+
+
+@kernel
+def digit_ranges(hand: HandArrays) -> DigitRanges:
+    """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
+    count, work = len(hand.digits), workspace(len(hand.digits))
+    nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
+    np.fill_diagonal(nearest, 0.0)
+    angles = np.empty(NUM_JOINTS)
+    for number in range(_ANGLES_PER_HINGE**4):
+        for hinge in range(NUM_JOINTS):
+            share = (
+                number // _ANGLES_PER_HINGE ** (3 - hinge % 4) % _ANGLES_PER_HINGE / (_ANGLES_PER_HINGE - 1)
+            )
+            low, high = hand.ranges[hinge]
+            angles[hinge] = low + share * (high - low)
+        compute_markers(hand, angles, work)
+        for one in range(count):
+            for other in range(one):
+                distance = point_distance(work.markers[one], work.markers[other])
+                nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
+                farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
+    return DigitRanges(nearest, farthest)
+
+
+def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:
+    """`DigitHypotheses` to be filled, for so many candidates and markers of each digit at most."""
+    sets = num_digits, 1 << num_candidates
+    return DigitHypotheses(
+        np.full(sets, -IMPOSSIBLE), np.full(sets, -IMPOSSIBLE), np.full((*sets, num_markers), -1)
+    )
+
+
 @kernel
 def evaluate_digit(
     hand: HandArrays,
@@ -119,15 +128,16 @@ def evaluate_digit(
     points: Float[np.ndarray, "N 3"],
     candidates: Int[np.ndarray, "C"],
     log_odds: Float[np.ndarray, "N M"],
-    scores: Float[np.ndarray, "S"],
-    runners_up: Float[np.ndarray, "S"],
-    assignments: Int[np.ndarray, "S K"],
+    found: DigitHypotheses,
 ) -> None:
     """Evaluate all assignments of candidate points to the markers of one digit.
 
-    The hand's markers are shifted by their biases; points are in the world [m]. Log-odds are those of each
-    label beside the fit, from IDs, presence and queries. The last three are the digit's rows of
-    `DigitHypotheses`, filled.
+    Args:
+        hand: The hand, its markers shifted by their biases.
+        points: Points in the world [m].
+        candidates: Which of them are tried.
+        log_odds: Log-odds of each label beside the fit, from IDs, presence and queries.
+        found: The digit's hypotheses, filled.
     """
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
@@ -139,92 +149,46 @@ def evaluate_digit(
         for slot, marker in enumerate(markers):
             label_log_odds[number, slot] = log_odds[point, marker]
     mean, precision = np.empty(4), np.empty((4, 4))
-    digit_prior(
-        model.joint_prior,
-        model.predicted.information_matrix,
-        model.predicted.information_vector,
-        digit,
-        mean,
-        precision,
-    )
-    _fit_hypotheses(
-        hand,
-        model,
-        digit,
-        markers,
-        local,
-        label_log_odds,
-        pose[7:],
-        mean,
-        precision,
-        scores,
-        runners_up,
-        assignments,
-    )
+    digit_prior(model.joint_prior, model.predicted, digit, mean, precision)
+    own = DigitPoints(hand, digit, markers, local, model.variance, mean, precision)
+    _fit_hypotheses(own, model, label_log_odds, found)
 
 
 @kernel
 def _fit_hypotheses(
-    hand: HandArrays,
-    model: DigitModel,
-    digit: int,
-    markers: Int[np.ndarray, "K"],
-    points: Float[np.ndarray, "C 3"],
-    label_log_odds: Float[np.ndarray, "C K"],
-    angles_before: Float[np.ndarray, "20"],
-    mean: Float[np.ndarray, "4"],
-    precision: Float[np.ndarray, "4 4"],
-    scores: Float[np.ndarray, "S"],
-    runners_up: Float[np.ndarray, "S"],
-    assignments: Int[np.ndarray, "S K"],
+    own: DigitPoints, model: DigitModel, label_log_odds: Float[np.ndarray, "C K"], found: DigitHypotheses
 ) -> None:
-    """Fit all hypotheses that can be the best of their points, those with fewer labels first.
-
-    The candidates are in the wrist's frame [m], the hinges of the hand [rad] as fitted to the labels so far;
-    mean and precision are the digit's prior. The results are those of `evaluate_digit`.
-    """
-    count, choices = len(markers), len(points) + 1
-    work = workspace(len(hand.digits))
-    compute_markers(hand, angles_before, work)
+    """Fit all hypotheses that can be the best of their points, those with fewer labels first."""
+    scores, runners_up, assignments = found
+    count, choices, angles_before = len(own.markers), len(own.points) + 1, model.predicted.qpos[7:]
+    work = workspace(len(own.hand.digits))
+    compute_markers(own.hand, angles_before, work)
     hypothesis, angles = np.full(count, -1), np.empty(4)
-    current = angles_before[4 * digit : 4 * digit + 4]
-    starts = 2 if np.abs(mean - current).max() > _START_DISTANCE else 1
+    current = angles_before[4 * own.digit : 4 * own.digit + 4]
+    starts = 2 if np.abs(own.mean - current).max() > _START_DISTANCE else 1
     total = choices**count
     costs, poses = np.zeros(total), np.empty((total, 4))
     subset_scores = np.full(len(scores), -IMPOSSIBLE)
-    poses[0] = mean
+    poses[0] = own.mean
     for number in range(total):
         points_used = _decode(number, choices, hypothesis)
         subset = _costliest_subset(number, choices, hypothesis, costs)
         costs[number], poses[number] = costs[subset], poses[subset]
         if number > 0 and costs[subset] >= IMPOSSIBLE:
             continue
-        bound = _upper_bound(model, markers, points, label_log_odds, hypothesis)
+        bound = _upper_bound(own, model, label_log_odds, hypothesis)
         if bound <= -IMPOSSIBLE:
             costs[number] = IMPOSSIBLE
             continue
         subset_score = _best_subset_score(points_used, scores, subset_scores)
-        cutoff = bound - max(
-            runners_up[points_used], max(scores[points_used], subset_score) - _PRUNING_MARGIN
-        )
+        least = max(scores[points_used], subset_score) - _PRUNING_MARGIN
+        cutoff = bound - max(runners_up[points_used], least)
         if costs[subset] >= cutoff:
             continue
         score = -IMPOSSIBLE
         for start in range(starts):
             angles[:] = poses[subset] if start == 0 else current
-            cost, complexity = fit_hypothesis(
-                hand,
-                digit,
-                markers,
-                points,
-                model.variance,
-                hypothesis,
-                mean,
-                precision,
-                cutoff,
-                angles,
-                work,
-            )
+            cost, complexity = fit_hypothesis(own, hypothesis, cutoff, angles, work)
             if bound - cost - complexity > score:
                 score = bound - cost - complexity
                 costs[number], poses[number] = cost, angles
@@ -280,54 +244,36 @@ def _best_subset_score(
 
 @kernel
 def _upper_bound(
+    own: DigitPoints,
     model: DigitModel,
-    markers: Int[np.ndarray, "K"],
-    points: Float[np.ndarray, "C 3"],
     label_log_odds: Float[np.ndarray, "C K"],
     hypothesis: Int[np.ndarray, "K"],
 ) -> float:
-    """Score of a hypothesis if every point is exactly at its marker.
-
-    It is `-IMPOSSIBLE` if the distances exclude the hypothesis. The arguments are those of `_fit_hypotheses`.
-    """
+    """Score of a hypothesis if every point is at its marker; `-IMPOSSIBLE` if the distances exclude it."""
     ranges, slack, total = model.ranges, model.slack, 0.0
-    for slot in range(len(markers)):
-        point = hypothesis[slot]
+    for slot in range(len(own.markers)):
+        point, one = hypothesis[slot], own.markers[slot]
         if point < 0:
             continue
-        total += model.peak_log_odds[markers[slot]] + label_log_odds[point, slot]
+        total += model.peak_log_odds[one] + label_log_odds[point, slot]
         for other in range(slot):
             if hypothesis[other] < 0:
                 continue
             if hypothesis[other] == point:
                 return -IMPOSSIBLE
-            distance = point_distance(points[point], points[hypothesis[other]])
-            one, two = markers[slot], markers[other]
+            distance = point_distance(own.points[point], own.points[hypothesis[other]])
+            two = own.markers[other]
             tolerance = _LENGTH_TOLERANCE + slack[one] + slack[two]
-            if (
-                distance < ranges.nearest[one, two] - tolerance
-                or distance > ranges.farthest[one, two] + tolerance
-            ):
+            low, high = ranges.nearest[one, two] - tolerance, ranges.farthest[one, two] + tolerance
+            if distance < low or distance > high:
                 return -IMPOSSIBLE
     return total
 
 
-_STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
-_SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
-_LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond its range: a soft limit
-_ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
-
-
 @kernel
 def fit_hypothesis(
-    hand: HandArrays,
-    digit: int,
-    markers: Int[np.ndarray, "K"],
-    points: Float[np.ndarray, "C 3"],
-    variance: Float[np.ndarray, "M"],
+    own: DigitPoints,
     hypothesis: Int[np.ndarray, "K"],
-    mean: Float[np.ndarray, "4"],
-    precision: Float[np.ndarray, "4 4"],
     cutoff: float,
     angles: Float[np.ndarray, "4"],
     work: Workspace,
@@ -335,14 +281,10 @@ def fit_hypothesis(
     """Fit the four hinges of a digit to a hypothesis by Levenberg-Marquardt.
 
     Args:
-        hand: The hand, its markers shifted by their biases.
-        points: The candidates in the wrist's frame [m].
-        variance: Variance of each marker of the hand [m^2].
         hypothesis: Candidate of each of the digit's markers, -1 for none.
-        mean: Mean of the digit's prior [rad].
-        precision: Precision of the digit's prior [1/rad^2].
         cutoff: Cost beyond which the fit stops early if it would end there.
         angles: Hinges to start from [rad], overwritten.
+        work: The bones of the hand must be computed.
 
     Returns:
         The cost of markers and prior (half squared standard deviations), and the complexity term: half the
@@ -352,11 +294,9 @@ def fit_hypothesis(
     trial, factor, step = angles.copy(), np.empty((4, 4)), np.empty(4)
     normal, gradient = np.empty((4, 4)), np.empty(4)
     new_normal, new_gradient = np.empty((4, 4)), np.empty(4)
-    cost = _accumulate_normal_equations(
-        hand, digit, markers, points, variance, hypothesis, mean, precision, angles, work, normal, gradient
-    )
+    cost = _accumulate_digit(own, hypothesis, angles, work, normal, gradient)
     damping = 1e-3
-    for _ in range(_STEPS):
+    for _ in range(_MOST_FIT_STEPS):
         for row in range(4):
             step[row] = -gradient[row]
             for column in range(4):
@@ -372,20 +312,7 @@ def fit_hypothesis(
         if cost - 2.0 * gain > cutoff:
             cost -= 2.0 * gain
             break
-        tried = _accumulate_normal_equations(
-            hand,
-            digit,
-            markers,
-            points,
-            variance,
-            hypothesis,
-            mean,
-            precision,
-            trial,
-            work,
-            new_normal,
-            new_gradient,
-        )
+        tried = _accumulate_digit(own, hypothesis, trial, work, new_normal, new_gradient)
         if tried < cost:
             small = cost - tried < _SMALL_GAIN
             cost = tried
@@ -399,39 +326,30 @@ def fit_hypothesis(
             damping *= 30.0
             if damping > 1e5:
                 break
-    return cost, 0.5 * (_log_determinant(normal) - _log_determinant(precision))
+    return cost, 0.5 * (_log_determinant(normal) - _log_determinant(own.precision))
 
 
 @kernel
-def _accumulate_normal_equations(
-    hand: HandArrays,
-    digit: int,
-    markers: Int[np.ndarray, "K"],
-    points: Float[np.ndarray, "C 3"],
-    variance: Float[np.ndarray, "M"],
+def _accumulate_digit(
+    own: DigitPoints,
     hypothesis: Int[np.ndarray, "K"],
-    mean: Float[np.ndarray, "4"],
-    precision: Float[np.ndarray, "4 4"],
     angles: Float[np.ndarray, "4"],
     work: Workspace,
     normal: Float[np.ndarray, "4 4"],
     gradient: Float[np.ndarray, "4"],
 ) -> float:
-    """Cost at some angles [rad]; its normal matrix and half its gradient are filled.
-
-    The arguments are those of `fit_hypothesis`.
-    """
+    """Cost of a hypothesis at some angles [rad]; its normal matrix and half its gradient are filled."""
     normal[:] = 0.0
     gradient[:] = 0.0
-    cost, first = 0.0, 4 * digit
-    compute_digit(hand, digit, angles, work)
-    for slot in range(len(markers)):
+    hand, mean, precision, cost, first = own.hand, own.mean, own.precision, 0.0, 4 * own.digit
+    compute_digit(hand, own.digit, angles, work)
+    for slot in range(len(own.markers)):
         if hypothesis[slot] < 0:
             continue
-        marker, point = markers[slot], points[hypothesis[slot]]
+        marker, point = own.markers[slot], own.points[hypothesis[slot]]
         compute_marker(hand, marker, work)
         marker_jacobian(hand, marker, work)
-        weight, jacobian, position = 1.0 / variance[marker], work.jacobian[marker], work.markers[marker]
+        weight, jacobian, position = 1.0 / own.variance[marker], work.jacobian[marker], work.markers[marker]
         x, y, z = position[0] - point[0], position[1] - point[1], position[2] - point[2]
         cost += 0.5 * weight * (x * x + y * y + z * z)
         for row in range(4):
@@ -459,9 +377,9 @@ def _accumulate_normal_equations(
         low, high = hand.ranges[first + row, 0], hand.ranges[first + row, 1]
         beyond = max(angles[row] - high, 0.0) + min(angles[row] - low, 0.0)
         if beyond != 0.0:
-            cost += 0.5 * _LIMIT_PRECISION * beyond * beyond
-            gradient[row] += _LIMIT_PRECISION * beyond
-            normal[row, row] += _LIMIT_PRECISION
+            cost += 0.5 * LIMIT_PRECISION * beyond * beyond
+            gradient[row] += LIMIT_PRECISION * beyond
+            normal[row, row] += LIMIT_PRECISION
     return cost  # type: ignore[no-any-return]
 
 

@@ -17,6 +17,14 @@ from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
 
+_LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
+# Distance of a point from its prediction [m], before hands are aligned and after each alignment.
+_DISTANCES: Final = (0.04, 0.025, 0.015)
+_FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
+_NEIGHBORS: Final = 0.06  # [m] between markers whose distance hardly changes from frame to frame
+_FEWEST_NEIGHBORS: Final = 3  # pairs of these that tell something
+_BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
+
 
 class Numbering:
     """The one numbering of the markers of all owners: hands, then bodies.
@@ -43,9 +51,7 @@ class Numbering:
     ) -> Int[np.ndarray, "N"]:
         """Labels in which exactly these points are an owner's markers.
 
-        Args:
-            markers: Its marker that each point is; -1 where it is none of them.
-            labels: Labels before; those of other owners stay, but where `markers` has a marker.
+        `markers` are -1 for points that are none of them; other owners' labels stay where they are.
         """
         return _with_markers(labels, self._first[owner], self._first[owner + 1], markers)
 
@@ -89,12 +95,7 @@ class FrameState(NamedTuple):
     def with_confidence(
         self, changed: Bool[np.ndarray, "P"], confidence: Float[np.ndarray, "C"]
     ) -> FrameState:
-        """The state in which C labels are new: without evidence so far, and with this confidence.
-
-        Args:
-            changed: Points whose label is new.
-            confidence: Confidence in each of these labels, 0 to 1.
-        """
+        """The state in which C labels are new: without evidence so far, and with this confidence (0 to 1)."""
         evidence, all_confidence = self.evidence.copy(), self.confidence.copy()
         evidence[changed], all_confidence[changed] = 0.0, confidence
         return self._replace(evidence=evidence, confidence=all_confidence)
@@ -111,12 +112,7 @@ class FrameState(NamedTuple):
 def targets_of(
     points: Float[np.ndarray, "N 3"], markers: Int[np.ndarray, "N"], count: int
 ) -> Float[np.ndarray, "M 3"]:
-    """Labeled points in the layout's order [m], NaN where a marker has no point.
-
-    Args:
-        markers: Marker of each point, -1 for none.
-        count: Markers of the layout.
-    """
+    """Labeled points in the order of a layout of so many markers [m], NaN where a marker has no point."""
     targets = np.full((count, 3), np.nan)
     for point in range(len(markers)):
         if markers[point] >= 0:
@@ -146,15 +142,6 @@ def _with_markers(
         elif first <= labels[point] < last:
             changed[point] = -1
     return changed
-
-
-_LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
-# Distance of a point from its prediction [m], before hands are aligned and after each alignment.
-_DISTANCES: Final = (0.04, 0.025, 0.015)
-_FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
-_NEIGHBORS: Final = 0.06  # [m] between markers whose distance hardly changes from frame to frame
-_FEWEST_NEIGHBORS: Final = 3  # pairs of these that tell something
-_BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
 
 
 class PointHistory:
@@ -308,11 +295,7 @@ def match_log_odds(
     covariances: Float[np.ndarray, "K 3 3"],
     stray_density: float,
 ) -> Float[np.ndarray, "P K"]:
-    """Log-odds of each point being a marker rather than a stray.
-
-    Args:
-        stray_density: Density of points that are no marker [1/m^3].
-    """
+    """Log-odds of each point being a marker rather than a stray; strays have a density [1/m^3]."""
     innovation = points[:, None] - positions
     precision = np.linalg.inv(covariances)
     square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
@@ -323,12 +306,7 @@ def match_log_odds(
 
 
 def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:
-    """Log-odds of a point exactly at the predicted position of a marker.
-
-    Args:
-        variances: Variance of each marker in each direction [m^2].
-        stray_density: Density of points that are no marker [1/m^3].
-    """
+    """Log-odds of a point exactly at the predicted position of a marker of some variance [m^2]."""
     log_odds: np.ndarray = -1.5 * np.log(variances) - _stray_log_density(stray_density)
     return log_odds
 

@@ -28,7 +28,7 @@ from track.kinematics.pose_spread import (
     MarkerPrediction,
     SpreadModel,
     predict_joints,
-    resting_covariance,
+    predict_markers,
     resting_prior,
 )
 
@@ -41,9 +41,9 @@ _WRIST_ACCELERATION: Final = 10.0  # [m/s^2] unforeseen
 _WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # of its predicted orientation in the same frame
 _WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] unforeseen
 # Measurement model: spread and bias of markers.
-_FIRST_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
-_FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
-_LEAST_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
+_INITIAL_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
+_INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
+_LEAST_MARKER_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
 _BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
@@ -65,50 +65,33 @@ MOST_AGE_LOG_ODDS: Final = 3.0
 class Prediction(NamedTuple):
     """A hand's pose before the markers of a frame are used."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The predicted pose."""
-    positions: Float[np.ndarray, "M 3"]
-    """Its markers in the world [m]."""
-    joint_prior: JointPrior
-    """Distribution of the hinges."""
-    wrist_spread: tuple[float, float]
-    """Standard deviations of the wrist's position [m] and orientation [rad]."""
+    qpos: Float[np.ndarray, "27"]  # the predicted pose
+    positions: Float[np.ndarray, "M 3"]  # its markers in the world [m]
+    joint_prior: JointPrior  # distribution of the hinges
+    wrist_spread: tuple[float, float]  # standard deviations of the wrist's position [m] and orientation [rad]
 
 
 class HandEstimate(NamedTuple):
     """A hand's pose that was fitted to the markers of a frame."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The fitted pose."""
-    rms: float
-    """3D RMS distance over the markers that are present [m]."""
-    residuals: Float[np.ndarray, "M 3"]
-    """Model minus marker [m], NaN where a marker is missing."""
-    predicted: MarkerPrediction
-    """Markers and hinges at that pose, with covariances."""
+    qpos: Float[np.ndarray, "27"]  # the fitted pose
+    rms: float  # 3D RMS distance over the markers that are present [m]
+    residuals: Float[np.ndarray, "M 3"]  # model minus marker [m], NaN where a marker is missing
+    predicted: MarkerPrediction  # markers and hinges at that pose, with covariances
 
     @property
     def positions(self) -> Float[np.ndarray, "M 3"]:
         """Positions of the pose's markers in the world [m]."""
         return self.predicted.positions
 
-    @property
-    def covariances(self) -> Float[np.ndarray, "M 3 3"]:
-        """Covariance of each marker in the world [m^2]."""
-        return self.predicted.covariances
-
 
 class Biases(NamedTuple):
     """What is known of the biases of a hand's markers."""
 
-    bias: Float[np.ndarray, "M 3"]
-    """In the frames of the bones [m]."""
-    frames: Float[np.ndarray, "M"]
-    """Frames that each is averaged over."""
-    learned_variance: Float[np.ndarray, "M"]
-    """Variance of each marker while its bias is certain [m^2]."""
-    variance: Float[np.ndarray, "M"]
-    """Variance of each marker at the last prediction [m^2]."""
+    bias: Float[np.ndarray, "M 3"]  # in the frames of the bones [m]
+    frames: Float[np.ndarray, "M"]  # frames that each is averaged over
+    learned_variance: Float[np.ndarray, "M"]  # variance of each marker while its bias is certain [m^2]
+    variance: Float[np.ndarray, "M"]  # variance of each marker at the last prediction [m^2]
 
 
 class HandState:
@@ -140,15 +123,14 @@ class HandState:
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
         """The hand as arrays, its markers shifted by their biases."""
-        self.variance = np.full(count, _FIRST_SPREAD_MOST**2)
+        self.variance = np.full(count, _INITIAL_SPREAD_MOST**2)
         """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
         self.positions = np.full((count, 3), np.nan)
         """Positions (M, 3) of the pose's markers [m]."""
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
         """Digits that have had a settled label since the hand was initialized."""
         self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
-        self._joint_covariance = resting_covariance()  # [rad^2] of the last estimate
-        self._resting_prior = resting_prior()
+        self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
@@ -199,13 +181,15 @@ class HandState:
                 prediction.wrist_spread,
             )
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
-        predicted = self.solver.predict_markers(
+        predicted = predict_markers(
+            self.solver.hand,
+            self.solver.on_part,
             qpos,
             targets,
             prediction.joint_prior,
-            wrist_spread=prediction.wrist_spread,
-            variance=self.variance,
-            noise=self.config.marker_noise,
+            prediction.wrist_spread,
+            self.variance,
+            self.config.marker_noise,
         )
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
@@ -224,7 +208,7 @@ class HandState:
             slack,
             self._ranges,
         )
-        return confirmed, confirmed._replace(joint_prior=self._resting_prior)
+        return confirmed, confirmed._replace(joint_prior=resting_prior())
 
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
         """What computes the standard deviations of this pose at a time [s], whatever the hand does later."""
@@ -267,14 +251,14 @@ class HandState:
         self._last_label[:] = -np.inf
         self.confirmed[:] = False
         positions = self.solver.marker_positions(qpos)
-        unknown = Prediction(qpos, positions, self._resting_prior, (1.0, 1.0))
+        unknown = Prediction(qpos, positions, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
         if not (self._bias_frames.any() and estimate.rms < _BIAS_REUSE_RMS):
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
             self._shift_markers()
             estimate = self.fit(targets, qpos, unknown)
-            spread = _FIRST_SPREAD * estimate.rms
-            self._variance[:] = np.clip(spread, _FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST) ** 2
+            spread = _INITIAL_SPREAD * estimate.rms
+            self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
         self._store(estimate, time)
         return estimate
 
@@ -286,14 +270,13 @@ class HandState:
     @property
     def biases(self) -> Biases:
         """A copy of what is known of the markers' biases, for `recall`."""
-        return Biases(
-            self._bias.copy(), self._bias_frames.copy(), self._variance.copy(), self.variance.copy()
-        )
+        known = (self._bias, self._bias_frames, self._variance, self.variance)
+        return Biases(*(values.copy() for values in known))
 
     def forget(self, markers: Int[np.ndarray, "K"]) -> None:
         """Forget the biases of some markers: they are where the glove has them again, give or take."""
         self._bias[markers], self._bias_frames[markers] = 0.0, 0.0
-        self._variance[markers] = self.variance[markers] = _FIRST_SPREAD_MOST**2
+        self._variance[markers] = self.variance[markers] = _INITIAL_SPREAD_MOST**2
         self._shift_markers()
 
     def recall(self, biases: Biases) -> None:
@@ -325,7 +308,6 @@ class HandState:
             estimate.predicted.rotations,
             settled,
             seen[parts] >= np.where(parts > 0, _FEWEST_ON_DIGIT, _FEWEST_ON_PALM),
-            _AVERAGING_FRAMES,
             self._bias_frames,
             self._bias,
             self._variance,
@@ -349,34 +331,19 @@ class HandState:
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
-        """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m].
-
-        A bias is in the frame of its bone, and known if averaged over any frames; it changes by a share
-        `variation` of the typical one as the hand moves. Variances below the least are overwritten, as are
-        the first `positions` of each marker in `HandArrays`.
-        """
+        """Shift the hand's markers by their biases, and update the typical bias and the least variances."""
         self._typical_bias = _shift_markers(
-            self._bias_frames,
-            self._bias,
-            self._designed,
-            _LEAST_SPREAD,
-            _BIAS_VARIATION,
-            self._variance,
-            self.adapted.positions,
+            self._bias_frames, self._bias, self._designed, self._variance, self.adapted.positions
         )
 
 
 class HandTrack(NamedTuple):
     """A hand with a pose in the current frame."""
 
-    hand: int
-    """Index of the hand."""
-    state: HandState
-    """Its filter state."""
-    prediction: Prediction
-    """The pose before the frame's markers were used."""
-    estimate: HandEstimate
-    """The pose fitted to its labels so far."""
+    hand: int  # index of the hand
+    state: HandState  # its filter state
+    prediction: Prediction  # the pose before the frame's markers were used
+    estimate: HandEstimate  # the pose fitted to its labels so far
 
 
 @kernel
@@ -385,7 +352,6 @@ def _learn_bias(
     rotations: Float[np.ndarray, "M 3 3"],
     settled: Bool[np.ndarray, "M"],
     is_tested: Bool[np.ndarray, "M"],
-    averaging_frames: float,
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
@@ -394,13 +360,13 @@ def _learn_bias(
 
     Residuals are model minus marker in the world [m], rotations those of the markers' bones. Any pose fits
     markers that are not tested by others on their part: their variance stays. `bias_frames`, `bias` [m] and
-    `variance` [m^2] are overwritten; an average goes over `averaging_frames` at most.
+    `variance` [m^2] are overwritten.
     """
     residual = np.empty(3)
     for marker in range(len(residuals)):
         if not settled[marker] or np.isnan(residuals[marker, 0]):
             continue
-        bias_frames[marker] = min(bias_frames[marker] + 1.0, averaging_frames)
+        bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
         square = 0.0
         for i in range(3):
             residual[i] = 0.0
@@ -417,8 +383,6 @@ def _shift_markers(
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     designed: Float[np.ndarray, "M 3"],
-    least_spread: float,
-    variation: float,
     variance: Float[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 4 3"],
 ) -> float:
@@ -428,8 +392,6 @@ def _shift_markers(
         bias_frames: Frames that each bias was averaged over; zero where it is unknown.
         bias: Bias of each marker in the frame of its bone [m].
         designed: Position of each marker in that frame as the glove has it [m].
-        least_spread: Least standard deviation of a marker [m].
-        variation: Share of the typical bias by which a bias changes as the hand moves.
         variance: Variance of each marker [m^2], overwritten where it is below the least.
         positions: `HandArrays.positions`; the first of each marker is overwritten.
     """
@@ -441,15 +403,13 @@ def _shift_markers(
         count += bias_frames[marker] > 0.0
     square /= max(count, 1)
     for marker in range(len(bias_frames)):
-        variance[marker] = max(variance[marker], least_spread**2 + variation**2 * square)
+        variance[marker] = max(variance[marker], _LEAST_MARKER_SPREAD**2 + _BIAS_VARIATION**2 * square)
     return np.sqrt(square)  # type: ignore[no-any-return]
 
 
 @kernel
 def _rms_without_bias(
-    residuals: Float[np.ndarray, "M 3"],
-    rotations: Float[np.ndarray, "M 3 3"],
-    bias: Float[np.ndarray, "M 3"],
+    residuals: Float[np.ndarray, "M 3"], rotations: Float[np.ndarray, "M 3 3"], bias: Float[np.ndarray, "M 3"]
 ) -> float:
     """RMS of the residuals with the biases added back [m]; the arguments are those of `_learn_bias`."""
     square, count = 0.0, 0

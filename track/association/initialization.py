@@ -30,8 +30,8 @@ from train.labelers.protocol import MAX_POINTS, Labeler
 MOST_POINTS: Final = 100
 """Largest number of points of a group that may be a hand."""
 _LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
-_LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
-_LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
+_LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand are linked
+_LEAST_LABELED_SHARE: Final = 0.45  # of a hand's markers that must be labeled
 FEWEST_POINTS: Final = 4
 """Least number of labeled points of a hand; a pose needs as many."""
 SPARE_POINTS: Final = 6
@@ -40,54 +40,52 @@ _SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few 
 _CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
-_FIRST_CUTS: Final = 3  # tried together; mostly one of them is enough
-_LAST_TURN: Final = _CUTS_OF_SEARCH - _FIRST_CUTS  # number of the call in which a search ends
-_CROSSED: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
-_MOST_FITS: Final = 3  # labeled clouds that are fitted at a time, the most confident ones
-_FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
-_MORE_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
+_CUTS_AT_FIRST: Final = 3  # tried together; mostly one of them is enough
+_LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # number of the call in which a search ends
+_EXCHANGE_DISTANCE: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
+_FITS_AT_A_TIME: Final = 3  # labeled clouds that are fitted at a time, the most confident ones
+# From each starting pose of a first fit: enough to tell a hand from its mirror image.
+_FIRST_FIT_STEPS: Final = 6
+_REFIT_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
-_LEAST_KEPT: Final = 0.75  # share of the labels that a robust fit keeps of a hand; a mirrored one loses more
+# Share of the labels that a robust fit keeps of a hand; a mirrored one loses more.
+_LEAST_KEPT_LABELS: Final = 0.75
 _POSE_WEIGHT: Final = 0.25  # log-odds of a pose for each squared deviation beyond the usual
 _MOST_POSE_PENALTY: Final = 20.0  # log-odds, because people do unusual things
 _REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
 _SEARCH_FACTOR: Final = 4.0  # spread of the markers in these rounds over that of the fit
 _SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of that spread
 _FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its points, in effect
-_USUAL_SPREAD: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
-_SUPPOSED: Final = 6.0  # coordinates that this spread counts for
-_MOST_MARKERS: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
+_SPREAD_BEFORE: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
+_SPREAD_BEFORE_COORDINATES: Final = 6.0  # coordinates that this spread counts for
+_MARKERS_OF_EVIDENCE: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker after which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
 _GOOD_RMS: Final = 0.003  # [m] of that hand at most; a wrong label may bend the hand that it should have been
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
+_CLOUD_RADIUS: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
+# Share of a capture's frames with a hand, from which on the others hold one too.
+_USUAL_HAND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitializedHand:
     """A hand that was initialized."""
 
-    index: int
-    """Index of the hand."""
-    fit: PoseFit
-    """Its pose, one frame."""
-    labels: Int[np.ndarray, "N"]
-    """Marker of each point, -1 for points that are none of this hand's."""
-    score: float
-    """See `HandInitializer.score`."""
+    index: int  # index of the hand
+    fit: PoseFit  # its pose, one frame
+    labels: Int[np.ndarray, "N"]  # marker of each point, -1 for points that are none of this hand's
+    score: float  # see `HandInitializer.score`
 
 
 @dataclass(slots=True)
 class _Search:
     """Where a search for some hands among points of more than one stands."""
 
-    turn: int = 0
-    """Number of calls before this one."""
-    best_turn: int = 0
-    """The one that gave the best hand so far, though none that is certain."""
-    score: float = -np.inf
-    """Of that hand."""
+    turn: int = 0  # number of calls before this one
+    best_turn: int = 0  # the one that gave the best hand so far, though none that is certain
+    score: float = -np.inf  # of that hand
 
 
 class HandInitializer:
@@ -176,10 +174,7 @@ class HandInitializer:
         if len(hands) != 2:
             return hands
         one, two = hands
-        first = (
-            self._first_fit(two.index, points, one.labels),
-            self._first_fit(one.index, points, two.labels),
-        )
+        first = self._fit(two.index, points, one.labels), self._fit(one.index, points, two.labels)
         if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
             return hands
         return _likelier([self._trim(fit, points) for fit in first], hands)
@@ -192,7 +187,9 @@ class HandInitializer:
         """
         taken = min(_FREE_COORDINATES, 3.0 * count)
         square = count * rms**2
-        variance = (square + _SUPPOSED * _USUAL_SPREAD**2) / (3.0 * count - taken + _SUPPOSED)
+        variance = (square + _SPREAD_BEFORE_COORDINATES * _SPREAD_BEFORE**2) / (
+            3.0 * count - taken + _SPREAD_BEFORE_COORDINATES
+        )
         variance = variance if spread is None else spread**2
         peak = peak_log_odds(np.array([variance]), self._config.stray_density)
         return float(count * peak[0] - 0.5 * (square / variance + taken))
@@ -205,7 +202,7 @@ class HandInitializer:
 
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
-        share = _LEAST_SHARE * self._states[index].num_markers
+        share = _LEAST_LABELED_SHARE * self._states[index].num_markers
         return max(FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
@@ -220,7 +217,7 @@ class HandInitializer:
         if not len(cuts):
             return self._better(None, points, group, [group], hands)
         best: InitializedHand | None = None
-        for turn in range(len(cuts) - _FIRST_CUTS + 1) if self._at_once else [search.turn]:
+        for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
             best = self._better(best, points, group, self._clouds(points, group, cuts, turn), hands)
             if best is not None and self._is_certain(best):
                 return best
@@ -254,8 +251,8 @@ class HandInitializer:
         hands: Sequence[int],
     ) -> InitializedHand | None:
         """The best hand so far, or one of these clouds of a group with a better score."""
-        for labels in self._labeled(points, clouds)[:_MOST_FITS]:
-            fits = [self._first_fit(index, points, labels) for index in hands]
+        for labels in self._labeled(points, clouds)[:_FITS_AT_A_TIME]:
+            fits = [self._fit(index, points, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
@@ -288,21 +285,12 @@ class HandInitializer:
     ) -> list[NDArray[np.int64]]:
         """The clouds of a turn: the whole group and its halves along the first cuts, then one cut a turn."""
         clouds = [group] if turn == 0 else []
-        for cut in cuts[:_FIRST_CUTS] if turn == 0 else cuts[turn + _FIRST_CUTS - 1 : turn + _FIRST_CUTS]:
+        for cut in (
+            cuts[:_CUTS_AT_FIRST] if turn == 0 else cuts[turn + _CUTS_AT_FIRST - 1 : turn + _CUTS_AT_FIRST]
+        ):
             order = group[np.argsort(points[group] @ self._directions[cut])]
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
-
-    def _first_fit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64]
-    ) -> InitializedHand | None:
-        """A hand fitted to all labeled points; None where they are too few for one."""
-        if (labels >= 0).sum() < self._least(index):
-            return None
-        state = self._states[index]
-        targets = targets_of(points, labels, state.num_markers)
-        fit = state.solver.solve(targets[None], iterations=_FIRST_STEPS)
-        return self._scored(index, fit, labels)
 
     def _improve(
         self, first: InitializedHand, points: NDArray[np.float64], group: NDArray[np.int64]
@@ -322,7 +310,7 @@ class HandInitializer:
             labels[group], _ = match_points(log_odds)
             if (labels == hand.labels).all():
                 break
-            hand = self._trim(self._refit(index, points, labels, hand.fit), points)
+            hand = self._trim(self._fit(index, points, labels, hand.fit), points)
         return hand
 
     def _divided(
@@ -353,13 +341,13 @@ class HandInitializer:
             )
             if not len(ours) or not len(theirs):
                 continue
-            if distances_to_nearest(points[ours], points[theirs]).min() > _CROSSED:
+            if distances_to_nearest(points[ours], points[theirs]).min() > _EXCHANGE_DISTANCE:
                 continue
             first, second = one.labels.copy(), two.labels.copy()
             first[ours], second[theirs] = -1, -1
             first[theirs], second[ours] = two.labels[theirs], one.labels[ours]
             changed = [
-                self._trim(self._refit(hand.index, points, labels, hand.fit), points)
+                self._trim(self._fit(hand.index, points, labels, hand.fit), points)
                 for hand, labels in ((one, first), (two, second))
             ]
             hands = _likelier(changed, hands)
@@ -374,12 +362,12 @@ class HandInitializer:
             squares = (hand.fit.residuals[0, hand.labels[labeled]] ** 2).sum(axis=1)
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
-            hand = self._refit(hand.index, points, labels, hand.fit)
+            hand = self._fit(hand.index, points, labels, hand.fit)
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
             and best.score
-            >= self._config.least_evidence * min(_MOST_MARKERS, self._states[best.index].num_markers)
+            >= self._config.least_evidence * min(_MARKERS_OF_EVIDENCE, self._states[best.index].num_markers)
         )
         return best if accepted else None
 
@@ -392,34 +380,31 @@ class HandInitializer:
         """
         state = self._states[first.index]
         targets = targets_of(points, first.labels, state.num_markers)
-        fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_STEPS)
+        fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
         distances = np.linalg.norm(fit.residuals[0], axis=-1)
         kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
-        if kept.sum() < _LEAST_KEPT * (first.labels >= 0).sum():
+        if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
-        return self._refit(first.index, points, np.where(kept, first.labels, -1), fit)
+        return self._fit(first.index, points, np.where(kept, first.labels, -1), fit)
 
-    def _refit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit
+    def _fit(
+        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
-        """A hand fitted to labeled points from a near pose; None where they are too few."""
-        if (labels >= 0).sum() < self._least(index):
-            return None
-        state = self._states[index]
-        targets = targets_of(points, labels, state.num_markers)
-        return self._scored(
-            index, state.solver.solve(targets[None], near.qpos, iterations=_MORE_STEPS), labels
-        )
+        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few.
 
-    def _scored(self, index: int, fit: PoseFit, labels: NDArray[np.int64]) -> InitializedHand:
-        """A fit with its score; a hand that was seen lately must fit as well as then."""
-        known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
-        spread = self._spreads[index] if known else None
-        count, rms = int((labels >= 0).sum()), float(fit.rms[0])
+        Its score counts how unusual the pose is; a hand that was seen lately must fit as well as then.
+        """
+        count, state = int((labels >= 0).sum()), self._states[index]
+        if count < self._least(index):
+            return None
+        targets = targets_of(points, labels, state.num_markers)[None]
+        start, steps = (None, _FIRST_FIT_STEPS) if near is None else (near.qpos, _REFIT_STEPS)
+        fit = state.solver.solve(targets, start, iterations=steps)
+        spread = self._spreads[index] if self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS else None
         offset = fit.qpos[0, 7:] - self._prior.angles
         unusual = float(offset @ self._prior.precision @ offset) - NUM_JOINTS
         penalty = min(max(_POSE_WEIGHT * unusual, 0.0), _MOST_POSE_PENALTY)
-        return InitializedHand(index, fit, labels, self.score(count, rms, spread) - penalty)
+        return InitializedHand(index, fit, labels, self.score(count, float(fit.rms[0]), spread) - penalty)
 
 
 def _likelier(
@@ -442,11 +427,7 @@ def _link_distance(hand: GloveFit) -> float:
     """Distance within which the neighboring markers of a hand are, while all are seen [m]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
-    return float(np.quantile(longest_links(markers), _LINKED))
-
-
-_NEAR: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
-_USUAL: Final = 0.5  # share of a capture's frames with a hand, from which on the others hold one too
+    return float(np.quantile(longest_links(markers), _LINKED_GESTURES))
 
 
 class FrameLabels(NamedTuple):
@@ -493,7 +474,7 @@ def _clouds(
     most = num_markers + SPARE_POINTS
     full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_POINTS]
     sides = [hand.index for hands in found for hand in hands]
-    usual = np.bincount(sides).argmax() if sides and np.mean(full) >= _USUAL else None
+    usual = np.bincount(sides).argmax() if sides and np.mean(full) >= _USUAL_HAND_SHARE else None
     clouds = []
     for number, (points, hands) in enumerate(zip(frames, found, strict=True)):
         small = FEWEST_POINTS <= len(points) <= most
@@ -501,7 +482,7 @@ def _clouds(
             clouds.append((number, hands[0].index if hands else int(usual), np.arange(len(points))))  # type: ignore[arg-type]
             continue
         for hand in hands:
-            near = distances_to_nearest(points, points[hand.labels >= 0]) < _NEAR
+            near = distances_to_nearest(points, points[hand.labels >= 0]) < _CLOUD_RADIUS
             for other in hands:
                 near &= (other.labels < 0) | (other is hand)
             clouds.append((number, hand.index, np.flatnonzero(near)[:MAX_POINTS]))

@@ -26,7 +26,7 @@ from train.labelers.protocol import Labeler
 _GATE: Final = 16.0  # squared Mahalanobis distance of a point that is fitted: four standard deviations
 _PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a predicted marker beside its own spread
 _PREDICTION_FACTOR: Final = 2.0  # the same over what the other markers show in this frame
-_MOST_GATED: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong
+_MOST_GATED_SHARE: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong
 EXCHANGE_DISTANCE: Final = 0.04
 """Distance of two points within which their IDs may be exchanged [m]."""
 _EXCHANGE_MARGIN: Final = 8.0  # log-odds from which on two labels are exchanged; systems rarely exchange IDs
@@ -36,6 +36,19 @@ _FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker beside 
 _RESTART_RMS: Final = 0.004  # [m] beyond which a fit is tried again from shapes instead of the prediction
 _RESTART_STEPS: Final = 8  # from each starting pose; the fit goes on from there
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
+# [m] from a missing marker, within which the labeler is shown points without a label.
+_CLOUD_RADIUS: Final = 0.06
+# [m] the same of a marker whose digit has no label: it may be bent or straight.
+_DIGIT_CLOUD_RADIUS: Final = 0.13
+_FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
+_REVIEW_WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
+_DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
+_REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
+# Share of a point's distance that is left without a bias, to doubt the bias.
+_DOUBTED_BIAS_SHARE: Final = 0.85
+_MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps the label that it has
+_REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds added by each earlier review with the same labels
+_MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes
 
 
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
@@ -123,7 +136,7 @@ def _gate(
         squares[row] = ((points[point] - positions[markers[point]]) ** 2).sum()
     shown = max(_PREDICTION_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / _MEDIAN_SQUARE)
     outside = squares > _GATE * (variance[markers[labeled]] + shown)
-    if outside.sum() <= _MOST_GATED * len(labeled):
+    if outside.sum() <= _MOST_GATED_SHARE * len(labeled):
         markers[labeled[outside]] = -1
 
 
@@ -186,18 +199,6 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
     return frame, track._replace(estimate=estimate)
 
 
-_RADIUS: Final = 0.06  # [m] from a missing marker, within which the labeler is shown points without a label
-_DIGIT_RADIUS: Final = 0.13  # [m] the same of a marker whose digit has no label: it may be bent or straight
-_FIRST_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
-_WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
-_SEEN_ELSEWHERE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
-_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
-_MUCH_NEARER: Final = 0.85  # share of a point's distance that is left without a bias, to doubt the bias
-_MOVED_LABEL: Final = 2.0  # log-odds that a point keeps the label that it has
-_PERSISTENCE: Final = 1.0  # log-odds added by each earlier review with the same labels
-_MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes
-
-
 class _Proposal(NamedTuple):
     """Labels of a hand's points by the labeler, and the pose that fits them."""
 
@@ -220,7 +221,7 @@ class LabelerReview:
     def __init__(self, labeler: Labeler, num_hands: int, config: TrackerConfig) -> None:
         self._labeler = labeler
         self._config = config
-        self._wait = np.full(num_hands, _FIRST_WAIT)  # [s] from a hand's last review to its next
+        self._wait = np.full(num_hands, _FIRST_REVIEW_WAIT)  # [s] from a hand's last review to its next
         self._last = np.full(num_hands, -np.inf)  # [s] of each hand's last review
         self._earlier: list[dict[tuple[int, int], int]] = [{} for _ in range(num_hands)]
         # How many reviews in turn found other labels of points likelier, but not by enough.
@@ -228,7 +229,7 @@ class LabelerReview:
 
     def restart(self, index: int, time: float) -> None:
         """Note that a hand was initialized at a time [s]: its labels are reviewed soon."""
-        self._wait[index], self._last[index] = _FIRST_WAIT, time
+        self._wait[index], self._last[index] = _FIRST_REVIEW_WAIT, time
 
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
         """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
@@ -253,7 +254,7 @@ class LabelerReview:
                     track.state.recall(biases)
         if proposal is None:
             return frame, track
-        self._wait[track.hand] = _FIRST_WAIT
+        self._wait[track.hand] = _FIRST_REVIEW_WAIT
         proposed = proposal.frame.markers(track.hand)
         changed = (proposed != markers) & (proposed >= 0)
         reviewed = proposal.frame.with_confidence(changed, proposal.confidence[changed])
@@ -280,7 +281,7 @@ class LabelerReview:
         }
         earlier = self._earlier[track.hand]
         times = min((earlier.get(change, 0) for change in changes), default=0)
-        if gain + _PERSISTENCE * times >= _MARGIN:
+        if gain + _REPEATED_REVIEW_LOG_ODDS * times >= _REVIEW_MARGIN:
             return proposal
         if gain > 0.0:
             self._earlier[track.hand] = {change: earlier.get(change, 0) + 1 for change in changes}
@@ -293,7 +294,7 @@ class LabelerReview:
             missing = np.ones(track.state.num_markers, dtype=bool)
             missing[markers[markers >= 0]] = False
             digits = track.state.digits
-            radius = np.where(np.isin(digits, digits[~missing]), _RADIUS, _DIGIT_RADIUS)
+            radius = np.where(np.isin(digits, digits[~missing]), _CLOUD_RADIUS, _DIGIT_CLOUD_RADIUS)
             offsets = frame.points[near, None] - track.estimate.positions[missing]
             near[near] = (np.linalg.norm(offsets, axis=-1) < radius[missing]).any(axis=1)
         return near
@@ -305,8 +306,8 @@ class LabelerReview:
         if not new and frame.time < self._last[index] + self._wait[index]:
             return False
         self._open[index], self._last[index] = points, frame.time
-        longer = min(_WAIT_FACTOR * self._wait[index], self._config.longest_review_wait)
-        self._wait[index] = _FIRST_WAIT if new else longer
+        longer = min(_REVIEW_WAIT_FACTOR * self._wait[index], self._config.longest_review_wait)
+        self._wait[index] = _FIRST_REVIEW_WAIT if new else longer
         return True
 
     def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal) -> float:
@@ -318,13 +319,13 @@ class LabelerReview:
         sure = np.clip(proposal.confidence[named], 0.5, 1.0 - 1e-6)
         gain += np.minimum(np.log(sure / (1.0 - sure)), _MOST_ANSWER_LOG_ODDS).sum()
         fresh = named[before[named] < 0]
-        gain -= _MOVED_LABEL * (len(named) - len(fresh))
+        gain -= _MOVED_LABEL_LOG_ODDS * (len(named) - len(fresh))
         presence = track.state.presence_log_odds(frame.first_seen[fresh])[
             np.arange(len(fresh)), proposed[fresh]
         ]
         # That the marker was seen elsewhere is what the review doubts.
         doubted = presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS
-        return float(gain + presence[~doubted].sum() + _SEEN_ELSEWHERE * doubted.sum())
+        return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
     def _log_odds(
         self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64], estimate: HandEstimate
@@ -349,5 +350,5 @@ def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64
     points, markers = frame.points[rows], named[rows]
     without = np.linalg.norm(points - track.state.unbiased_positions(track.estimate)[markers], axis=1)
     with_bias = np.linalg.norm(points - track.estimate.positions[markers], axis=1)
-    doubted = markers[without < _MUCH_NEARER * with_bias]
+    doubted = markers[without < _DOUBTED_BIAS_SHARE * with_bias]
     return np.setdiff1d(doubted, frame.markers(track.hand))

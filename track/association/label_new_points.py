@@ -1,9 +1,8 @@
 """Labels for new points: first the palms' markers, then those of all digits with candidates, jointly.
 
-All assignments of a digit's candidates to its markers are tested on the digit
-(`track.association.digit_hypotheses`). Where digits share candidates, of one hand or of two that touch, the
-best joint assignment is taken (`track.association.assignment`). Labels that are not settled yet can be
-reassigned.
+The points within a radius of a digit's markers are its candidates. All assignments of them to its markers
+are tested on the digit (`track.association.digit_hypotheses`). Where digits share candidates, of one hand or
+of two that touch, the best joint assignment is taken. Labels with weak evidence can be reassigned.
 """
 
 from __future__ import annotations
@@ -21,18 +20,38 @@ from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses, empt
 from track.association.frame_state import FrameState, Numbering, match_log_odds, match_points
 from track.association.hand_state import HandState, HandTrack
 
+MAX_CANDIDATES: Final = 7
+"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
+SETTLED_EVIDENCE: Final = 4.0
+"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
 _NOWHERE: Final = 1e6  # [m] of the markers of a hand without a pose, which no point is near
+_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
+_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
 
 
 class DigitTable(NamedTuple):
     """The D digits of all hands, counted through the hands, with their labels."""
 
-    digits: Int[np.ndarray, "K"]
-    """Digit of each label, -1 for a palm's."""
-    labels: Int[np.ndarray, "D K"]
-    """Labels of each digit, -1 where there are fewer."""
-    markers: Int[np.ndarray, "D K"]
-    """The same in the order of the hand's layout."""
+    digits: Int[np.ndarray, "K"]  # digit of each label, -1 for a palm's
+    labels: Int[np.ndarray, "D K"]  # labels of each digit, -1 where there are fewer
+    markers: Int[np.ndarray, "D K"]  # the same in the order of the hand's layout
+
+
+class MarkerTable(NamedTuple):
+    """The K markers of all hands by their labels, and the label of each of N points."""
+
+    positions: Float[np.ndarray, "K 3"]  # predicted positions [m]
+    digits: Int[np.ndarray, "K"]  # digit of each marker, counted through the hands; -1 on a palm
+    assigned: Int[np.ndarray, "N"]  # label of each point, -1 for none
+
+
+class DigitCandidates(NamedTuple):
+    """Candidate points of D digits, those with their labels among them."""
+
+    candidates: Int[np.ndarray, "D 7"]
+    """Points of each digit: first those labeled as its markers, then others, the nearest first."""
+    counts: Int[np.ndarray, "D"]
+    """How many there are; zero where there is nothing to decide."""
 
 
 def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
@@ -49,17 +68,12 @@ def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable
 
 
 def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: DigitTable) -> FrameState:
-    """Label points without a label, and reassign labels that are not settled.
-
-    Args:
-        tracks: The hands that have a pose.
-    """
+    """Label points without a label, and reassign labels with weak evidence, by the hands that have a pose."""
     if not tracks:
         return frame
-    for track in tracks:
-        frame = _label_palm(frame, track)
     positions = np.full((len(table.digits), 3), _NOWHERE)
     for track in tracks:
+        frame = _label_palm(frame, track)
         positions[frame.numbering.part(track.hand)] = track.estimate.positions
     assigned = frame.labels.copy()
     markers = MarkerTable(positions, table.digits, assigned)
@@ -68,10 +82,7 @@ def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: Digi
         return frame
     hypotheses = empty_hypotheses(len(table.labels), MAX_CANDIDATES, table.labels.shape[1])
     for track in tracks:
-        rows = _rows(track.hand)
-        own = DigitCandidates(*(values[rows] for values in candidates))
-        filled = DigitHypotheses(*(values[rows] for values in hypotheses))
-        _evaluate_hand(frame, track, own, table.markers[rows], filled)
+        _evaluate_hand(frame, track, candidates, table.markers, hypotheses)
     margins = np.full(len(frame.points), np.nan)
     assign_jointly(candidates, hypotheses, table.labels, assigned, margins)
     changed = assigned != frame.labels
@@ -79,26 +90,17 @@ def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: Digi
     return frame._replace(labels=assigned).with_confidence(changed, confidence)
 
 
-def _rows(hand: int) -> slice:
-    """The digits of a hand."""
-    return slice(hand * len(DIGITS), (hand + 1) * len(DIGITS))
-
-
 def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
     """Match unlabeled points with the missing markers of a palm."""
     free = np.flatnonzero(frame.unlabeled)
-    if not len(free):
-        return frame
     markers, missing = frame.markers(track.hand), track.state.digits < 0
     missing[markers[markers >= 0]] = False
-    if not missing.any():
+    if not len(free) or not missing.any():
         return frame
-    palm = np.flatnonzero(missing)
+    palm, expected = np.flatnonzero(missing), track.estimate.predicted
+    density = track.state.config.stray_density
     log_odds = match_log_odds(
-        frame.points[free],
-        track.estimate.positions[palm],
-        track.estimate.covariances[palm],
-        track.state.config.stray_density,
+        frame.points[free], expected.positions[palm], expected.covariances[palm], density
     )
     log_odds += track.state.presence_log_odds(frame.first_seen[free])[:, palm]
     matched, confidence = match_points(log_odds)
@@ -115,67 +117,33 @@ def _evaluate_hand(
     hypotheses: DigitHypotheses,
 ) -> None:
     """Evaluate the hypotheses of one hand's digits, which are filled."""
-    if not candidates.counts.any():
+    first = track.hand * len(DIGITS)
+    open_digits = np.flatnonzero(candidates.counts[first : first + len(DIGITS)]).tolist()
+    if not open_digits:
         return
     state, markers = track.state, frame.markers(track.hand)
     log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(markers >= 0)
     log_odds[labeled, markers[labeled]] = frame.evidence[labeled]
     confirmed, unconfirmed = state.digit_models(track.prediction, track.estimate)
-    for digit in np.flatnonzero(candidates.counts).tolist():
+    for digit in open_digits:
+        row = first + digit
         evaluate_digit(
             state.adapted,
             confirmed if state.confirmed[digit] else unconfirmed,
             digit,
-            digit_markers[digit, digit_markers[digit] >= 0],
+            digit_markers[row, digit_markers[row] >= 0],
             frame.points,
-            candidates.candidates[digit, : candidates.counts[digit]],
+            candidates.candidates[row, : candidates.counts[row]],
             log_odds,
-            *(values[digit] for values in hypotheses),
+            DigitHypotheses(*(values[row] for values in hypotheses)),
         )
 
 
-MAX_CANDIDATES: Final = 7
-"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
-SETTLED_EVIDENCE: Final = 4.0
-"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
-_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
-_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
-
-
-class MarkerTable(NamedTuple):
-    """The K markers of all hands by their labels, and the label of each of N points."""
-
-    positions: Float[np.ndarray, "K 3"]
-    """Predicted positions [m]."""
-    digits: Int[np.ndarray, "K"]
-    """Digit of each marker, counted through the hands; -1 on a palm."""
-    assigned: Int[np.ndarray, "N"]
-    """Label of each point, -1 for none."""
-
-
-class DigitCandidates(NamedTuple):
-    """Candidate points of D digits, those with their labels among them."""
-
-    candidates: Int[np.ndarray, "D 7"]
-    """Points of each digit: first those labeled as its markers, then others, the nearest first."""
-    counts: Int[np.ndarray, "D"]
-    """How many there are; zero where there is nothing to decide."""
-    labeled: Int[np.ndarray, "D"]
-    """How many of them are labeled as the digit's markers."""
-
-
 def find_candidates(
-    points: Float[np.ndarray, "N 3"],
-    evidence: Float[np.ndarray, "N"],
-    table: MarkerTable,
-    num_digits: int,
+    points: Float[np.ndarray, "N 3"], evidence: Float[np.ndarray, "N"], table: MarkerTable, num_digits: int
 ) -> DigitCandidates:
     """The candidates of each digit."""
-    found = DigitCandidates(
-        np.full((num_digits, MAX_CANDIDATES), -1),
-        np.zeros(num_digits, dtype=np.int64),
-        np.zeros(num_digits, dtype=np.int64),
-    )
+    found = DigitCandidates(np.full((num_digits, MAX_CANDIDATES), -1), np.zeros(num_digits, dtype=np.int64))
     _find_candidates(points, evidence, table, found)
     return found
 
@@ -187,7 +155,7 @@ def _find_candidates(
     table: MarkerTable,
     found: DigitCandidates,
 ) -> None:
-    """Fill `found`; the other arguments are those of `find_candidates`."""
+    """Kernel of `find_candidates`."""
     positions, digits, assigned = table
     missing = np.ones(len(positions), dtype=np.bool_)
     for owner in assigned:
@@ -213,15 +181,12 @@ def _find_candidates(
         for point in range(len(points)):
             if assigned[point] >= 0 and digits[assigned[point]] == digit:
                 rivals[point] = False
-                undecided = (
-                    undecided or contested[point] or (incomplete and evidence[point] < SETTLED_EVIDENCE)
-                )
+                weak = incomplete and evidence[point] < SETTLED_EVIDENCE
+                undecided = undecided or contested[point] or weak
                 found.candidates[digit, count] = point
                 count += 1
-        if not (undecided or rivals.any()):
-            continue
-        found.labeled[digit] = count
-        found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
+        if undecided or rivals.any():
+            found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
 
 
 @kernel
@@ -231,7 +196,7 @@ def _find_contested(
     table: MarkerTable,
     missing: Bool[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "N"]:
-    """Points with an unsettled label and a missing marker of another digit nearby."""
+    """Points whose label has weak evidence, with a missing marker of another digit nearby."""
     contested = np.zeros(len(points), dtype=np.bool_)
     for point in range(len(points)):
         owner = table.assigned[point]

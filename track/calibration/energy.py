@@ -40,7 +40,6 @@ from track.calibration.hand_parameters import (
     shape_at,
     shape_jacobian,
     shape_precision,
-    skeleton_jacobian,
     skin_points,
     skin_weight_jacobian,
     skin_weights,
@@ -62,7 +61,31 @@ _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
 RELINEARIZE: Final = 0.005
 """Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
-_STEP: Final = 1e-5  # of finite differences
+_DIFFERENCE_STEP: Final = 1e-5  # of finite differences
+PAD_COMPRESSION: Final = 0.001
+"""Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
+_MOST_TOUCH_GAP: Final = 0.012  # [m] between the two pads of a touch
+_MOST_TOUCH_SPEED: Final = 0.02  # [m/s] of the finger relative to the thumb
+_SHORTEST_HOLD: Final = 0.06  # [s] that a touch lasts
+_MOST_TOUCHES_PER_FINGER: Final = 10
+_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, over which speed is measured
+_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap, at which a touch has a quarter of its weight
+_PAD_DEPTH: Final = 0.006  # [m] below the skin: about the middle of a pad
+_SLIDE_ROUNDS: Final = 3
+_GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
+_FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
+_MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
+Progress = Callable[[int, float, float], None]
+"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
+_DAMPING_RAISE, _DAMPING_CUT, _LEAST_RAISED_DAMPING = (
+    10.0,
+    0.2,
+    1e-6,
+)  # factors of the damping after a failed step and a good one
+_MOST_DAMPING_TRIALS: Final = 8
+SMALL_GAIN: Final = 1e-4
+"""Share of the energy; a step that gains less is the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,14 +223,21 @@ class Problem:
 
     def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
         """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
-        count = len(estimate.points)
+        count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(estimate))
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        skeleton = skeleton_jacobian(self.shape, estimate.parameters)
-        by_pose, by_shared = self._marker_jacobians(
-            estimate, fit, _part(corners, 0, count), rest[:count], skeleton
+        bone_weights = skin_weights(estimate.coordinates)
+        by_pose, by_shape, by_point, by_bone = self._point_jacobians(
+            fit, estimate, slice(None), estimate.points, bone_weights, rest[:count]
         )
+        weight_jacobian = skin_weight_jacobian(estimate.coordinates, _part(corners, 0, count))
+        by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
+        by_marker = np.zeros((frames, count, 3, count, 3))
+        by_marker[:, np.arange(count), :, np.arange(count)] = by_point.swapaxes(0, 1)
+        by_pose = by_pose.reshape(frames, 3 * count, -1)
+        by_shared = np.concatenate([by_shape, by_marker.reshape(frames, count, 3, -1)], axis=-1)
+        by_shared = by_shared.reshape(frames, 3 * count, -1)
         squares = (fit.residuals**2).sum(axis=2)
         weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
         rows = np.repeat(weights, 3, axis=1)[..., None]
@@ -221,7 +251,7 @@ class Problem:
         result = NormalEquations(pose, mixed, shared, pose_gradient, shared_gradient)
         self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
         if estimate.contacts is not None and fit.geometry is not None:
-            self._add_contacts(estimate, fit, rest[2 * count :], skeleton, result)
+            self._add_contacts(estimate, fit, rest[2 * count :], result)
         return result
 
     def _rest_jacobian(
@@ -242,8 +272,8 @@ class Problem:
         here, _ = skin_points(coordinates, patch.corners(skin))
         columns = []
         for number in range(NUM_PARAMETERS):
-            grown = skin + _STEP * self._surface_jacobian[..., number]
-            columns.append((skin_points(coordinates, patch.corners(grown))[0] - here) / _STEP)
+            grown = skin + _DIFFERENCE_STEP * self._surface_jacobian[..., number]
+            columns.append((skin_points(coordinates, patch.corners(grown))[0] - here) / _DIFFERENCE_STEP)
         return np.stack(columns, axis=-1)
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
@@ -255,31 +285,6 @@ class Problem:
                 for side in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates)
             ]
         return SkinCoordinates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-    def _marker_jacobians(
-        self,
-        estimate: Estimate,
-        fit: Fit,
-        corners: Corners,
-        rest: NDArray[np.float64],
-        skeleton: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Jacobians of all markers by the poses (F, 3 M, 26) and by the shared unknowns (F, 3 M, S)."""
-        frames, count = len(estimate.qpos), len(estimate.points)
-        weights = skin_weights(estimate.coordinates)
-        all_bones = np.tile(np.arange(NUM_BONES), (count, 1))
-        by_pose = skinned_jacobian(fit.model, fit.bones, estimate.points, all_bones, weights)
-        by_shape = skinned_shape_jacobian(fit.model, fit.bones, estimate.points, weights) @ skeleton
-        by_point, by_bone = skinning_terms(fit.model, fit.bones, estimate.points, weights)
-        by_shape += by_point @ rest
-        weight_jacobian = skin_weight_jacobian(estimate.coordinates, corners)
-        by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
-        by_shared = np.zeros((frames, count, 3, NUM_PARAMETERS + 3 * count))
-        by_shared[..., :NUM_PARAMETERS] = by_shape
-        for marker in range(count):
-            first = NUM_PARAMETERS + 3 * marker
-            by_shared[:, marker, :, first : first + 3] = by_point[:, marker]
-        return by_pose.reshape(frames, 3 * count, -1), by_shared.reshape(frames, 3 * count, -1)
 
     def _add_priors(
         self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
@@ -310,39 +315,50 @@ class Problem:
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
     def _add_contacts(
-        self,
-        estimate: Estimate,
-        fit: Fit,
-        rest: NDArray[np.float64],
-        skeleton: NDArray[np.float64],
-        result: NormalEquations,
+        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64], result: NormalEquations
     ) -> None:
         """Add each contact's gap; `rest` (2 K, 3, 53): jacobian of the pads' rest points."""
         contacts, geometry = estimate.contacts, fit.geometry
         assert contacts is not None
         assert geometry is not None
-        count = len(contacts.frames)
+        frames, rows, count = contacts.frames, np.arange(len(contacts.frames)), len(contacts.frames)
         coordinates = self._all_coordinates(estimate)
         pads = SkinCoordinates(*(values[len(values) - 2 * count :] for values in coordinates))
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        weights = skin_weights(pads)
-        precision = contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2
-        all_bones = np.tile(np.arange(NUM_BONES), (2, 1))
-        for number, frame in enumerate(contacts.frames):
-            both = [number, count + number]
-            bones, share = fit.bones[frame : frame + 1], weights[both]
-            by_pose = skinned_jacobian(fit.model, bones, points[both], all_bones, share)[0]
-            by_shape = skinned_shape_jacobian(fit.model, bones, points[both], share)[0] @ skeleton
-            by_shape += skinning_terms(fit.model, bones, points[both], share)[0][0] @ rest[both]
-            direction = geometry.directions[number]
-            pose = direction @ (by_pose[1] - by_pose[0])
-            shared = np.zeros(result.shared.shape[0])
-            shared[:NUM_PARAMETERS] = direction @ (by_shape[1] - by_shape[0])
-            result.pose[frame] += precision[number] * np.outer(pose, pose)
-            result.mixed[frame] += precision[number] * np.outer(pose, shared)
-            result.shared[:] += precision[number] * np.outer(shared, shared)
-            result.pose_gradient[frame] += precision[number] * geometry.gaps[number] * pose
-            result.shared_gradient[:] += precision[number] * geometry.gaps[number] * shared
+        jacobians = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
+        pose, shape = (
+            np.einsum("ki,kis->ks", geometry.directions, by[rows, count + rows] - by[rows, rows])
+            for by in jacobians[:2]
+        )
+        shared = np.pad(shape, ((0, 0), (0, result.shared.shape[0] - NUM_PARAMETERS)))
+        precision = (contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2)[:, None]
+        pull = precision * geometry.gaps[:, None]
+        np.add.at(result.pose, frames, (precision * pose)[:, :, None] * pose[:, None])
+        np.add.at(result.mixed, frames, (precision * pose)[:, :, None] * shared[:, None])
+        np.add.at(result.pose_gradient, frames, pull * pose)
+        result.shared[:] += shared.T @ (precision * shared)
+        result.shared_gradient[:] += (pull * shared).sum(axis=0)
+
+    def _point_jacobians(
+        self,
+        fit: Fit,
+        estimate: Estimate,
+        frames: NDArray[np.int64] | slice,
+        points: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        rest: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Jacobians of skinned points in some frames (T, M, 3, ...) by poses, parameters and rest points.
+
+        Also where each bone alone would put them (T, M, L, 3). `rest` (M, 3, 53) is the jacobian of the rest
+        points by the parameters.
+        """
+        bones, qpos = fit.bones[frames], estimate.qpos[frames]
+        by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
+        all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
+        by_pose = skinned_jacobian(fit.model, bones, points, all_bones, weights)
+        by_shape = skinned_shape_jacobian(self.shape, estimate.parameters, qpos, points, weights)
+        return by_pose, by_shape + by_point @ rest, by_point, by_bone
 
     def apply_step(
         self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
@@ -370,27 +386,11 @@ def _part(corners: Corners, first: int, last: int) -> Corners:
     return Corners(corners.points[first:last], corners.normals[first:last])
 
 
-PAD_COMPRESSION: Final = 0.001
-"""Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
-_MOST_GAP: Final = 0.012  # [m] between the two pads of a touch
-_MOST_SPEED: Final = 0.02  # [m/s] of the finger relative to the thumb
-_SHORTEST_HOLD: Final = 0.06  # [s] that a touch lasts
-_MOST_PER_FINGER: Final = 10
-_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, over which speed is measured
-_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap, at which a touch has a quarter of its weight
-_PAD_DEPTH: Final = 0.006  # [m] below the skin: about the middle of a pad
-_SLIDE_ROUNDS: Final = 3
-_GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
-_FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
-_MOST_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
-
-
 class Contacts(NamedTuple):
     """K contacts of the thumb, each in one frame, with a point on either pad."""
 
     frames: Int[np.ndarray, "K"]
-    fingers: Int[np.ndarray, "K"]
-    """Indices into `topology.DIGITS`."""
+    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
     thumb_coordinates: SkinCoordinates
     finger_coordinates: SkinCoordinates
 
@@ -424,7 +424,11 @@ def find_touches(
     touches: list[tuple[int, str]] = []
     for number, finger in enumerate(FINGERS):
         speed = _speed(model, angles, finger, window, rate)
-        good = (speed < _MOST_SPEED) & (gaps[:, number] < _MOST_GAP) & (gaps.argmin(axis=1) == number)
+        good = (
+            (speed < _MOST_TOUCH_SPEED)
+            & (gaps[:, number] < _MOST_TOUCH_GAP)
+            & (gaps.argmin(axis=1) == number)
+        )
         good &= complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
         stillest = [
@@ -433,7 +437,7 @@ def find_touches(
             if last + 1 - first >= shortest
         ]
         stillest.sort(key=lambda frame, number=number: float(gaps[frame, number]))  # type: ignore[misc]
-        touches += [(frame, finger) for frame in stillest[:_MOST_PER_FINGER]]
+        touches += [(frame, finger) for frame in stillest[:_MOST_TOUCHES_PER_FINGER]]
     return sorted(touches)
 
 
@@ -544,7 +548,7 @@ def contact_geometry(
     normals = [normal / np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
     facing = (
         ((normals[0] * normals[1]).sum(axis=1) < _FACING_COSINE)
-        & (across < _MOST_OFFSET)
+        & (across < _MOST_PAD_OFFSET)
         & _on_tips(contacts)
     )
     return ContactGeometry(direction, along + 2.0 * PAD_COMPRESSION, facing)
@@ -591,15 +595,6 @@ def _blend_transforms(
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     blends: NDArray[np.float64] = np.einsum("kl,klij->kij", skin_weights(coordinates), motion)
     return blends
-
-
-Progress = Callable[[int, float, float], None]
-"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
-_MORE, _LESS, _LEAST_RAISED = 10.0, 0.2, 1e-6  # factors of the damping after a failed step and a good one
-_MOST_TRIALS: Final = 8
-SMALL_GAIN: Final = 1e-4
-"""Share of the energy; a step that gains less is the last one."""
 
 
 def levenberg_marquardt(
@@ -682,7 +677,7 @@ def _step(
 ) -> tuple[Estimate, Fit, float, bool]:
     """One step: the new estimate, its fit, the next damping, and whether the energy fell."""
     equations = problem.normal_equations(estimate, fit)
-    for _ in range(_MOST_TRIALS):
+    for _ in range(_MOST_DAMPING_TRIALS):
         reduced, solved = eliminate_poses(equations, damping)
         system, gradient = reduced[:, :-1].copy(), reduced[:, -1]
         diagonal = np.arange(len(system))
@@ -692,8 +687,12 @@ def _step(
         trial = problem.apply_step(estimate, poses, shared)
         trial_fit = problem.fit(trial)
         if trial_fit.cost < fit.cost:
-            return *_with_slid_contacts(problem, trial, trial_fit), max(_LESS * damping, _LEAST_DAMPING), True
-        damping = max(_MORE * damping, _LEAST_RAISED)
+            return (
+                *_with_slid_contacts(problem, trial, trial_fit),
+                max(_DAMPING_CUT * damping, _LEAST_DAMPING),
+                True,
+            )
+        damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
     return estimate, fit, damping, False
 
 

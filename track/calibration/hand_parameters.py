@@ -1,4 +1,4 @@
-"""A hand's shape as 53 parameters around an initial shape: their prior, and jacobians of skinned points.
+"""A hand's shape as 53 parameters around an initial shape, and coordinates on the skin of such hands.
 
 All shapes are of right hands. Length and breadth scale the whole hand; bone lengths, knuckles, directions of
 the digits, girths and the palm's thickness vary in addition, as in `handsim.hand.shape.sample_shape`.
@@ -18,10 +18,9 @@ from scipy import sparse
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.model import HandModel, build_skeleton
+from handsim.hand.model import HandModel, bone_transforms, build_skeleton
 from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
 from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
-from handsim.kernels import kernel
 
 LENGTH, BREADTH = 0, 1  # log factors
 BONE_LENGTHS: Final = slice(2, 17)  # log factors, three per digit
@@ -35,7 +34,10 @@ NUM_PARAMETERS: Final = 53
 _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
-_STEP: Final = 1e-5  # of finite differences
+_DIFFERENCE_STEP: Final = 1e-5  # of finite differences
+_MOST_PROJECTION_STEPS: Final = 40
+_OUTSIDE_COORDINATE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
+_PROJECTION_TOLERANCE: Final = 1e-8  # [m] from the target, at which a projection ends
 
 
 def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape:
@@ -72,6 +74,7 @@ def shape_jacobian(
     start: HandShape,
     parameters: Float[np.ndarray, "53"],
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
+    count: int = NUM_PARAMETERS,
 ) -> Float[np.ndarray, "*shape 53"]:
     """Derivative of a function of the shape by the parameters, by finite differences.
 
@@ -79,154 +82,38 @@ def shape_jacobian(
         start: Shape of zero parameters.
         parameters: Where to differentiate.
         function: Arrays that depend on shapes, one for each.
+        count: The first parameters, on which alone the function depends.
     """
-    nudged = parameters + _STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)  # the first as it is
+    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # the first as it is
     values = function([shape_at(start, one) for one in nudged])
-    return np.moveaxis((values[1:] - values[0]) / _STEP, 0, -1)
-
-
-def skeleton_jacobian(start: HandShape, parameters: Float[np.ndarray, "53"]) -> Float[np.ndarray, "45 53"]:
-    """Derivative of what determines a skeleton by the parameters, zero of which are the shape `start`.
-
-    That is, in this order: bone lengths [m], knuckles [m] and base angles [rad], digit by digit.
-    """
-    along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
-    lengths = start.bone_lengths.ravel() * along * np.exp(parameters[BONE_LENGTHS])
-    knuckles = start.knuckles * [along, across, across]
-    jacobian = np.zeros((45, NUM_PARAMETERS))
-    jacobian[:15, LENGTH], jacobian[:15, BONE_LENGTHS] = lengths, np.diag(lengths)
-    jacobian[15:30:3, LENGTH] = knuckles[:, 0]
-    jacobian[16:30:3, BREADTH], jacobian[17:30:3, BREADTH] = knuckles[:, 1], knuckles[:, 2]
-    jacobian[15:30, KNUCKLES] = jacobian[30:, DIRECTIONS] = np.eye(15)
+    jacobian = np.zeros((*values.shape[1:], NUM_PARAMETERS))
+    jacobian[..., :count] = np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
     return jacobian
 
 
 def skinned_shape_jacobian(
-    model: HandModel,
-    T_world_bone: Float[np.ndarray, "T L 4 4"],
+    start: HandShape,
+    parameters: Float[np.ndarray, "53"],
+    qpos: Float[np.ndarray, "T 27"],
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
-) -> Float[np.ndarray, "T M 3 45"]:
-    """Derivative of skinned points by the skeleton (`skeleton_jacobian`), rest points and poses held fixed.
+) -> Float[np.ndarray, "T M 3 53"]:
+    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed.
 
-    A longer bone moves all bones beyond it, in the pose and at rest. Skinning undoes the rest transform, so
-    the derivative is the difference of the two. The model is a right hand, rest points are in the wrist's
-    frame [m].
+    A longer bone moves all bones beyond it, in the pose and at rest.
     """
-    rest = model.rest_transforms
-    jacobian = np.zeros((len(T_world_bone), len(points), 3, 45))
-    _fill_jacobian(
-        np.ascontiguousarray(T_world_bone), rest, points, weights, _base_angle_axes(model.shape), jacobian
-    )
-    return jacobian
+    homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
+    def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
+        posed = np.empty((len(shapes), 3 * len(qpos), len(points)))
+        for row, shape in zip(posed, shapes, strict=True):
+            skeleton = build_skeleton(shape)
+            local = np.linalg.inv(skeleton.rest_transforms()) @ homogeneous.T  # (L, 4, M)
+            bones = bone_transforms(skeleton, qpos)[:, :, :3].swapaxes(1, 2).reshape(3 * len(qpos), -1)
+            row[:] = bones @ (weights.T[:, None] * local).reshape(-1, len(points))
+        return posed.reshape(len(shapes), len(qpos), 3, -1).swapaxes(2, 3)
 
-def _base_angle_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
-    """Axes (the last index) in the palm about which a digit rotates when one of its base angles grows."""
-    here = build_skeleton(shape).rotations[1::3]
-    axes = np.empty((5, 3, 3))
-    for angle in range(3):
-        nudged = shape.base_angles.copy()
-        nudged[:, angle] += 1e-6
-        there = build_skeleton(dataclasses.replace(shape, base_angles=nudged)).rotations[1::3]
-        spin = np.einsum("dij,dkj->dik", there - here, here) / 1e-6
-        axes[:, angle] = np.stack(
-            [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]],
-            axis=1,
-        )
-    return 0.5 * axes
-
-
-@kernel
-def _fill_jacobian(
-    bones: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    points: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-) -> None:
-    """Kernel of `skinned_shape_jacobian`; axes are those of the base angles in the palm (5, 3, 3)."""
-    rotation = np.empty((3, 3))
-    for frame in range(len(bones)):
-        for bone in range(1, NUM_BONES):
-            own = bones[frame, bone]
-            for i in range(3):
-                for j in range(3):
-                    rotation[i, j] = 0.0
-                    for k in range(3):
-                        rotation[i, j] += own[i, k] * rest[bone, j, k]
-            for point in range(len(points)):
-                share = weights[point, bone]
-                if share != 0.0:
-                    _add_bone(
-                        jacobian[frame, point], bone, share, points[point], bones[frame], rest, rotation, axes
-                    )
-
-
-@kernel
-def _add_bone(
-    row: NDArray[np.float64],
-    bone: int,
-    share: float,
-    point: NDArray[np.float64],
-    bones: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    axes: NDArray[np.float64],
-) -> None:
-    """Add one bone's share of a point's jacobian (3, 45); the arguments are those of `_fill_jacobian`."""
-    digit, index, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
-    carried, arm = np.empty(3), np.empty(3)
-    for i in range(3):
-        carried[i] = bones[bone, i, 3] - bones[first, i, 3]
-        arm[i] = point[i] - rest[first, i, 3]
-        for j in range(3):
-            carried[i] += rotation[i, j] * (point[j] - rest[bone, j, 3])
-    for segment in range(index):  # the bones before this one
-        other = first + segment
-        for i in range(3):
-            moved = bones[other, i, 0]
-            for j in range(3):
-                moved -= rotation[i, j] * rest[other, j, 0]
-            row[i, 3 * digit + segment] += share * moved
-    for axis in range(3):
-        for i in range(3):
-            row[i, 15 + 3 * digit + axis] += share * (bones[0, i, axis] - rotation[i, axis])
-        _add_rotation(row, 30 + 3 * digit + axis, share, bones[0], rotation, axes[digit, axis], carried, arm)
-
-
-@kernel
-def _add_rotation(
-    row: NDArray[np.float64],
-    column: int,
-    share: float,
-    wrist: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    axis: NDArray[np.float64],
-    carried: NDArray[np.float64],
-    arm: NDArray[np.float64],
-) -> None:
-    """Add the derivative by one base angle: a rotation of the digit about its knuckle, posed minus at rest.
-
-    `carried` is the posed point minus the knuckle, in the world, `arm` the same at rest, in the wrist's
-    frame.
-    """
-    x = wrist[0, 0] * axis[0] + wrist[0, 1] * axis[1] + wrist[0, 2] * axis[2]
-    y = wrist[1, 0] * axis[0] + wrist[1, 1] * axis[1] + wrist[1, 2] * axis[2]
-    z = wrist[2, 0] * axis[0] + wrist[2, 1] * axis[1] + wrist[2, 2] * axis[2]
-    a = axis[1] * arm[2] - axis[2] * arm[1]
-    b = axis[2] * arm[0] - axis[0] * arm[2]
-    c = axis[0] * arm[1] - axis[1] * arm[0]
-    row[0, column] += share * (
-        y * carried[2] - z * carried[1] - rotation[0, 0] * a - rotation[0, 1] * b - rotation[0, 2] * c
-    )
-    row[1, column] += share * (
-        z * carried[0] - x * carried[2] - rotation[1, 0] * a - rotation[1, 1] * b - rotation[1, 2] * c
-    )
-    row[2, column] += share * (
-        x * carried[1] - y * carried[0] - rotation[2, 0] * a - rotation[2, 1] * b - rotation[2, 2] * c
-    )
+    return shape_jacobian(start, parameters, skinned, GIRTHS.start)
 
 
 def skinning_terms(
@@ -235,11 +122,9 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """Terms of linear blend skinning of a right hand, with rest points in the wrist's frame [m].
+    """Blended rotations of skinned points, and the position that each bone alone would give them [m].
 
-    Returns:
-        Derivative of each skinned point by its rest position (the blended rotation), and the position that
-        each bone alone would give it [m].
+    The hand is a right one, rest points [m] are in the wrist's frame.
     """
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
@@ -248,51 +133,35 @@ def skinning_terms(
     return rotations, by_bone
 
 
-_MOST_STEPS: Final = 40
-_OUTSIDE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
-_CLOSE: Final = 1e-8  # [m] from the target, at which a projection ends
-
-
 class SkinTopology(NamedTuple):
     """Topology and weights, the same for the skins of all hands."""
 
-    subdivide: sparse.csr_array
-    """Matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these."""
-    faces: Int[np.ndarray, "F 3"]
-    """Triangles, counter-clockwise from outside."""
-    adjacent: Int[np.ndarray, "F 3"]
-    """The triangle beyond the edge opposite to each corner."""
-    vertex_faces: Int[np.ndarray, "V A"]
-    """Triangles at each vertex, the last one repeated."""
-    weights: Float[np.ndarray, "V 16"]
-    """Skinning weights of all bones."""
+    subdivide: sparse.csr_array  # matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these
+    faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
+    adjacent: Int[np.ndarray, "F 3"]  # the triangle beyond the edge opposite to each corner
+    vertex_faces: Int[np.ndarray, "V A"]  # triangles at each vertex, the last one repeated
+    weights: Float[np.ndarray, "V 16"]  # skinning weights of all bones
 
 
 class SkinCoordinates(NamedTuple):
     """Coordinates of P points on or above the skin."""
 
-    faces: Int[np.ndarray, "P"]
-    """Triangles of `skin_mesh`."""
-    bary: Float[np.ndarray, "P 3"]
-    """Barycentric coordinates of the foot points."""
-    heights: Float[np.ndarray, "P"]
-    """Above the skin, along the normal [m]."""
+    faces: Int[np.ndarray, "P"]  # triangles of `skin_mesh`
+    bary: Float[np.ndarray, "P 3"]  # barycentric coordinates of the foot points
+    heights: Float[np.ndarray, "P"]  # above the skin, along the normal [m]
 
 
 class Corners(NamedTuple):
     """Corners of some triangles on one hand's skin."""
 
-    points: Float[np.ndarray, "P 3 3"]
-    """In the wrist's frame [m]."""
-    normals: Float[np.ndarray, "P 3 3"]
-    """Unit vertex normals."""
+    points: Float[np.ndarray, "P 3 3"]  # in the wrist's frame [m]
+    normals: Float[np.ndarray, "P 3 3"]  # unit vertex normals
 
 
 class Skin(NamedTuple):
     """One hand's subdivided skin in the wrist's frame."""
 
-    points: Float[np.ndarray, "V 3"]
-    """[m]"""
+    points: Float[np.ndarray, "V 3"]  # [m]
     normals: Float[np.ndarray, "V 3"]
 
     def corners(self, faces: Int[np.ndarray, "P"]) -> Corners:
@@ -453,7 +322,7 @@ def project_onto_skin(
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
     active = np.arange(len(faces))
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MOST_PROJECTION_STEPS):
         here = SkinCoordinates(faces[active], bary[active], heights[active])
         corners = skin.corners(here.faces)
         residual = targets[active] - skin_points(here, corners)[0]
@@ -461,12 +330,12 @@ def project_onto_skin(
         moved = here.bary + np.column_stack([-step[:, 0] - step[:, 1], step[:, :2]])
         heights[active] = here.heights + step[:, 2]
         lowest = moved.argmin(axis=1)
-        out = moved[np.arange(len(active)), lowest] < _OUTSIDE
+        out = moved[np.arange(len(active)), lowest] < _OUTSIDE_COORDINATE
         # What left its triangle is clipped to its border.
         inside = np.clip(moved, 0.0, None)
         edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
         bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
-        done = ~out & (np.linalg.norm(residual, axis=1) < _CLOSE)
+        done = ~out & (np.linalg.norm(residual, axis=1) < _PROJECTION_TOLERANCE)
         _cross_edges(mesh, faces, bary, active[out], lowest[out])
         active = active[~done]
         if not len(active):

@@ -60,8 +60,21 @@ MOST_STEPS: Final = 30
 _SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
-_BETTER: Final = 0.98  # of the distance before; what is not better than that stays as it was
-_SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
+_BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
+_SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
+NUM_FRAMES: Final = 240
+"""Frames that a calibration is solved on."""
+FEWEST_FRAMES: Final = 100
+"""Usable frames without which a capture is refused."""
+_INITIAL_FRAMES: Final = 800
+_FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
+_LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
+_MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
+_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
+_LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
+_CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
+_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +109,7 @@ class HeldOut(NamedTuple):
     @property
     def is_better(self) -> bool:
         """Whether the calibrated hand fits better, by more than chance and with labels that are certain."""
-        return not self.hidden and self.after < _BETTER * self.before
+        return not self.hidden and self.after < _BETTER_SHARE * self.before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +162,7 @@ class Calibration:
     @property
     def significant_touches(self) -> tuple[Touch, ...]:
         """Touches with a weight above 0.25."""
-        return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT)
+        return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT_TOUCH)
 
     def gaps(self) -> Float[np.ndarray, "2"]:
         """Mean distance from touching [m], before and after, of the significant touches; NaN without any."""
@@ -200,7 +213,8 @@ def calibrate_hand(
     markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     complete = complete_digits(markers, right.attachment)
-    track = initial_poses(markers, right, usable)
+    # Poses of frames spread over the capture, on the hand that the calibration begins with.
+    track = solve_frames(markers, right, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
     problem, estimate = _initial_problem(markers, right, track)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
     rough = user_hand(right, problem, estimate)
@@ -209,7 +223,10 @@ def calibrate_hand(
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
     estimate, fit = _solve_with_spreads(problem, estimate, steps, progress)
     done = user_hand(right, problem, estimate)
-    before = _gaps_before(right, markers, touches, usable)
+    before = np.empty(0)
+    if touches:
+        touching = usable[[frame for frame, _ in touches]]
+        before = contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
     final = solve_frames(markers, done, usable, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
@@ -320,36 +337,13 @@ def _touches(
     )
 
 
-def _gaps_before(
-    right: GloveFit, markers: NDArray[np.float64], touches: list[tuple[int, str]], frames: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Gaps of the touches (K,) [m] on the hand that the calibration began with."""
-    if not touches:
-        return np.empty(0)
-    touching = frames[[frame for frame, _ in touches]]
-    return contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
-
-
-NUM_FRAMES: Final = 240
-"""Frames that a calibration is solved on."""
-FEWEST_FRAMES: Final = 100
-"""Usable frames without which a capture is refused."""
-_INITIAL_FRAMES: Final = 800
-_FEWEST_MARKERS: Final = 6  # that a frame must have
-_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
-_MOST_RMS: Final = 3.0  # times the median RMS, up to which a frame is used
-
-
 class PoseTrack(NamedTuple):
     """Poses of K frames of a capture."""
 
-    frames: Int[np.ndarray, "K"]
-    """Their numbers in the capture."""
+    frames: Int[np.ndarray, "K"]  # their numbers in the capture
     qpos: Float[np.ndarray, "K 27"]
-    rms: Float[np.ndarray, "K"]
-    """3D RMS distance of the markers from the model's [m]."""
-    residuals: Float[np.ndarray, "K M 3"]
-    """Model minus marker [m], NaN where a marker is missing."""
+    rms: Float[np.ndarray, "K"]  # 3D RMS distance of the markers from the model's [m]
+    residuals: Float[np.ndarray, "K M 3"]  # model minus marker [m], NaN where a marker is missing
 
 
 def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
@@ -367,7 +361,7 @@ def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: fl
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
     """Numbers of the frames with enough markers for a pose."""
     count = markers.shape[1]
-    needed = min(count, max(_FEWEST_MARKERS, round(_MARKER_SHARE * count)))
+    needed = min(count, max(_FEWEST_MARKERS_OF_FRAME, round(_LEAST_MARKER_SHARE * count)))
     usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= needed)
     if len(usable) < FEWEST_FRAMES:
         raise CalibrationError(
@@ -383,22 +377,9 @@ def solve_frames(
     frames: NDArray[np.int64],
     initial: NDArray[np.float64] | None = None,
 ) -> PoseTrack:
-    """Solve the poses of some frames.
-
-    Args:
-        markers: All markers of the capture [m]; NaN where missing.
-        frames: Numbers of the frames (K,).
-        initial: Poses to start from (K, 27).
-    """
+    """Solve the poses of frames by their numbers, from initial poses (K, 27) if there are any."""
     solved = PoseSolver(hand).solve(markers[frames], initial)
     return PoseTrack(frames, solved.qpos, solved.rms, solved.residuals)
-
-
-def initial_poses(
-    markers: Float[np.ndarray, "T M 3"], hand: GloveFit, usable: NDArray[np.int64]
-) -> PoseTrack:
-    """Poses of frames spread over the capture, on the hand that a calibration begins with."""
-    return solve_frames(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
 
 
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
@@ -415,7 +396,7 @@ def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) ->
     Frames without missing markers are preferred; frames with an unusual RMS are left out.
     """
     missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
-    well_fitted = track.rms <= _MOST_RMS * np.median(track.rms)
+    well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
         candidates = np.flatnonzero((missing <= allowed) & well_fitted)
         if len(candidates) >= min(3 * NUM_FRAMES, well_fitted.sum()):
@@ -428,13 +409,6 @@ def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) ->
         chosen.append(int(distance.argmax()))
     picked: NDArray[np.int64] = candidates[np.sort(chosen)]
     return picked
-
-
-_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
-_LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
-_CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
-_USUAL_WORTH: Final = 12.0  # coordinates of markers that the usual spread counts as
-_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -493,7 +467,11 @@ def _learned(
 ) -> float:
     """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
-    return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
+    return float(
+        np.sqrt(
+            (squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2) / (determined + _USUAL_SPREAD_COORDINATES)
+        )
+    )
 
 
 def standard_errors(
@@ -535,13 +513,7 @@ def standard_errors(
 def contact_gaps(
     model: HandModel, touches: list[tuple[int, str]], qpos: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Gaps between thumb and finger (K,) [m] of touches on a hand.
-
-    Args:
-        model: A right hand.
-        touches: Frame and finger of each.
-        qpos: Poses of these frames (K, 27).
-    """
+    """Gaps between thumb and finger (K,) [m] of touches on a right hand, in the poses (K, 27) of each."""
     bones = model.forward_kinematics(qpos)
     contacts = initialize_contacts(model, touches, bones)
     faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])

@@ -1,4 +1,6 @@
-"""Compiled forward kinematics of a hand's markers, their Jacobian and their normal equations.
+"""Compiled forward kinematics of a hand's markers, and Levenberg-Marquardt on its pose.
+
+The energy E_IK is that of Han et al. 2018, section 4.3, with joint limits, a prior and a robust loss.
 
 All kernels work in the wrist's frame: the target markers are transformed into it, so a fit does not depend on
 where the hand is. The 26 unknowns of a step are the 20 hinge angles [rad], then the translation of the wrist
@@ -15,12 +17,20 @@ from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import BONES, NUM_BONES, NUM_JOINTS
-from handsim.kernels import kernel, rotate_quaternion
+from handsim.kernels import kernel, multiply_rotations, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
+MARKER_NOISE: Final = 0.001
+"""Standard deviation of a marker [m]: the scale of all costs; optical systems and gloves reach about this."""
 _TRANSLATION: Final = NUM_JOINTS  # index of the first unknown of the wrist's translation
 _ROTATION: Final = NUM_JOINTS + 3  # index of the first unknown of its rotation
+_MARKER_PRECISION: Final = MARKER_NOISE**-2  # [1/m^2]
+LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2
+"""Precision of a hinge beyond its range [1/rad^2]: a soft limit."""
+_FIRST_DAMPING: Final = 1e-4  # share of the diagonal; small, because most starts are near the minimum
+_LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positive
+_MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
 
 
 class HandArrays(NamedTuple):
@@ -75,29 +85,39 @@ class Workspace(NamedTuple):
     """Step of the unknowns [rad, m]."""
 
 
+class PoseEnergy(NamedTuple):
+    """What a pose is fitted to: markers, and a prior."""
+
+    target: Float[np.ndarray, "M 3"]
+    """Markers in the world [m]; NaN where missing."""
+    prior_mean: Float[np.ndarray, "27"]
+    """Mean of the prior, a pose."""
+    precision: Float[np.ndarray, "26"]
+    """Its diagonal precision, in the order of the unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none."""
+    robust_scale: float
+    """Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for least squares."""
+
+
 def hand_arrays(fit: GloveFit) -> HandArrays:
     """The arrays of a hand and its glove, in the layout's order of markers."""
     model, attachment = fit.model, fit.attachment
-    skeleton = model.skeleton
     inverse = np.linalg.inv(model.rest_transforms)[attachment.bone_indices]
     local = np.einsum("mkij,mj->mki", inverse[..., :3, :3], attachment.points) + inverse[..., :3, 3]
     order = np.argsort(-attachment.bone_weights, axis=1, kind="stable")
-    bones, bone_weights = (
-        np.take_along_axis(values, order, axis=1)
-        for values in (attachment.bone_indices, attachment.bone_weights)
-    )
+    bones = np.take_along_axis(attachment.bone_indices, order, axis=1)
+    bone_weights = np.take_along_axis(attachment.bone_weights, order, axis=1)
     positions = np.take_along_axis(local, order[..., None], axis=1) * bone_weights[..., None]
     digits = np.array([bone.digit for bone in BONES])
-    carriers = np.where(bone_weights > 0.0, digits[bones], -1)
     hinge_span = np.zeros((len(bones), 2), dtype=np.int64)
     skyline = np.zeros(NUM_UNKNOWNS, dtype=np.int64)
     skyline[:NUM_JOINTS] = np.arange(NUM_JOINTS) // 4 * 4
-    for marker, row in enumerate(carriers):
+    for marker, row in enumerate(np.where(bone_weights > 0.0, digits[bones], -1)):
         moving = row[row >= 0]
         if len(moving):
             first, last = 4 * moving.min(), 4 * moving.max() + 4
             hinge_span[marker] = first, last
             skyline[first:last] = np.minimum(skyline[first:last], first)
+    skeleton = model.skeleton
     return HandArrays(
         np.array(skeleton.offsets, order="C"),
         np.array(skeleton.rotations, order="C"),
@@ -136,11 +156,7 @@ def workspace(num_markers: int) -> Workspace:
 
 @kernel
 def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Workspace) -> None:
-    """Forward kinematics of all bones, hinge axes and markers, in the wrist's frame.
-
-    Args:
-        work: Its `rotations`, `origins`, `axes`, `bone_terms` and `markers` are filled.
-    """
+    """Forward kinematics of all bones, hinge axes and markers in the wrist's frame, which are filled."""
     for digit in range(NUM_JOINTS // 4):
         compute_digit(hand, digit, angles[4 * digit : 4 * digit + 4], work)
     for marker in range(len(hand.bones)):
@@ -149,12 +165,7 @@ def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Wor
 
 @kernel
 def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], work: Workspace) -> None:
-    """Forward kinematics of the bones and hinge axes of one digit, in the wrist's frame.
-
-    Args:
-        digit: Index of the digit, 0 for the thumb.
-        work: The digit's rows of `rotations`, `origins` and `axes` are filled.
-    """
+    """Fill the bones and hinge axes of one digit (0 is the thumb) in the wrist's frame."""
     for link in range(3):
         bone = 1 + 3 * digit + link
         parent = bone - 1 if link > 0 else 0
@@ -163,9 +174,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
             work.origins[bone, i] = work.origins[parent, i]
             for j in range(3):
                 work.origins[bone, i] += parent_rotation[i, j] * hand.offsets[bone, j]
-                own[i, j] = 0.0
-                for k in range(3):
-                    own[i, j] += parent_rotation[i, k] * hand.rotations[bone, k, j]
+        multiply_rotations(parent_rotation, hand.rotations[bone], own)
         for number in range(link + 1 if link > 0 else 0, link + 2):
             hinge = 4 * digit + number
             _rotate_bone(own, hand.axes[hinge], angles[number], work.axes[hinge])
@@ -173,11 +182,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
 
 @kernel
 def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
-    """Position of one marker in the wrist's frame [m].
-
-    Args:
-        work: Its bones must be computed; the marker's rows of `bone_terms` and `markers` are filled.
-    """
+    """Fill the position and the bones' terms of one marker [m]; its bones must be computed."""
     work.markers[marker] = 0.0
     for slot in range(4):
         bone = hand.bones[marker, slot]
@@ -210,11 +215,7 @@ def _rotate_bone(
 
 @kernel
 def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
-    """Derivatives of one marker by all unknowns, in the wrist's frame.
-
-    Args:
-        work: Its bones and the marker must be computed; the marker's block of `jacobian` is filled.
-    """
+    """Fill the derivatives of one marker by all unknowns; its bones and the marker must be computed."""
     jacobian = work.jacobian[marker]
     for digit in range(hand.hinge_span[marker, 0] // 4, hand.hinge_span[marker, 1] // 4):
         x, y, z, share = 0.0, 0.0, 0.0, 0.0
@@ -273,23 +274,28 @@ def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"
                 )
 
 
-MARKER_NOISE: Final = 0.001
-"""Standard deviation of a marker [m]: the scale of all costs; optical systems and gloves reach about this."""
-_MARKER_PRECISION: Final = MARKER_NOISE**-2  # [1/m^2]
-_LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond its range: a soft limit
-_FIRST_DAMPING: Final = 1e-4  # share of the diagonal; small, because most starts are near the minimum
-_LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positive
-_MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
+@kernel
+def marker_residuals(
+    hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
+) -> None:
+    """Fill markers and residuals of a pose in the wrist's frame; targets [m] are in the world."""
+    compute_markers(hand, qpos[7:], work)
+    w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
+    for marker in range(len(target)):
+        a, b, c = target[marker, 0] - qpos[0], target[marker, 1] - qpos[1], target[marker, 2] - qpos[2]
+        # The inverse rotation: v + 2 w (v x u) + 2 (v x u) x u, with u the quaternion's vector part.
+        i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
+        position, residual = work.markers[marker], work.residuals[marker]
+        residual[0] = position[0] - a - 2.0 * (w * i + j * z - k * y)
+        residual[1] = position[1] - b - 2.0 * (w * j + k * x - i * z)
+        residual[2] = position[2] - c - 2.0 * (w * k + i * y - j * x)
 
 
 @kernel
 def levenberg_marquardt(
     hand: HandArrays,
-    target: Float[np.ndarray, "M 3"],
+    energy: PoseEnergy,
     qpos: Float[np.ndarray, "27"],
-    prior_mean: Float[np.ndarray, "27"],
-    precision: Float[np.ndarray, "26"],
-    robust_scale: float,
     most_steps: int,
     small_gain: float,
     work: Workspace,
@@ -297,22 +303,15 @@ def levenberg_marquardt(
     """Bring a pose to a minimum of its cost.
 
     Args:
-        target: Markers in the world [m]; NaN where missing.
         qpos: Pose to start from, overwritten.
-        prior_mean: Mean of the prior, a pose.
-        precision: Diagonal precision of the prior, in the order of a step's unknowns
-            [1/rad^2, 1/m^2, 1/rad^2]; zero where there is no prior.
-        robust_scale: Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for
-            plain least squares.
         small_gain: Expected decrease of the cost from which on a step is the last one.
 
     Returns:
         The cost (squared standard deviations), and how many steps were tried.
     """
-    trial = qpos.copy()
-    weights = np.zeros(len(target))
-    cost = _cost(hand, target, qpos, prior_mean, precision, robust_scale, work)
-    _linearize(hand, qpos, prior_mean, precision, robust_scale, weights, work)
+    trial, weights = qpos.copy(), np.zeros(len(energy.target))
+    cost = _cost(hand, energy, qpos, work)
+    _linearize(hand, energy, qpos, weights, work)
     damping, steps = _FIRST_DAMPING, 0
     while steps < most_steps and damping < _MOST_DAMPING:
         steps += 1
@@ -323,7 +322,7 @@ def levenberg_marquardt(
         move_wrist(qpos, work.step, trial)
         for hinge in range(NUM_JOINTS):
             trial[7 + hinge] = qpos[7 + hinge] + work.step[hinge]
-        trial_cost = _cost(hand, target, trial, prior_mean, precision, robust_scale, work)
+        trial_cost = _cost(hand, energy, trial, work)
         better = trial_cost < cost
         if better:
             qpos[:] = trial
@@ -331,62 +330,28 @@ def levenberg_marquardt(
         if gain < small_gain:
             break
         if better:
-            _linearize(hand, qpos, prior_mean, precision, robust_scale, weights, work)
+            _linearize(hand, energy, qpos, weights, work)
         damping = max(damping * 0.1, _LEAST_DAMPING) if better else damping * 10.0
     return cost, steps
 
 
 @kernel
-def marker_residuals(
-    hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
-) -> None:
-    """Forward kinematics, and the residuals of the markers in the wrist's frame.
-
-    Args:
-        target: Markers in the world [m]; NaN where missing.
-        work: Filled as by `compute_markers`, and `residuals` too.
-    """
-    compute_markers(hand, qpos[7:], work)
-    w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
-    for marker in range(len(target)):
-        a, b, c = (
-            target[marker, 0] - qpos[0],
-            target[marker, 1] - qpos[1],
-            target[marker, 2] - qpos[2],
-        )
-        # The inverse rotation: v + 2 w (v x u) + 2 (v x u) x u, with u the quaternion's vector part.
-        i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
-        position, residual = work.markers[marker], work.residuals[marker]
-        residual[0] = position[0] - a - 2.0 * (w * i + j * z - k * y)
-        residual[1] = position[1] - b - 2.0 * (w * j + k * x - i * z)
-        residual[2] = position[2] - c - 2.0 * (w * k + i * y - j * x)
-
-
-@kernel
-def _cost(
-    hand: HandArrays,
-    target: Float[np.ndarray, "M 3"],
-    qpos: Float[np.ndarray, "27"],
-    prior_mean: Float[np.ndarray, "27"],
-    precision: Float[np.ndarray, "26"],
-    robust_scale: float,
-    work: Workspace,
-) -> float:
+def _cost(hand: HandArrays, energy: PoseEnergy, qpos: Float[np.ndarray, "27"], work: Workspace) -> float:
     """Cost of a pose (squared standard deviations); fills `work` as `marker_residuals` does."""
-    marker_residuals(hand, target, qpos, work)
-    cost = 0.0
-    for marker in range(len(target)):
+    marker_residuals(hand, energy.target, qpos, work)
+    cost, precision = 0.0, energy.precision
+    for marker in range(len(energy.target)):
         residual = work.residuals[marker]
         square = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2]
         if not np.isnan(square):
-            cost += _MARKER_PRECISION * square / (1.0 + robust_scale * square)  # Geman and McClure 1987
+            cost += _MARKER_PRECISION * square / (1.0 + energy.robust_scale * square)  # Geman, McClure 1987
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        deviation = angle - prior_mean[7 + hinge]
+        deviation = angle - energy.prior_mean[7 + hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
-        cost += precision[hinge] * deviation * deviation + _LIMIT_PRECISION * beyond * beyond
+        cost += precision[hinge] * deviation * deviation + LIMIT_PRECISION * beyond * beyond
     if precision[NUM_JOINTS] > 0.0:
-        wrist_offsets(prior_mean, qpos, work.step)
+        wrist_offsets(energy.prior_mean, qpos, work.step)
         for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
             cost += precision[unknown] * work.step[unknown] ** 2
     return cost
@@ -395,10 +360,8 @@ def _cost(
 @kernel
 def _linearize(
     hand: HandArrays,
+    energy: PoseEnergy,
     qpos: Float[np.ndarray, "27"],
-    prior_mean: Float[np.ndarray, "27"],
-    precision: Float[np.ndarray, "26"],
-    robust_scale: float,
     weights: Float[np.ndarray, "M"],
     work: Workspace,
 ) -> None:
@@ -406,21 +369,23 @@ def _linearize(
 
     The robust loss is taken into account by reweighting; `weights` [1/m^2] is a buffer and is overwritten.
     """
+    precision = energy.precision
     for marker in range(len(weights)):
         residual = work.residuals[marker]
         square = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2]
-        weights[marker] = 0.0 if np.isnan(square) else _MARKER_PRECISION / (1.0 + robust_scale * square) ** 2
+        robust = (1.0 + energy.robust_scale * square) ** 2
+        weights[marker] = 0.0 if np.isnan(square) else _MARKER_PRECISION / robust
     accumulate_normal_equations(hand, weights, work)
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        work.gradient[hinge] += precision[hinge] * (angle - prior_mean[7 + hinge])
+        work.gradient[hinge] += precision[hinge] * (angle - energy.prior_mean[7 + hinge])
         work.normal[hinge, hinge] += precision[hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
         if beyond != 0.0:
-            work.gradient[hinge] += _LIMIT_PRECISION * beyond
-            work.normal[hinge, hinge] += _LIMIT_PRECISION
+            work.gradient[hinge] += LIMIT_PRECISION * beyond
+            work.normal[hinge, hinge] += LIMIT_PRECISION
     if precision[NUM_JOINTS] > 0.0:
-        wrist_offsets(prior_mean, qpos, work.step)
+        wrist_offsets(energy.prior_mean, qpos, work.step)
         for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
             work.gradient[unknown] += precision[unknown] * work.step[unknown]
             work.normal[unknown, unknown] += precision[unknown]
@@ -462,12 +427,9 @@ def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> f
 def move_wrist(
     qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
 ) -> None:
-    """Translate and rotate the wrist along its own axes by the last six unknowns of a step.
+    """Write the wrist of a pose after the last six unknowns of a step to the first seven numbers of another.
 
-    Args:
-        qpos: The pose before.
-        step: The step [rad, m, rad].
-        moved: The pose after; only its first seven numbers are written.
+    The step [rad, m, rad] translates and rotates the wrist along its own axes.
     """
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
@@ -503,7 +465,10 @@ def wrist_offsets(
 
 @kernel
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
-    """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read."""
+    """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read.
+
+    A call of LAPACK costs more than the inverse of so small a matrix.
+    """
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):

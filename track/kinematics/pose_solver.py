@@ -24,23 +24,73 @@ from track.kinematics.marker_kinematics import (
     MARKER_NOISE,
     NUM_UNKNOWNS,
     HandArrays,
+    PoseEnergy,
     Workspace,
+    compute_markers,
     hand_arrays,
     levenberg_marquardt,
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import (
-    JointPrior,
-    MarkerPrediction,
-    empty_prediction,
-    predict_markers,
-    world_markers,
-)
 
+FEWEST_MARKERS: Final = 4
+"""Least number of markers of a frame for a pose to be solved."""
+FEWEST_ON_PART: Final = 3
+"""Markers that determine a digit's hinges, also when it is straight, or a palm's pose."""
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+"""Hinge angles of a relaxed hand [rad]."""
+# Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
+# knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
+# finger, opposed, opposed and bent, across the palm.
+_FINGER: Final = (
+    (0, 25, 35, 20),
+    (0, 0, 5, 5),
+    (0, 45, 60, 35),
+    (0, 75, 10, 10),
+    (0, 10, 95, 55),
+    (0, 80, 100, 55),
+)
+_THUMB: Final = (
+    (0, 25, 35, 20),
+    (25, -25, 0, 0),
+    (-20, -20, 10, 10),
+    (25, 20, 10, 10),
+    (20, 25, 45, 60),
+    (-20, 35, 50, 40),
+)
+# Of choosing digits and aligning again; the choice no longer changes after these.
+_ALIGNMENT_ROUNDS: Final = 3
+_LEAST_SHAPE_SPREAD: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
+_ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
+_STEPS_AT_WIDE_SCALES: Final = 8  # at most at each widened scale
+_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
+_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
+_RMS_OF_LAST_START: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
 _MOST_STEPS: Final = 30  # from each start
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
 _ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all markers nearer by 30 um
+
+
+class _StartingShapes(NamedTuple):
+    """K hand shapes with the wrist at the origin, and the positions of their markers."""
+
+    angles: Float[np.ndarray, "K 20"]
+    """Hinge angles [rad]."""
+    markers: Float[np.ndarray, "K M 3"]
+    """Markers in the wrist's frame [m]."""
+    weights: Float[np.ndarray, "M"]
+    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
+
+
+class _PosePrior(NamedTuple):
+    """What is known of the poses of frames before their markers are used."""
+
+    angles: Float[np.ndarray, "P 20"]  # mean of the hinges [rad], one row per frame or none
+    precision: Float[np.ndarray, "P 20"]  # their precision [1/rad^2]
+    wrist: Float[np.ndarray, "9"]  # position [m] and orientation of the wrist, then the precisions of both
+
+
+_NO_ROWS: Final = np.empty((0, NUM_JOINTS))
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero
 
 
@@ -67,6 +117,22 @@ class AnglePrior:
     spread: ArrayLike
     """Their standard deviation [rad]: one number, or an array that broadcasts with the angles."""
 
+    def _rows(self, frames: int) -> _PosePrior:
+        """Means and precisions, one row per frame."""
+        spread = np.asarray(self.spread, dtype=np.float64)
+        if not (spread > 0.0).all():
+            raise ArgumentError(f"prior.spread is {spread.min():g} rad, expected positive angles")
+        angles = check_array("prior.angles", self.angles, (NUM_JOINTS,))
+        shape = (frames, NUM_JOINTS)
+        try:
+            means, precision = np.broadcast_to(angles, shape), np.broadcast_to(spread**-2, shape)
+        except ValueError:
+            raise ArgumentError(
+                f"prior has angles of shape {angles.shape} and spread of shape {spread.shape}, "
+                f"expected shapes that broadcast to ({frames}, {NUM_JOINTS})"
+            ) from None
+        return _PosePrior(np.array(means, order="C"), np.array(precision, order="C"), _NO_WRIST)
+
 
 class PoseSolver:
     """Solves poses of one hand in one glove; precomputes what does not depend on the frame.
@@ -79,20 +145,20 @@ class PoseSolver:
         ArgumentError: `outlier_distance` is not positive.
     """
 
-    def __init__(
-        self,
-        fit: GloveFit,
-        *,
-        outlier_distance: float | None = None,
-    ) -> None:
+    def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
         if outlier_distance is not None and not outlier_distance > 0.0:
             raise ArgumentError(f"outlier_distance is {outlier_distance:g} m, expected a positive distance")
         self.hand: HandArrays = hand_arrays(fit)
         """The hand and its glove; a change of its marker positions takes effect in the next solution."""
-        self._shapes: StartingShapes = starting_shapes(fit)
+        angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
+        markers = fit.markers(join_qpos(angles))[0]
+        weights = 1.0 / (_LEAST_SHAPE_SPREAD**2 + markers.var(axis=0).sum(axis=1))
+        self._shapes = _StartingShapes(angles, markers, weights)
         self._robust_scale = 0.0 if outlier_distance is None else outlier_distance**-2
-        parts = (*range(len(DIGITS)), -1)  # the palm last
-        self._on_part = np.array([(self.hand.digits == number).sum() for number in parts])
+        self.on_part: Int[np.ndarray, "6"] = np.array(
+            [(self.hand.digits == part).sum() for part in (*range(len(DIGITS)), -1)]
+        )
+        """Markers on each digit, and on the palm (last)."""
 
     def solve(
         self,
@@ -117,20 +183,17 @@ class PoseSolver:
         """
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
-        if targets.ndim != 3 or targets.shape[1:] != self._shapes.markers.shape[1:]:
-            raise ArgumentError(
-                f"targets have shape {targets.shape}, expected (T, {self._shapes.markers.shape[1]}, 3)"
-            )
+        frames, markers = len(targets), len(self.hand.digits)
+        if targets.ndim != 3 or targets.shape[1:] != (markers, 3):
+            raise ArgumentError(f"targets have shape {targets.shape}, expected (T, {markers}, 3)")
         starts = np.empty((0, NUM_QPOS))
         if initial is not None:
             starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
-            if starts.shape != (len(targets), NUM_QPOS):
-                raise ArgumentError(
-                    f"initial has shape {starts.shape}, expected ({len(targets)}, {NUM_QPOS})"
-                )
-        angles, precision = _rows(prior, len(targets))
+            if starts.shape != (frames, NUM_QPOS):
+                raise ArgumentError(f"initial has shape {starts.shape}, expected ({frames}, {NUM_QPOS})")
+        known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST) if prior is None else prior._rows(frames)
         steps = _MOST_STEPS if iterations is None else iterations
-        wrong, fit = self._run(targets, starts, angles, precision, _NO_WRIST, steps, _CONVERGED)
+        wrong, fit = self._run(targets, starts, known, steps, _CONVERGED)
         if wrong >= 0:
             present = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
             if present < FEWEST_MARKERS:
@@ -163,57 +226,29 @@ class PoseSolver:
             wrist_spread: Standard deviations of that position [m] and orientation [rad].
         """
         wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
-        precision, one = spread[None] ** -2.0, (target[None], start[None], angles[None])
-        return self._run(*one, precision, wrist_prior, _MOST_STEPS, _ACCURATE)[1]
+        prior = _PosePrior(angles[None], spread[None] ** -2.0, wrist_prior)
+        return self._run(target[None], start[None], prior, _MOST_STEPS, _ACCURATE)[1]
 
     def _run(
         self,
         targets: NDArray[np.float64],
         starts: NDArray[np.float64],
-        angles: NDArray[np.float64],
-        precision: NDArray[np.float64],
-        wrist: NDArray[np.float64],
+        prior: _PosePrior,
         iterations: int,
         small_gain: float,
     ) -> tuple[int, PoseFit]:
-        """Index of the first frame that cannot be solved (or -1), and the fits; see `fit_frames`."""
-        wrong, *arrays = fit_frames(
-            self.hand,
-            self._shapes,
-            self._on_part,
-            targets,
-            starts,
-            angles,
-            precision,
-            wrist,
-            self._robust_scale,
-            iterations,
-            small_gain,
+        """Index of the first frame that cannot be solved (or -1), and the fits."""
+        scale, frames = self._robust_scale, (targets, starts, prior)
+        wrong, *arrays = _fit_frames(
+            self.hand, self._shapes, self.on_part, *frames, scale, iterations, small_gain
         )
         return wrong, PoseFit(*arrays)
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
         positions = np.empty((len(self.hand.digits), 3))
-        world_markers(self.hand, np.array(qpos, dtype=np.float64), positions)
+        _write_world_markers(self.hand, np.array(qpos, dtype=np.float64), positions)
         return positions
-
-    def predict_markers(
-        self,
-        qpos: Float[np.ndarray, "27"],
-        target: Float[np.ndarray, "M 3"],
-        joint_prior: JointPrior,
-        *,
-        wrist_spread: tuple[float, float],
-        variance: Float[np.ndarray, "M"],
-        noise: float,
-    ) -> MarkerPrediction:
-        """Positions and covariances of a fitted pose's markers; see `marker_prediction.predict_markers`."""
-        predicted = empty_prediction(len(self.hand.digits))
-        predict_markers(
-            self.hand, self._on_part, qpos, target, joint_prior, wrist_spread, variance, noise, predicted
-        )
-        return predicted
 
 
 def solve_pose(
@@ -240,46 +275,14 @@ def solve_pose(
     return PoseSolver(fit).solve(targets, initial, iterations=iterations)
 
 
-def _rows(prior: AnglePrior | None, frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean angles [rad] and precisions [1/rad^2] of a prior, one row per frame or no rows."""
-    if prior is None:
-        return np.empty((0, NUM_JOINTS)), np.empty((0, NUM_JOINTS))
-    spread = np.asarray(prior.spread, dtype=np.float64)
-    if not (spread > 0.0).all():
-        raise ArgumentError(f"prior.spread is {spread.min():g} rad, expected positive angles")
-    angles = check_array("prior.angles", prior.angles, (NUM_JOINTS,))
-    try:
-        return (
-            np.array(np.broadcast_to(angles, (frames, NUM_JOINTS)), order="C"),
-            np.array(np.broadcast_to(spread**-2, (frames, NUM_JOINTS)), order="C"),
-        )
-    except ValueError:
-        raise ArgumentError(
-            f"prior has angles of shape {angles.shape} and spread of shape {spread.shape}, "
-            f"expected shapes that broadcast to ({frames}, {NUM_JOINTS})"
-        ) from None
-
-
-FEWEST_MARKERS: Final = 4
-"""Least number of markers of a frame for a pose to be solved."""
-_EASING: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
-_EASING_STEPS: Final = 8  # at most at each widened scale
-_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
-_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
-_FEWEST_ON_PART: Final = 3  # markers that determine a digit's hinges, also when straight, or a palm's pose
-_GOOD_RMS: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
-
-
 @kernel
-def fit_frames(
+def _fit_frames(
     hand: HandArrays,
-    shapes: StartingShapes,
+    shapes: _StartingShapes,
     on_part: Int[np.ndarray, "6"],
     targets: Float[np.ndarray, "T M 3"],
     initial: Float[np.ndarray, "S 27"],
-    predicted: Float[np.ndarray, "P 20"],
-    predicted_precision: Float[np.ndarray, "P 20"],
-    wrist: Float[np.ndarray, "9"],
+    prior: _PosePrior,
     robust_scale: float,
     iterations: int,
     small_gain: float,
@@ -297,10 +300,7 @@ def fit_frames(
         on_part: Markers on each digit, and on the palm (last).
         targets: Labeled markers [m]; NaN where missing.
         initial: Poses to start from, one row per frame or none.
-        predicted: Mean of the hinges [rad], one row per frame or none.
-        predicted_precision: Their precision [1/rad^2].
-        wrist: Predicted position [m] and orientation of the wrist, then the precisions of both.
-        robust_scale: See `levenberg_marquardt`.
+        robust_scale: See `PoseEnergy`.
         iterations: Steps at most from each start.
         small_gain: See `levenberg_marquardt`.
 
@@ -310,25 +310,13 @@ def fit_frames(
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
-    prior_mean, precision, seen = (
-        np.empty(NUM_QPOS),
-        np.empty(NUM_UNKNOWNS),
-        np.empty(len(on_part), dtype=np.int64),
-    )
+    mean, precision, seen = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS), np.empty(len(on_part), dtype=np.int64)
     work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
     for frame in range(frames):
         present = _read_markers(hand.digits, targets[frame], target, seen)
         if present < FEWEST_MARKERS:
             return frame, qpos, rms, residuals, steps
-        _set_prior(
-            seen,
-            on_part,
-            predicted[frame:],
-            predicted_precision[frame:],
-            wrist,
-            prior_mean,
-            precision,
-        )
+        _set_prior(seen, on_part, prior, frame, mean, precision)
         if len(initial) > 0:
             starts = initial[frame : frame + 1].copy()
             length = np.sqrt((starts[0, 3:7] ** 2).sum())
@@ -336,24 +324,23 @@ def fit_frames(
                 return frame, qpos, rms, residuals, steps
             starts[0, 3:7] /= length
         else:
-            starts = initial_poses(shapes, hand.digits, target)
+            starts = _initial_poses(shapes, hand.digits, target)
         least = np.inf
         qpos[frame] = starts[0]
         for number in range(len(starts)):
             pose[:] = starts[number]
             cost = np.inf
-            for part in _EASING:
+            for part in _ROBUST_SCALES:
                 if robust_scale == 0.0 and part < 1.0:
                     continue
-                most = iterations if part == 1.0 else min(iterations, _EASING_STEPS)
-                cost, tried = levenberg_marquardt(
-                    hand, target, pose, prior_mean, precision, part * robust_scale, most, small_gain, work
-                )
+                most = iterations if part == 1.0 else min(iterations, _STEPS_AT_WIDE_SCALES)
+                energy = PoseEnergy(target, mean, precision, part * robust_scale)
+                cost, tried = levenberg_marquardt(hand, energy, pose, most, small_gain, work)
                 steps[frame] += tried
             if cost < least:
                 least = cost
                 qpos[frame] = pose
-            if least < present * (_GOOD_RMS / MARKER_NOISE) ** 2:
+            if least < present * (_RMS_OF_LAST_START / MARKER_NOISE) ** 2:
                 break
         rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
     return -1, qpos, rms, residuals, steps
@@ -386,32 +373,25 @@ def _read_markers(
 def _set_prior(
     seen: Int[np.ndarray, "6"],
     on_part: Int[np.ndarray, "6"],
-    predicted: Float[np.ndarray, "P 20"],
-    predicted_precision: Float[np.ndarray, "P 20"],
-    wrist: Float[np.ndarray, "9"],
-    prior_mean: Float[np.ndarray, "27"],
+    prior: _PosePrior,
+    frame: int,
+    mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],
 ) -> None:
-    """Mean and precision of the prior of one frame, both filled; see `levenberg_marquardt`.
-
-    The frame's rows of `predicted` and `predicted_precision` come first, if there are any.
-    """
-    prior_mean[:7] = wrist[:7]
-    incomplete = seen[-1] < max(on_part[-1], _FEWEST_ON_PART)
-    precision[NUM_JOINTS : NUM_JOINTS + 3] = wrist[7] if incomplete else 0.0
-    precision[NUM_JOINTS + 3 :] = wrist[8] if incomplete else 0.0
+    """Fill mean and precision of the prior of one frame; see `PoseEnergy`."""
+    mean[:7] = prior.wrist[:7]
+    incomplete = seen[-1] < max(on_part[-1], FEWEST_ON_PART)
+    precision[NUM_JOINTS : NUM_JOINTS + 3] = prior.wrist[7] if incomplete else 0.0
+    precision[NUM_JOINTS + 3 :] = prior.wrist[8] if incomplete else 0.0
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
-        complete = seen[digit] == on_part[digit] and seen[digit] >= _FEWEST_ON_PART
-        rest, weight = (
-            RESTING[hinge],
-            _REST_PRECISION * (_COMPLETE_DIGIT if complete else 1.0),
-        )
-        if len(predicted) > 0 and not complete:
-            both = weight + predicted_precision[0, hinge]
-            rest += (predicted[0, hinge] - rest) * predicted_precision[0, hinge] / both
+        complete = seen[digit] == on_part[digit] and seen[digit] >= FEWEST_ON_PART
+        rest, weight = RESTING[hinge], _REST_PRECISION * (_COMPLETE_DIGIT if complete else 1.0)
+        if len(prior.angles) > frame and not complete:
+            both = weight + prior.precision[frame, hinge]
+            rest += (prior.angles[frame, hinge] - rest) * prior.precision[frame, hinge] / both
             weight = both
-        prior_mean[7 + hinge], precision[hinge] = rest, weight
+        mean[7 + hinge], precision[hinge] = rest, weight
 
 
 @kernel
@@ -438,52 +418,21 @@ def _write_residuals(
     return np.sqrt(total / present)  # type: ignore[no-any-return]
 
 
-RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
-"""Hinge angles of a relaxed hand [rad]."""
-# Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
-# knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
-# finger, opposed, opposed and bent, across the palm.
-_FINGER: Final = (
-    (0, 25, 35, 20),
-    (0, 0, 5, 5),
-    (0, 45, 60, 35),
-    (0, 75, 10, 10),
-    (0, 10, 95, 55),
-    (0, 80, 100, 55),
-)
-_THUMB: Final = (
-    (0, 25, 35, 20),
-    (25, -25, 0, 0),
-    (-20, -20, 10, 10),
-    (25, 20, 10, 10),
-    (20, 25, 45, 60),
-    (-20, 35, 50, 40),
-)
-_ROUNDS: Final = 3  # of choosing digits and aligning again; the choice is settled after these
-_STEADY: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
-
-
-class StartingShapes(NamedTuple):
-    """K hand shapes with the wrist at the origin, and the positions of their markers."""
-
-    angles: Float[np.ndarray, "K 20"]
-    """Hinge angles [rad]."""
-    markers: Float[np.ndarray, "K M 3"]
-    """Markers in the wrist's frame [m]."""
-    weights: Float[np.ndarray, "M"]
-    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
-
-
-def starting_shapes(fit: GloveFit) -> StartingShapes:
-    """The shapes that a fit of this hand in its glove may start from."""
-    angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
-    markers = fit.markers(join_qpos(angles))[0]
-    return StartingShapes(angles, markers, 1.0 / (_STEADY**2 + markers.var(axis=0).sum(axis=1)))
+@kernel
+def _write_world_markers(
+    hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
+) -> None:
+    """Write the positions of a pose's markers in the world [m]."""
+    work, wrist = workspace(len(positions)), np.empty((3, 3))
+    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
+    compute_markers(hand, pose[7:], work)
+    for marker in range(len(positions)):
+        positions[marker] = pose[:3] + wrist @ work.markers[marker]
 
 
 @kernel
-def initial_poses(
-    shapes: StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
+def _initial_poses(
+    shapes: _StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "S 27"]:
     """Poses to start from (K + 1, 27) for the markers of one frame, the most likely one first.
 
@@ -491,8 +440,7 @@ def initial_poses(
     aligned with the markers first.
     """
     count = len(shapes.angles)
-    aligned, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
-    squares = np.empty(count)
+    aligned, poses, squares = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS)), np.empty(count)
     for number in range(count):
         aligned[number, 7:] = shapes.angles[number]
         squares[number] = align_rigid(shapes.markers[number], target, shapes.weights, aligned[number])
@@ -504,7 +452,7 @@ def initial_poses(
         poses[1 + better] = aligned[number]
     markers = np.empty_like(target)
     poses[0] = poses[1]
-    for _ in range(_ROUNDS):
+    for _ in range(_ALIGNMENT_ROUNDS):
         _choose_digits(shapes, digits, target, poses[0], markers)
         align_rigid(markers, target, shapes.weights, poses[0])
     return poses
@@ -512,7 +460,7 @@ def initial_poses(
 
 @kernel
 def _choose_digits(
-    shapes: StartingShapes,
+    shapes: _StartingShapes,
     digits: Int[np.ndarray, "M"],
     target: Float[np.ndarray, "M 3"],
     pose: Float[np.ndarray, "27"],

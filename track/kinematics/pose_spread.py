@@ -1,9 +1,15 @@
-"""Standard deviations of joint angles and keypoints: what markers, priors and the hand leave open.
+"""What markers and priors leave open of a pose: covariances of hinges, predicted markers and keypoints.
 
-The model is linear and normal around the pose. Each marker is seen with noise, and tells less the longer it
-is hidden. The hand is not quite its user's, which is the same in every frame, so that no number of frames
-averages it out: its size is another, markers sit elsewhere on their bones, digits begin elsewhere and point
-another way, bones are longer. What no marker tells follows what hands usually do: the covariance of gestures.
+- Before its markers are used, a hand has a prior: a normal distribution of all 20 hinges together. They
+  follow an Ornstein-Uhlenbeck process whose resting distribution is that of the gestures people make: a hinge
+  that no marker shows for a while returns to it, in its mean and in its spread. Neighboring fingers bend
+  together, so the covariance carries information from visible digits to hidden ones.
+- The neighbors of a missing marker may determine its position nearly, or leave it free along the arc of one
+  hinge. The normal matrix of the fit together with the prior of the hinges gives its covariance.
+- Standard deviations of joint angles and keypoints come from a model that is linear and normal around the
+  pose. Each marker is seen with noise, and tells less the longer it is hidden. The hand differs from its
+  user's in the same way in every frame, so that no number of frames averages it out: in its size, in the
+  places of its markers, in where its digits begin and point, in the lengths of its bones.
 """
 
 from __future__ import annotations
@@ -13,7 +19,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
@@ -34,14 +39,20 @@ from track.kinematics.marker_kinematics import (
     solve_positive,
     workspace,
 )
+from track.kinematics.pose_solver import FEWEST_ON_PART
 
+# So short that a digit with one marker that was bent as few digits are finds its way back.
+_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of the hinges
+_JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge
+_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # added to the gestures' spread, for poses that none shows
+_ARC: Final = 0.04  # [m] usual radius of the arcs that markers move on: the length of a finger's bones
+_LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision on the diagonal, so that it has an inverse
 _DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
 _LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
-_NOISE_STEP: Final = 1e-5  # [m] in which noise is told apart
+_NOISE_STEP: Final = 1e-5  # [m] to which noise is rounded
 # A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
-_DETERMINED: Final = 3  # markers that determine a digit
-_FEW: Final = 1.4  # times the doubt of such a digit, of one with fewer
+_FEW: Final = 1.4  # uncertainty factor of a digit with fewer than three markers
 _CALIBRATED_SIZE: Final = 3.0  # [1/m] times the noise
 _CALIBRATED_PLACE: Final = 0.15  # times the noise
 _CALIBRATED_PALM: Final = 0.45  # times the noise
@@ -57,31 +68,36 @@ _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, b
 _CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
 
 
-class _Proportions(NamedTuple):
-    """How far a hand that is not calibrated is from its user's: standard deviations."""
+class JointPrior(NamedTuple):
+    """A normal distribution of the hinges."""
 
-    size: float
-    """Logarithm."""
-    place: float
-    """Of a marker [m]."""
-    knuckle: float
-    """[m]"""
-    turn: float
-    """Of a finger's direction [deg]."""
-    thumb: float
-    """Times the fingers' directions."""
-    bones: tuple[float, float]
-    """Logarithms, of each bone and of all of a digit."""
+    angles: Float[np.ndarray, "20"]  # mean [rad]
+    covariance: Float[np.ndarray, "20 20"]  # covariance [rad^2]
+    precision: Float[np.ndarray, "20 20"]  # inverse of the covariance [1/rad^2]
+
+    @property
+    def spread(self) -> Float[np.ndarray, "20"]:
+        """Standard deviation of each hinge [rad]."""
+        return np.sqrt(np.diag(self.covariance))
 
 
-# Chosen on simulated people that benchmarks.doubt does not try. What the fit of the proportions makes up for
-# is not here: less than people differ by.
-_MEASURED: Final = _Proportions(0.001, 0.0014, 0.0003, 1.8, 4.0, (0.01, 0.02))
-# Of the nearest of five sizes: what people differ by, and half a step between sizes. Places are off by what
-# slips, and by what girths of digits and lengths of bones that are not the user's move.
-_NAMED: Final = _Proportions(
-    0.02, 0.003, ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0, (ADULTS.bone_spread, ADULTS.digit_spread)
-)
+class MarkerPrediction(NamedTuple):
+    """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
+
+    qpos: Float[np.ndarray, "27"]
+    """The pose; hinges of digits that lack markers are moved to the optimum of markers and prior."""
+    positions: Float[np.ndarray, "M 3"]
+    """Markers in the world [m]."""
+    covariances: Float[np.ndarray, "M 3 3"]
+    """Covariance of each marker in the world [m^2]: that of the pose, and the marker's own variance."""
+    rotations: Float[np.ndarray, "M 3 3"]
+    """Rotation in the world of the bone with the largest weight of each marker."""
+    joint_covariance: Float[np.ndarray, "20 20"]
+    """Covariance of the hinges [rad^2]."""
+    information_matrix: Float[np.ndarray, "20 20"]
+    """Information of the markers alone on the hinges, the palm being held [1/rad^2]."""
+    information_vector: Float[np.ndarray, "20"]
+    """The matrix times the angles that the markers alone would give [1/rad]."""
 
 
 class HandDoubt(NamedTuple):
@@ -105,52 +121,276 @@ class HandDoubt(NamedTuple):
     """Of where a digit's joints and its tip are, as far as no marker shows it, in each direction [m]."""
 
 
+class _Proportions(NamedTuple):
+    """How far a hand that is not calibrated is from its user's: standard deviations."""
+
+    size: float  # logarithm
+    place: float  # of a marker [m]
+    knuckle: float  # [m]
+    turn: float  # of a finger's direction [deg]
+    thumb: float  # times the fingers' directions
+    bones: tuple[float, float]  # logarithms, of each bone and of all of a digit
+
+
+# Chosen on simulated people that benchmarks.doubt does not try. What the fit of the proportions makes up for
+# is not here: less than people differ by.
+_MEASURED: Final = _Proportions(0.001, 0.0014, 0.0003, 1.8, 4.0, (0.01, 0.02))
+# Of the nearest of five sizes: what people differ by, and half a step between sizes. Places are off by what
+# slips, and by what girths of digits and lengths of bones that are not the user's move.
+_NAMED: Final = _Proportions(
+    0.02, 0.003, ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0, (ADULTS.bone_spread, ADULTS.digit_spread)
+)
+
+
+@cache
+def resting_prior() -> JointPrior:
+    """Prior of a hand without any history: mean and covariance over all gestures."""
+    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
+    covariance = np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
+    return JointPrior(gestures.mean(axis=0), covariance, np.linalg.inv(covariance))
+
+
+def predict_joints(
+    angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
+) -> JointPrior:
+    """Prior of the hinges `span` seconds after they were estimated.
+
+    The angles [rad] are predicted by velocity alone; they return to those of a resting hand.
+    """
+    kept, resting = np.exp(-max(span, 0.0) / _JOINT_MEMORY), resting_prior()
+    mean = angles + (1.0 - kept) * (resting.angles - angles)
+    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
+    _predict_covariance(covariance, resting.covariance, kept**2, prior)
+    return prior
+
+
+@kernel
+def _predict_covariance(
+    known: Float[np.ndarray, "20 20"], resting: Float[np.ndarray, "20 20"], kept: float, prior: JointPrior
+) -> None:
+    """Fill covariance and precision of a prior: a share of what is known, the rest of a resting hand."""
+    for row in range(len(known)):
+        for column in range(len(known)):
+            prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
+        prior.covariance[row, row] += _JOINT_SPREAD**2
+    prior.precision[:] = prior.covariance
+    invert_positive(prior.precision)
+
+
+@kernel
+def digit_prior(
+    prior: JointPrior,
+    seen: MarkerPrediction,
+    digit: int,
+    angles: Float[np.ndarray, "4"],
+    precision: Float[np.ndarray, "4 4"],
+) -> None:
+    """Fill mean and precision of one digit's hinges, given the information of the others' markers."""
+    count = len(prior.angles)
+    order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
+    index = 0
+    for hinge in range(count):  # the digit's own hinges last, so that the others are eliminated from them
+        own = hinge // 4 == digit
+        order[count - 4 + hinge % 4 if own else index] = hinge
+        index += not own
+    for row in range(count):
+        one = order[row]
+        for column in range(count):
+            system[row, column] = prior.precision[one, order[column]]
+        if row < count - 4:
+            right_side[row] = seen.information_vector[one]
+            for column in range(count):
+                right_side[row] -= seen.information_matrix[one, order[column]] * prior.angles[order[column]]
+            for column in range(count - 4):
+                system[row, column] += seen.information_matrix[one, order[column]]
+    eliminate(system, right_side, 0, count - 4)
+    precision[:] = system[count - 4 :, count - 4 :]
+    solve_positive(system[count - 4 :, count - 4 :], right_side[count - 4 :])
+    for row in range(4):
+        angles[row] = prior.angles[4 * digit + row] + right_side[count - 4 + row]
+
+
+@kernel
+def predict_markers(
+    hand: HandArrays,
+    on_part: Int[np.ndarray, "6"],
+    pose: Float[np.ndarray, "27"],
+    target: Float[np.ndarray, "M 3"],
+    joint_prior: JointPrior,
+    wrist_spread: tuple[float, float],
+    variance: Float[np.ndarray, "M"],
+    noise: float,
+) -> MarkerPrediction:
+    """Positions and covariances of a fitted pose's markers.
+
+    Args:
+        on_part: Markers on each digit, and on the palm (last).
+        target: The markers it was fitted to [m]; NaN where missing.
+        joint_prior: Distribution of the hinges before the fit.
+        wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before the fit.
+        variance: Variance of each marker around its position on the hand [m^2].
+        noise: Standard deviation of the markers around the pose's [m].
+    """
+    count = len(target)
+    work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
+    out = MarkerPrediction(
+        pose.copy(),
+        np.empty((count, 3)),
+        np.empty((count, 3, 3)),
+        np.empty((count, 3, 3)),
+        np.empty((NUM_JOINTS, NUM_JOINTS)),
+        np.empty((NUM_JOINTS, NUM_JOINTS)),
+        np.empty(NUM_JOINTS),
+    )
+    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
+    marker_residuals(hand, target, pose, work)
+    seen = np.zeros(len(on_part), dtype=np.int64)
+    for marker in range(count):
+        if not np.isnan(work.residuals[marker, 0]):
+            weights[marker] = 1.0 / noise**2
+            seen[hand.digits[marker]] += 1
+    accumulate_normal_equations(hand, weights, work)
+    if _complete_digits(hand, seen, on_part, joint_prior, work, out.qpos):
+        marker_residuals(hand, target, out.qpos, work)
+        accumulate_normal_equations(hand, weights, work)
+    posterior = work.factor
+    for row in range(NUM_UNKNOWNS):
+        for column in range(row + 1):
+            posterior[row, column] = work.normal[column, row]
+        posterior[row, row] += _LEAST_INFORMATION / noise**2
+        if row >= NUM_JOINTS:
+            posterior[row, row] += wrist_spread[(row - NUM_JOINTS) // 3] ** -2.0
+    for row in range(NUM_JOINTS):
+        out.information_vector[row] = -work.gradient[row]
+        for column in range(NUM_JOINTS):
+            out.information_matrix[row, column] = posterior[max(row, column), min(row, column)]
+            out.information_vector[row] += out.information_matrix[row, column] * out.qpos[7 + column]
+    posterior[:NUM_JOINTS, :NUM_JOINTS] += joint_prior.precision
+    invert_positive(posterior)
+    out.joint_covariance[:] = posterior[:NUM_JOINTS, :NUM_JOINTS]
+    for marker in range(count):
+        _marker_covariance(hand, marker, posterior, wrist, variance[marker], work, out.covariances[marker])
+        bone = work.rotations[hand.bones[marker, 0]]
+        for i in range(3):
+            out.positions[marker, i] = pose[i]
+            for j in range(3):
+                out.positions[marker, i] += wrist[i, j] * work.markers[marker, j]
+                out.rotations[marker, i, j] = 0.0
+                for k in range(3):
+                    out.rotations[marker, i, j] += wrist[i, k] * bone[k, j]
+    return out
+
+
+@kernel
+def _marker_covariance(
+    hand: HandArrays,
+    marker: int,
+    posterior: Float[np.ndarray, "26 26"],
+    wrist: Float[np.ndarray, "3 3"],
+    variance: float,
+    work: Workspace,
+    covariance: Float[np.ndarray, "3 3"],
+) -> None:
+    """Fill the covariance of a marker in the world [m^2]: that of the unknowns, and its own variance."""
+    first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
+    count = last - first + 6
+    jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
+    for number in range(count):
+        unknown = first + number if number < last - first else NUM_JOINTS + number - (last - first)
+        for i in range(3):
+            for j in range(3):
+                in_world[i, number] += wrist[i, j] * jacobian[j, unknown]
+    covariance[:] = 0.0
+    for one in range(count):
+        row = first + one if one < last - first else NUM_JOINTS + one - (last - first)
+        for other in range(count):
+            column = first + other if other < last - first else NUM_JOINTS + other - (last - first)
+            share = posterior[row, column]
+            for i in range(3):
+                for j in range(3):
+                    covariance[i, j] += in_world[i, one] * share * in_world[j, other]
+    # A marker moves on an arc, not on its tangent: a variance along the tangent means a deviation
+    # across it, by the square over twice the radius.
+    bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
+    for i in range(3):
+        covariance[i, i] += variance + bend**2
+
+
+@kernel
+def _complete_digits(
+    hand: HandArrays,
+    seen: Int[np.ndarray, "6"],
+    on_part: Int[np.ndarray, "6"],
+    joint_prior: JointPrior,
+    work: Workspace,
+    qpos: Float[np.ndarray, "27"],
+) -> bool:
+    """Move hinges of digits that lack markers to the optimum of prior and markers; False without such digits.
+
+    The hinges of the other digits are held, and inform those of their neighbors through the prior's
+    covariance.
+    """
+    weak = np.zeros(NUM_JOINTS, dtype=np.int64)
+    count = 0
+    for hinge in range(NUM_JOINTS):
+        digit = hinge // 4
+        if seen[digit] < max(on_part[digit], FEWEST_ON_PART):
+            weak[count] = hinge
+            count += 1
+    if count == 0:
+        return False
+    matrix, change = np.empty((count, count)), np.empty(count)
+    for row in range(count):
+        one = weak[row]
+        change[row] = -work.gradient[one]
+        for hinge in range(NUM_JOINTS):
+            change[row] -= joint_prior.precision[one, hinge] * (qpos[7 + hinge] - joint_prior.angles[hinge])
+        for column in range(count):
+            other = weak[column]
+            information = work.normal[min(one, other), max(one, other)]
+            matrix[row, column] = information + joint_prior.precision[one, other]
+    solve_positive(matrix, change)
+    for row in range(count):
+        hinge = weak[row]
+        low, high = hand.ranges[hinge, 0], hand.ranges[hinge, 1]
+        qpos[7 + hinge] = min(max(qpos[7 + hinge] + change[row], low), high)
+    return True
+
+
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
-    """Of a hand of which everything is known, whose markers are seen with a noise [m]."""
+    """Doubt of a hand of which everything is known, whose markers are seen with a noise [m]."""
     count = len(DIGITS)
     pairs, turns = np.zeros((count, 2)), np.zeros((count, 3))
     return HandDoubt(noise, 0.0, np.zeros(len(digits)), np.zeros(count), turns, pairs, 0.0, pairs)
 
 
-def measured_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
-    """Of a hand of which size and proportions are measured: people and gloves differ as simulated ones do.
+def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -> HandDoubt:
+    """Doubt of a user's hand by where it is from.
+
+    People and gloves differ as simulated ones do. A calibrated hand is as near to its user's as the noise of
+    its markers [m] lets it be; a digit with a single marker remains half as doubtful as on a measured hand.
 
     Args:
         digits: Digit of each marker, -1 for the palm.
     """
-    return _doubt_of(digits, _MEASURED)
-
-
-def named_doubt(digits: Int[np.ndarray, "M"]) -> HandDoubt:
-    """Of a mean hand of the size nearest to the user's; arguments as `measured_doubt`."""
-    return _doubt_of(digits, _NAMED)
-
-
-def _doubt_of(digits: Int[np.ndarray, "M"], proportions: _Proportions) -> HandDoubt:
-    """Of a hand that is not calibrated."""
-    count = len(DIGITS)
-    directions = np.full((count, 3), np.deg2rad(proportions.turn))
-    directions[0] *= proportions.thumb
-    return HandDoubt(
+    known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
+    turns = np.full((count, 3), np.deg2rad(known.turn))
+    turns[0] *= known.thumb
+    before = HandDoubt(
         MARKER_NOISE,
-        proportions.size,
-        np.full(len(digits), proportions.place),
-        np.full(count, proportions.knuckle),
-        directions,
-        np.tile(proportions.bones, (count, 1)),
+        known.size,
+        np.full(len(digits), known.place),
+        np.full(count, known.knuckle),
+        turns,
+        np.tile(known.bones, (count, 1)),
         0.0,
         np.zeros((count, 2)),
     )
-
-
-def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
-    """Of a calibrated hand, which is as near to its user's as the noise of its markers [m] lets it be.
-
-    A digit with a single marker remains half as doubtful as on a measured hand.
-    """
-    before, counts = measured_doubt(digits), np.bincount(digits[digits >= 0], minlength=len(DIGITS))
-    single, few = counts < 2, np.where(counts < _DETERMINED, _FEW, 1.0)
-    places = np.where(single, 0.6 * _MEASURED.place, _CALIBRATED_PLACE * noise * few)
+    if origin != "calibrated":
+        return before
+    counts = np.bincount(digits[digits >= 0], minlength=count)
+    single, few = counts < 2, np.where(counts < FEWEST_ON_PART, _FEW, 1.0)
+    places = np.where(single, 0.6 * known.place, _CALIBRATED_PLACE * noise * few)
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
     turns[0] *= _CALIBRATED_THUMB * few[0]  # few markers tell even less of where a thumb points
     return HandDoubt(
@@ -166,11 +406,7 @@ def calibrated_doubt(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
 
 
 class SpreadModel:
-    """Standard deviations of the poses of one hand.
-
-    Args:
-        origin: Where it is from.
-    """
+    """Standard deviations of the poses of one hand, which depend on where the hand is from."""
 
     def __init__(self, fit: GloveFit, origin: HandOrigin) -> None:
         self._hand, self._tips, self._origin = hand_arrays(fit), tip_lengths(fit), origin
@@ -195,23 +431,30 @@ class SpreadModel:
         digits = self._hand.digits
         freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
         noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
-        doubt = self._doubt(round(noise / _NOISE_STEP))
-        return pose_spreads(self._hand, self._tips, resting_prior().precision, doubt, qpos, unseen)
-
-    def _doubt(self, steps: int) -> HandDoubt:
-        """What is not known of the hand, at a noise of so many steps."""
+        steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
-            digits = self._hand.digits
-            if self._origin == "calibrated":
-                self._doubts[steps] = calibrated_doubt(digits, steps * _NOISE_STEP)
-            else:
-                self._doubts[steps] = (measured_doubt if self._origin == "measured" else named_doubt)(digits)
-        return self._doubts[steps]
+            self._doubts[steps] = hand_doubt(digits, self._origin, steps * _NOISE_STEP)
+        return pose_spreads(
+            self._hand, self._tips, resting_prior().precision, self._doubts[steps], qpos, unseen
+        )
 
 
 def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:
     """Lengths of the last bones [m]."""
     return np.array([fit.model.skeleton.lengths[bones_of(digit)[-1]] for digit in DIGITS])
+
+
+class _PoseErrors(NamedTuple):
+    """Covariances of the unknowns of one pose, and how its fit answers to what is not known of the hand."""
+
+    posterior: Float[np.ndarray, "26 26"]
+    """By noise alone."""
+    covariance: Float[np.ndarray, "26 26"]
+    """With the doubt of the hand; lower triangle."""
+    own: Float[np.ndarray, "5 10 26"]
+    """Change of the fit's gradient by each digit's own numbers, in their standard deviations."""
+    whole: Float[np.ndarray, "26"]
+    """The same by the size of the whole hand."""
 
 
 @kernel
@@ -232,9 +475,9 @@ def pose_spreads(
     """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
     count = unseen.shape[1]
-    work, weights = workspace(count), np.empty(count)
-    posterior, covariance = np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    work, weights, square = workspace(count), np.empty(count), (NUM_UNKNOWNS, NUM_UNKNOWNS)
     own, whole = np.empty((len(tips), _OWN, NUM_UNKNOWNS)), np.empty(NUM_UNKNOWNS)
+    errors = _PoseErrors(np.empty(square), np.empty(square), own, whole)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
         for marker in range(count):
@@ -243,36 +486,25 @@ def pose_spreads(
         accumulate_normal_equations(hand, weights, work)
         for row in range(NUM_UNKNOWNS):
             for column in range(row + 1):
-                posterior[row, column] = work.normal[column, row]
+                errors.posterior[row, column] = work.normal[column, row]
                 if row < NUM_JOINTS:
-                    posterior[row, column] += prior[row, column]
+                    errors.posterior[row, column] += prior[row, column]
             if row >= NUM_JOINTS:
-                posterior[row, row] += _ANYWHERE
-        invert_positive(posterior)
-        _add_systematic(hand, doubt, weights, work, posterior, covariance, own, whole)
+                errors.posterior[row, row] += _ANYWHERE
+        invert_positive(errors.posterior)
+        _add_systematic(hand, doubt, weights, work, errors)
         for hinge in range(NUM_JOINTS):
-            angles[frame, hinge] = np.sqrt(covariance[hinge, hinge])
-        _spread_keypoints(hand, tips, doubt, posterior, covariance, own, whole, work, keypoints[frame])
+            angles[frame, hinge] = np.sqrt(errors.covariance[hinge, hinge])
+        _spread_keypoints(hand, tips, doubt, errors, work, keypoints[frame])
     return angles, keypoints
 
 
 @kernel
 def _add_systematic(
-    hand: HandArrays,
-    doubt: HandDoubt,
-    weights: Float[np.ndarray, "M"],
-    work: Workspace,
-    posterior: Float[np.ndarray, "26 26"],
-    covariance: Float[np.ndarray, "26 26"],
-    own: Float[np.ndarray, "5 10 26"],
-    whole: Float[np.ndarray, "26"],
+    hand: HandArrays, doubt: HandDoubt, weights: Float[np.ndarray, "M"], work: Workspace, errors: _PoseErrors
 ) -> None:
-    """Covariance of the unknowns (lower triangle): the posterior, and what the hand's own doubt makes of it.
-
-    `own` and `whole` get how the gradient of the fit changes by each digit's own numbers, and by the size of
-    the whole hand, in their standard deviations.
-    """
-    forces = work.factor
+    """Fill what the doubt of the hand adds to a posterior."""
+    forces, own, whole = work.factor, errors.own, errors.whole
     forces[:], own[:], whole[:] = 0.0, 0.0, 0.0
     shift, unknowns = np.empty((_OWN, 3)), np.empty(NUM_UNKNOWNS, dtype=np.int64)
     for marker in range(len(weights)):
@@ -302,7 +534,7 @@ def _add_systematic(
                         a * shift[number, 0] + b * shift[number, 1] + c * shift[number, 2]
                     )
     _add_columns(own, whole, forces)
-    _propagate(forces, posterior, covariance)
+    _propagate(forces, errors.posterior, errors.covariance)
 
 
 @kernel
@@ -399,20 +631,17 @@ def _spread_keypoints(
     hand: HandArrays,
     tips: Float[np.ndarray, "5"],
     doubt: HandDoubt,
-    posterior: Float[np.ndarray, "26 26"],
-    covariance: Float[np.ndarray, "26 26"],
-    own: Float[np.ndarray, "5 10 26"],
-    whole: Float[np.ndarray, "26"],
+    errors: _PoseErrors,
     work: Workspace,
     spread: Float[np.ndarray, "21"],
 ) -> None:
-    """Fill the standard deviation of each keypoint in each direction [m]; arguments as `_add_systematic`.
+    """Fill the standard deviation of each keypoint in each direction [m].
 
     A keypoint is off by the pose's error and by the hand's own, which the fit partly makes up for.
     """
     total = 0.0
     for i in range(3):
-        total += covariance[NUM_JOINTS + i, NUM_JOINTS + i]
+        total += errors.covariance[NUM_JOINTS + i, NUM_JOINTS + i]
     spread[0] = np.sqrt(total / 3.0 + doubt.wrist**2)
     unknowns, answers = np.empty(_CHAIN, dtype=np.int64), np.empty((_OWN + 1, _CHAIN))
     jacobian, shift = np.zeros((_CHAIN, 3)), np.zeros((_OWN + 1, 3))
@@ -425,7 +654,7 @@ def _spread_keypoints(
         base = 1 + 3 * digit
         for number in range(4):
             unknowns[number] = 4 * digit + number
-        _answer(posterior, own[digit], whole, unknowns, answers)
+        _answer(errors, digit, unknowns, answers)
         jacobian[:4], shift[:] = 0.0, 0.0
         for part in range(4):
             bone = base + part - 1  # that ends here
@@ -441,7 +670,7 @@ def _spread_keypoints(
                 offset[i] = point[i] - work.origins[base, i]
             _shift_digit(doubt, digit, offset, 1.0, shift)
             _move_keypoint(digit, part, point, work, jacobian)
-            total = _keypoint_square(jacobian, unknowns, covariance, answers, shift)
+            total = _keypoint_square(jacobian, unknowns, errors.covariance, answers, shift)
             beyond = doubt.joints[digit, part // 3]
             spread[1 + 4 * digit + part] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
 
@@ -479,22 +708,18 @@ def _keypoint_square(
 
 @kernel
 def _answer(
-    posterior: Float[np.ndarray, "26 26"],
-    own: Float[np.ndarray, "10 26"],
-    whole: Float[np.ndarray, "26"],
-    unknowns: Int[np.ndarray, "10"],
-    answers: Float[np.ndarray, "11 10"],
+    errors: _PoseErrors, digit: int, unknowns: Int[np.ndarray, "10"], answers: Float[np.ndarray, "11 10"]
 ) -> None:
     """Fill how the fit of some unknowns answers to a digit's own numbers, and to the size (last)."""
     answers[:] = 0.0
     for one in range(_CHAIN):
         for inner in range(_CHAIN):
             column = unknowns[inner]
-            share = posterior[unknowns[one], column]
+            share = errors.posterior[unknowns[one], column]
             for number in range(_OWN):
-                answers[number, one] += share * own[number, column]
+                answers[number, one] += share * errors.own[digit, number, column]
         for column in range(NUM_UNKNOWNS):
-            answers[_OWN, one] += posterior[unknowns[one], column] * whole[column]
+            answers[_OWN, one] += errors.posterior[unknowns[one], column] * errors.whole[column]
 
 
 @kernel
@@ -515,304 +740,3 @@ def _move_keypoint(
     jacobian[7, 1], jacobian[7, 2] = -point[2], point[1]
     jacobian[8, 0], jacobian[8, 2] = point[2], -point[0]
     jacobian[9, 0], jacobian[9, 1] = -point[1], point[0]
-
-
-# Little is known of a hinge after it, so that a digit with one marker that was bent as few are finds back.
-_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of the hinges
-_JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge
-_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # added to the gestures' spread, for poses that none shows
-
-
-class JointPrior(NamedTuple):
-    """A normal distribution of the hinges."""
-
-    angles: Float[np.ndarray, "20"]
-    """Mean [rad]."""
-    covariance: Float[np.ndarray, "20 20"]
-    """Covariance [rad^2]."""
-    precision: Float[np.ndarray, "20 20"]
-    """Inverse of the covariance [1/rad^2]."""
-
-    @property
-    def spread(self) -> Float[np.ndarray, "20"]:
-        """Standard deviation of each hinge [rad]."""
-        return np.sqrt(np.diag(self.covariance))
-
-
-@cache
-def resting_angles() -> Float[np.ndarray, "20"]:
-    """Mean of the hinges over all gestures [rad]."""
-    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    angles: NDArray[np.float64] = gestures.mean(axis=0)
-    return angles
-
-
-@cache
-def resting_covariance() -> Float[np.ndarray, "20 20"]:
-    """Covariance of the hinges over all gestures, and a margin for other poses [rad^2]."""
-    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    return np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
-
-
-@cache
-def resting_prior() -> JointPrior:
-    """Prior of a hand without any history."""
-    covariance = resting_covariance()
-    return JointPrior(resting_angles(), covariance, np.linalg.inv(covariance))
-
-
-def predict_joints(
-    angles: Float[np.ndarray, "20"],
-    covariance: Float[np.ndarray, "20 20"],
-    span: float,
-) -> JointPrior:
-    """Prior of the hinges some time after they were estimated.
-
-    Args:
-        angles: Predicted angles [rad], by velocity alone; they return to those of a resting hand.
-        span: Time since the estimate [s].
-    """
-    kept = np.exp(-max(span, 0.0) / _JOINT_MEMORY)
-    mean = angles + (1.0 - kept) * (resting_angles() - angles)
-    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
-    _predict_covariance(covariance, resting_covariance(), kept**2, prior)
-    return prior
-
-
-@kernel
-def _predict_covariance(
-    known: Float[np.ndarray, "20 20"],
-    resting: Float[np.ndarray, "20 20"],
-    kept: float,
-    prior: JointPrior,
-) -> None:
-    """Fill covariance and precision of a prior: a share of what is known, the rest of a resting hand."""
-    for row in range(len(known)):
-        for column in range(len(known)):
-            prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
-        prior.covariance[row, row] += _JOINT_SPREAD**2
-    prior.precision[:] = prior.covariance
-    invert_positive(prior.precision)
-
-
-@kernel
-def digit_prior(
-    prior: JointPrior,
-    information_matrix: Float[np.ndarray, "20 20"],
-    information_vector: Float[np.ndarray, "20"],
-    digit: int,
-    angles: Float[np.ndarray, "4"],
-    precision: Float[np.ndarray, "4 4"],
-) -> None:
-    """Fill mean and precision of one digit's hinges, given the others' markers; see `MarkerPrediction`."""
-    count = len(information_vector)
-    order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
-    index = 0
-    for hinge in range(count):  # the digit's own hinges last, so that the others are eliminated from them
-        own = hinge // 4 == digit
-        order[count - 4 + hinge % 4 if own else index] = hinge
-        index += not own
-    for row in range(count):
-        one = order[row]
-        for column in range(count):
-            system[row, column] = prior.precision[one, order[column]]
-        if row < count - 4:
-            right_side[row] = information_vector[one]
-            for column in range(count):
-                right_side[row] -= information_matrix[one, order[column]] * prior.angles[order[column]]
-            for column in range(count - 4):
-                system[row, column] += information_matrix[one, order[column]]
-    eliminate(system, right_side, 0, count - 4)
-    precision[:] = system[count - 4 :, count - 4 :]
-    solve_positive(system[count - 4 :, count - 4 :], right_side[count - 4 :])
-    for row in range(4):
-        angles[row] = prior.angles[4 * digit + row] + right_side[count - 4 + row]
-
-
-_FEWEST_ON_DIGIT: Final = 3  # markers that determine the four hinges of a digit, also when it is straight
-_ARC: Final = 0.04  # [m] usual radius of the arcs that markers move on: the length of a finger's bones
-_LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision on the diagonal, so that it has an inverse
-
-
-class MarkerPrediction(NamedTuple):
-    """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
-
-    qpos: Float[np.ndarray, "27"]
-    """The pose; hinges of digits that lack markers are moved to the optimum of markers and prior."""
-    positions: Float[np.ndarray, "M 3"]
-    """Markers in the world [m]."""
-    covariances: Float[np.ndarray, "M 3 3"]
-    """Covariance of each marker in the world [m^2]: that of the pose, and the marker's own variance."""
-    rotations: Float[np.ndarray, "M 3 3"]
-    """Rotation in the world of the bone with the largest weight of each marker."""
-    joint_covariance: Float[np.ndarray, "20 20"]
-    """Covariance of the hinges [rad^2]."""
-    information_matrix: Float[np.ndarray, "20 20"]
-    """Information of the markers alone on the hinges, the palm being held [1/rad^2]."""
-    information_vector: Float[np.ndarray, "20"]
-    """The matrix times the angles that the markers alone would give [1/rad]."""
-
-
-def empty_prediction(num_markers: int) -> MarkerPrediction:
-    """A `MarkerPrediction` to be filled."""
-    return MarkerPrediction(
-        np.empty(7 + NUM_JOINTS),
-        np.empty((num_markers, 3)),
-        np.empty((num_markers, 3, 3)),
-        np.empty((num_markers, 3, 3)),
-        np.empty((NUM_JOINTS, NUM_JOINTS)),
-        np.empty((NUM_JOINTS, NUM_JOINTS)),
-        np.empty(NUM_JOINTS),
-    )
-
-
-@kernel
-def predict_markers(
-    hand: HandArrays,
-    on_part: Int[np.ndarray, "6"],
-    pose: Float[np.ndarray, "27"],
-    target: Float[np.ndarray, "M 3"],
-    joint_prior: JointPrior,
-    wrist_spread: tuple[float, float],
-    variance: Float[np.ndarray, "M"],
-    noise: float,
-    out: MarkerPrediction,
-) -> None:
-    """Fill a `MarkerPrediction`.
-
-    Args:
-        on_part: Markers on each digit, and on the palm (last).
-        target: The markers it was fitted to [m]; NaN where missing.
-        joint_prior: Distribution of the hinges before the fit.
-        wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before the fit.
-        variance: Variance of each marker around its position on the hand [m^2].
-        noise: Standard deviation of the markers around the pose's [m].
-        out: The prediction that is filled.
-    """
-    count = len(target)
-    work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
-    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
-    out.qpos[:] = pose
-    marker_residuals(hand, target, pose, work)
-    seen = np.zeros(len(on_part), dtype=np.int64)
-    for marker in range(count):
-        if not np.isnan(work.residuals[marker, 0]):
-            weights[marker] = 1.0 / noise**2
-            seen[hand.digits[marker]] += 1
-    accumulate_normal_equations(hand, weights, work)
-    if _settle(hand, seen, on_part, joint_prior, work, out.qpos):
-        marker_residuals(hand, target, out.qpos, work)
-        accumulate_normal_equations(hand, weights, work)
-    posterior = work.factor
-    for row in range(NUM_UNKNOWNS):
-        for column in range(row + 1):
-            posterior[row, column] = work.normal[column, row]
-        posterior[row, row] += _LEAST_INFORMATION / noise**2
-        if row >= NUM_JOINTS:
-            posterior[row, row] += wrist_spread[(row - NUM_JOINTS) // 3] ** -2.0
-    for row in range(NUM_JOINTS):
-        out.information_vector[row] = -work.gradient[row]
-        for column in range(NUM_JOINTS):
-            out.information_matrix[row, column] = posterior[max(row, column), min(row, column)]
-            out.information_vector[row] += out.information_matrix[row, column] * out.qpos[7 + column]
-    posterior[:NUM_JOINTS, :NUM_JOINTS] += joint_prior.precision
-    invert_positive(posterior)
-    out.joint_covariance[:] = posterior[:NUM_JOINTS, :NUM_JOINTS]
-    for marker in range(count):
-        _marker_covariance(hand, marker, posterior, wrist, variance[marker], work, out.covariances[marker])
-        bone = work.rotations[hand.bones[marker, 0]]
-        for i in range(3):
-            out.positions[marker, i] = pose[i]
-            for j in range(3):
-                out.positions[marker, i] += wrist[i, j] * work.markers[marker, j]
-                out.rotations[marker, i, j] = 0.0
-                for k in range(3):
-                    out.rotations[marker, i, j] += wrist[i, k] * bone[k, j]
-
-
-@kernel
-def _marker_covariance(
-    hand: HandArrays,
-    marker: int,
-    posterior: Float[np.ndarray, "26 26"],
-    wrist: Float[np.ndarray, "3 3"],
-    variance: float,
-    work: Workspace,
-    covariance: Float[np.ndarray, "3 3"],
-) -> None:
-    """Covariance of a marker in the world [m^2], from the unknowns' posterior and its own variance."""
-    first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
-    count = last - first + 6
-    jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
-    for number in range(count):
-        unknown = first + number if number < last - first else NUM_JOINTS + number - (last - first)
-        for i in range(3):
-            for j in range(3):
-                in_world[i, number] += wrist[i, j] * jacobian[j, unknown]
-    covariance[:] = 0.0
-    for one in range(count):
-        row = first + one if one < last - first else NUM_JOINTS + one - (last - first)
-        for other in range(count):
-            column = first + other if other < last - first else NUM_JOINTS + other - (last - first)
-            share = posterior[row, column]
-            for i in range(3):
-                for j in range(3):
-                    covariance[i, j] += in_world[i, one] * share * in_world[j, other]
-    # A marker moves on an arc, not on its tangent: a variance along the tangent means a deviation
-    # across it, by the square over twice the radius.
-    bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
-    for i in range(3):
-        covariance[i, i] += variance + bend**2
-
-
-@kernel
-def _settle(
-    hand: HandArrays,
-    seen: Int[np.ndarray, "6"],
-    on_part: Int[np.ndarray, "6"],
-    joint_prior: JointPrior,
-    work: Workspace,
-    qpos: Float[np.ndarray, "27"],
-) -> bool:
-    """Move hinges of digits that lack markers to the optimum of prior and markers; False without such digits.
-
-    The hinges of the other digits are held, and inform those of their neighbors through the prior's
-    covariance.
-    """
-    weak = np.zeros(NUM_JOINTS, dtype=np.int64)
-    count = 0
-    for hinge in range(NUM_JOINTS):
-        digit = hinge // 4
-        if seen[digit] < max(on_part[digit], _FEWEST_ON_DIGIT):
-            weak[count] = hinge
-            count += 1
-    if count == 0:
-        return False
-    matrix, change = np.empty((count, count)), np.empty(count)
-    for row in range(count):
-        one = weak[row]
-        change[row] = -work.gradient[one]
-        for hinge in range(NUM_JOINTS):
-            change[row] -= joint_prior.precision[one, hinge] * (qpos[7 + hinge] - joint_prior.angles[hinge])
-        for column in range(count):
-            other = weak[column]
-            information = work.normal[min(one, other), max(one, other)]
-            matrix[row, column] = information + joint_prior.precision[one, other]
-    solve_positive(matrix, change)
-    for row in range(count):
-        hinge = weak[row]
-        low, high = hand.ranges[hinge, 0], hand.ranges[hinge, 1]
-        qpos[7 + hinge] = min(max(qpos[7 + hinge] + change[row], low), high)
-    return True
-
-
-@kernel
-def world_markers(
-    hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
-) -> None:
-    """Write the positions of a pose's markers in the world [m] to `positions`."""
-    work, wrist = workspace(len(positions)), np.empty((3, 3))
-    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
-    compute_markers(hand, pose[7:], work)
-    for marker in range(len(positions)):
-        positions[marker] = pose[:3] + wrist @ work.markers[marker]

@@ -10,16 +10,12 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
 
-from gloves.captures.capture import Capture, check_place, check_unit
-from gloves.optics.reconstruction import number_runs
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from track.frames import FARTHEST, LATEST_TIME
+from track.frames import LATEST_TIME, StreamedFrame
 
 LEAVE: Final = 1.0
 """Time for a source to end after `close` [s]."""
@@ -31,26 +27,6 @@ _SAME_PACE: Final = 1.0  # [s], the longest step of their times, beyond which it
 _FASTER: Final = 1.5  # times as fast as its frames' times, from which a source is not live
 _SHORT: Final = 0.01  # [s] by which any source may be ahead
 _MOST_ID: Final = 1 << 31  # as takes store them
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamedFrame:
-    """The points of one frame."""
-
-    number: int
-    """The server's number of the frame."""
-    time: float
-    """The server's time [s]."""
-    points: Float[np.ndarray, "N 3"]
-    """[m], in the server's axes."""
-    ids: Int[np.ndarray, "N"]
-    """The server's ID of each point, -1 where it gives none."""
-    silent: bool = False
-    """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
-    restarted: bool = False
-    """The server's time began anew: it does not continue that of the frame before."""
-    arrived: float = math.nan
-    """Monotonic time of its arrival on this machine [s]; NaN where it did not come live."""
 
 
 class FrameSource(Protocol):
@@ -69,35 +45,6 @@ class FrameSource(Protocol):
     def close(self) -> None:
         """No further frame is wanted; called once, from another thread, while a frame may be waited for."""
         ...
-
-
-def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
-    """The frames of a capture as of a stream: points [m], IDs and times [s].
-
-    Marker files have no IDs. Every format that is read has one column per trajectory, so a column is an ID
-    for as long as it has a point. After a gap it is a new ID, because a column of unlabeled points may
-    continue with another marker. Column names are not used.
-    """
-    present = np.isfinite(capture.positions[..., 0])
-    ids = number_runs(present)
-    for number, (points, seen) in enumerate(zip(capture.positions, present, strict=True)):
-        yield StreamedFrame(number, number / capture.rate, points[seen], ids[number, seen])
-
-
-def checked_frames(capture: Capture) -> list[StreamedFrame]:
-    """The frames of a capture, if their points can be hands' markers.
-
-    Args:
-        capture: Positions (T, N, 3) [m].
-
-    Raises:
-        ArgumentError: The capture is not in meters.
-        CaptureError: Most of its points are far from any room.
-    """
-    frames = list(capture_frames(capture))
-    check_unit([frame.points for frame in frames])
-    check_place(capture, FARTHEST)
-    return frames
 
 
 class ArrivingFrames(ABC):

@@ -34,9 +34,9 @@ from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError
 from handsim.settings import Limits, Settings
-from track.frames import FARTHEST, LATEST_TIME
+from track.frames import FARTHEST, LATEST_TIME, StreamedFrame
 from track.streams import split_address
-from track.streams.frame_source import LEAVE, ArrivingFrames, SourceStream, StreamedFrame
+from track.streams.frame_source import LEAVE, ArrivingFrames, SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
 """What an address may be."""

@@ -30,9 +30,9 @@ from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.settings import Limits, Settings
-from track.inputs import read_points
+from track.frames import StreamedFrame, read_points
 from track.streams import LOOPBACK, split_address
-from track.streams.frame_source import ArrivingFrames, StreamedFrame
+from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
 COMMAND_PORT: Final = 1510

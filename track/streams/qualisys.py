@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from handsim._plugins import import_extra
 from handsim.errors import CaptureError
-from track.streams.frame_source import StreamedFrame
+from track.frames import StreamedFrame
 
 PORT: Final = 22223
 """QTM's port for little-endian clients."""

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.callbacks import Closing
-from track.frames import TrackedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
 from track.viewer.recordings import LiveRecording, Recording, ShownFrame
 from track.viewer.stage import FrameView, set_stage
 

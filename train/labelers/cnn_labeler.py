@@ -22,7 +22,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from handsim.space.transforms import quaternion_matrix, random_quaternions, rigid_fit
 from train.labelers.matching import match_distances
@@ -105,6 +104,8 @@ class MeanHand:
         rng: np.random.Generator,
     ) -> NDArray[np.float64]:
         """Views (B, 3, 3) of right hands' clouds and markers [m]: first ones of labeling, or aligned ones."""
+        from scipy.spatial.transform import Rotation  # not loaded by labeling
+
         aligned = self.align(markers, np.ones(len(markers)))
         axes = _nearest_axes(points, present, aligned)
         direction = rng.standard_normal((len(points), 3))

@@ -10,11 +10,9 @@ import pytest
 from benchmarks.paper.assignment_trackers import GATE, NEAR, HungarianTracker, NearestNeighborTracker
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import GloveFit, Status, Take
 from handsim.errors import ArgumentError
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
 

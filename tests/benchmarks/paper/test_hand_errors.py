@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.fit import GloveFit, attach_markers, nominal_fit
-from gloves.layout import load_layout
+from gloves import GloveFit, load_layout
+from gloves.fit import attach_markers, nominal_fit
+from handsim import HandModel, sample_shape
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel
-from handsim.hand.shape import PALM, SIDES, sample_shape
+from handsim.hand.shape import PALM, SIDES
 
 
 def worn(shape):

@@ -11,11 +11,9 @@ from benchmarks.paper import labeling_tables
 from benchmarks.paper.labeling_tables import FIGURES, LABELING_TABLES, augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from handsim.cli.main import main
-from train.evaluation import evaluate_labeler
-from train.labelers.storage import load_labeler
+from train import evaluate_labeler, load_labeler, simulate_take
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,10 @@ import pytest
 from benchmarks.paper.paper_tracker import GATE, PaperTracker
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import GloveFit, Status, Take
 from handsim.hand.shape import JOINT_NAMES
-from track.frames import TrackedFrame
-from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track import TrackedFrame
+from train import Labeling, load_labeler, simulate_take
 
 
 class Asked:

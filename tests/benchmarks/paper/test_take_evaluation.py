@@ -16,12 +16,11 @@ from benchmarks.paper.take_evaluation import (
     seen_frame,
     true_users,
 )
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import Status, Take
 from handsim.hand.shape import NUM_QPOS, SIZES
-from track.frames import TrackedFrame, TrackedHand
+from track import TrackedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 
 @pytest.fixture(scope="module")

@@ -22,10 +22,9 @@ from benchmarks.paper.printed import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from benchmarks.paper.tracking_tables import TRACKING_TABLES, print_errors, print_trials, table5_figures
 from benchmarks.paper.trials import FEWEST_FRAMES
 from handsim.errors import ArgumentError
-from train.labelers.storage import load_labeler
+from train import load_labeler, simulate_take
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what they share is made once
 METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)

@@ -12,13 +12,10 @@ from benchmarks.paper.trials import (
     initialization_times,
     recovery_times,
 )
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import Status, Take
 from handsim.errors import ArgumentError
-from track.frames import TrackedFrame, TrackedHand
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track import TrackedFrame, TrackedHand, Tracker
+from train import load_labeler, simulate_take
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,10 @@ from benchmarks.public.manifest import (
     truth_path,
     user_path,
 )
-from gloves.layout import load_layout
+from gloves import load_layout
+from handsim import load_rig
 from handsim.files.inputs import checksum
 from handsim.hand.model import hand_keypoints
-from handsim.space.rig import load_rig
 from track.kinematics.pose_solver import PoseSolver
 
 

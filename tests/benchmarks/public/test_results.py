@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from benchmarks.public.answers import Answers, BenchmarkError, save_answers
 from benchmarks.public.manifest import label_names
 from benchmarks.public.results import find_results, read_result
-from gloves.captures.capture import Capture, labeled_columns, unlabeled_frames
-from gloves.captures.formats import write_capture
-from track.captures import track_capture
+from gloves import Capture, write_capture
+from gloves.captures.capture import labeled_columns, unlabeled_frames
+from track import track_capture
 
 NAME = "hand-controller-hard-1"
 LABELS = label_names()

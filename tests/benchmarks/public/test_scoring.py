@@ -15,7 +15,7 @@ from benchmarks.public.__main__ import COMMANDS
 from benchmarks.public.answers import Answers, BenchmarkError, save_answers
 from benchmarks.public.manifest import MANIFEST, load_benchmark, truth_path
 from benchmarks.public.scoring import score_results
-from handsim.errors import HandSimWarning
+from handsim import HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES
 
 PERFECT = ("frame_accuracy", "slot_accuracy", "point_accuracy", "macro_f1", "posed", "within_5mm")

@@ -1,4 +1,4 @@
-"""Captures in general: round trips of both formats, suffixes, the disk, and the golden sentences."""
+"""Captures in general: round trips of both formats, suffixes, the disk, and what mistakes are told."""
 
 from __future__ import annotations
 
@@ -14,16 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.captures.capture import (
-    Capture,
-    check_place,
-    count_gaps,
-    run_lengths,
-    unit_fault,
-    zeros_as_missing,
-)
-from gloves.captures.formats import READABLE, WRITABLE, read_capture, write_capture
-from handsim.errors import CaptureError, HandSimWarning
+from gloves import Capture, read_capture, write_capture
+from gloves.captures.capture import check_place, count_gaps, run_lengths, unit_fault, zeros_as_missing
+from gloves.captures.formats import READABLE, WRITABLE
+from handsim import HandSimWarning
+from handsim.errors import CaptureError
+from tests.sentences import assert_names
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NAMES = st.one_of(WORDS, st.builds("{} {}".format, WORDS, WORDS), st.just("*12"), st.just("Unlabeled 2379"))
@@ -110,37 +106,60 @@ def test_a_full_disk_leaves_nothing(tmp_path: Path, suffix: str) -> None:
     assert path.read_text() == "old"
 
 
-def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]], None]) -> None:
+def test_mistakes_are_told(tmp_path: Path) -> None:
     good = Capture(("a", "b"), np.zeros((2, 2, 3)), 120.0)
     (tmp_path / "empty.trc").write_bytes(b"")
     (tmp_path / "folder.trc").mkdir()
     long = Capture(("a" * 300,), np.zeros((1, 1, 3)), 120.0)
-    calls: dict[str, Callable[[], object]] = {
-        "unknown suffix": lambda: read_capture(tmp_path / "take.tcr"),
-        "no suffix": lambda: read_capture(tmp_path / "take"),
-        "unknown suffix to write": lambda: write_capture(tmp_path / "take.tsv", good),
-        "missing file": lambda: read_capture(tmp_path / "take.trc"),
-        "a folder": lambda: read_capture(tmp_path / "folder.trc"),
-        "empty file": lambda: read_capture(tmp_path / "empty.trc"),
-        "write onto a folder": lambda: write_capture(tmp_path / "folder.trc", good),
-        "a name with a tab": lambda: write_capture(
-            tmp_path / "x.trc", Capture(("a\tb",), np.zeros((1, 1, 3)), 120.0)
+    calls: dict[str, tuple[Callable[[], object], str]] = {
+        "unknown suffix": (
+            lambda: read_capture(tmp_path / "take.tcr"),
+            "folder/take.tcr | '.tcr' | '.trc' | .c3d, .csv, .tsv",
         ),
-        "an empty name": lambda: write_capture(tmp_path / "x.trc", Capture(("",), np.zeros((1, 1, 3)), 1.0)),
-        "a label too long": lambda: write_capture(tmp_path / "x.c3d", long),
-        "wrong shape": lambda: Capture(("a",), np.zeros((2, 2, 3)), 120.0),
-        "no frames": lambda: Capture(("a",), np.zeros((0, 1, 3)), 120.0),
-        "no markers": lambda: Capture((), np.zeros((2, 0, 3)), 120.0),
-        "infinite": lambda: Capture(("a",), np.full((1, 1, 3), np.inf), 120.0),
-        "no rate": lambda: Capture(("a",), np.zeros((1, 1, 3)), 0.0),
-        "NaN rate": lambda: Capture(("a",), np.zeros((1, 1, 3)), float("nan")),
+        "no suffix": (lambda: read_capture(tmp_path / "take"), "folder/take | '' | .trc, .c3d, .csv, .tsv"),
+        "unknown suffix to write": (
+            lambda: write_capture(tmp_path / "take.tsv", good),
+            "folder/take.tsv | '.tsv' | .trc, .c3d, .csv",
+        ),
+        "missing file": (lambda: read_capture(tmp_path / "take.trc"), "folder/take.trc | No such file"),
+        "a folder": (lambda: read_capture(tmp_path / "folder.trc"), "folder/folder.trc | Is a directory"),
+        "empty file": (lambda: read_capture(tmp_path / "empty.trc"), "folder/empty.trc | empty"),
+        "write onto a folder": (
+            lambda: write_capture(tmp_path / "folder.trc", good),
+            "folder/folder.trc | cannot be written",
+        ),
+        "a name with a tab": (
+            lambda: write_capture(tmp_path / "x.trc", Capture(("a\tb",), np.zeros((1, 1, 3)), 120.0)),
+            "folder/x.trc | 'a\\tb' | printable",
+        ),
+        "an empty name": (
+            lambda: write_capture(tmp_path / "x.trc", Capture(("",), np.zeros((1, 1, 3)), 1.0)),
+            "folder/x.trc | '' | printable",
+        ),
+        "a label too long": (
+            lambda: write_capture(tmp_path / "x.c3d", long),
+            "folder/x.c3d | aaaa...aaaa | 255 bytes",
+        ),
+        "wrong shape": (
+            lambda: Capture(("a",), np.zeros((2, 2, 3)), 120.0),
+            "(2, 2, 3) | (T, 1, 3) | 1 names",
+        ),
+        "no frames": (
+            lambda: Capture(("a",), np.zeros((0, 1, 3)), 120.0),
+            "at least one frame | 0 frames of 1",
+        ),
+        "no markers": (lambda: Capture((), np.zeros((2, 0, 3)), 120.0), "at least one frame | 2 frames of 0"),
+        "infinite": (
+            lambda: Capture(("a",), np.full((1, 1, 3), np.inf), 120.0),
+            "infinite | finite numbers or NaN",
+        ),
+        "no rate": (lambda: Capture(("a",), np.zeros((1, 1, 3)), 0.0), "0 Hz | 1 to 5000"),
+        "NaN rate": (lambda: Capture(("a",), np.zeros((1, 1, 3)), float("nan")), "nan Hz | 1 to 5000"),
     }
-    actual = {}
-    for case, call in calls.items():
+    for call, words in calls.values():
         with pytest.raises(CaptureError) as caught:
             call()
-        actual[case] = str(caught.value).replace(str(tmp_path), "folder")
-    golden("capture_errors", actual)
+        assert_names(str(caught.value).replace(str(tmp_path), "folder"), words)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty.trc", "folder.trc"]
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture
+from gloves import Capture, read_capture
 from handsim.errors import CaptureError
 from tests.gloves.captures.test_formats import (
     DEVICES,

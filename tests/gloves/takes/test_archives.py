@@ -11,6 +11,7 @@ import warnings
 import numpy as np
 import pytest
 
+from gloves import Take, load_take
 from gloves.takes import archives as growing
 from gloves.takes.archives import (
     Column,
@@ -20,12 +21,12 @@ from gloves.takes.archives import (
     growing_path,
     is_growing,
 )
-from gloves.takes.take import Take, load_take
-from handsim.errors import CaptureError, HandSimError
+from handsim import HandSimError
+from handsim.errors import CaptureError
 from handsim.files import arrays as array_files
 from handsim.files.arrays import read_npz, write_npz
 from handsim.hand.shape import HAND_DTYPE
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 COLUMNS = (
     Column("times", "<f8", ("T",)),

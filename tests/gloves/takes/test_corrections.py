@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gloves import PointList
 from gloves.takes.corrections import (
     FREE,
     NO_MARKER,
@@ -21,7 +22,6 @@ from gloves.takes.corrections import (
     save_corrections,
     told,
 )
-from gloves.takes.points import PointList
 from handsim.errors import CaptureError
 
 NAMES = ("right:ThumbTip", "right:IndexTip", "pen:Pen1")

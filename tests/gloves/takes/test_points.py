@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.takes.points import PointList
+from gloves import PointList
 
 
 @st.composite

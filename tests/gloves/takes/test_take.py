@@ -14,25 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.captures.formats import read_capture
-from gloves.fit import attach, nominal_fit
-from gloves.layout import load_layout
+from gloves import RigidBody, Take, attach, load_layout, load_take, read_capture
+from gloves.fit import nominal_fit
 from gloves.takes.archives import SCHEMA
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
-from gloves.takes.take import (
-    INITIALIZED,
-    LOST,
-    MOTION_FORMATS,
-    STATUSES,
-    SUFFIX,
-    TRACKED,
-    RigidBody,
-    Take,
-    load_take,
-)
+from gloves.takes.take import INITIALIZED, LOST, MOTION_FORMATS, STATUSES, SUFFIX, TRACKED
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, CaptureError
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, is_steady, join_qpos
-from handsim.hand.shape import sample_shape
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
 from handsim.space.transforms import random_quaternions
 
 FRAMES, COLUMNS, MARKERS = 9, 47, 19

@@ -17,18 +17,17 @@ from pathlib import Path
 
 import pytest
 
+from handsim import HandSimError
 from handsim.app.output import open_output
 from handsim.app.workers import ClusterExecutor, _Task, _versions, check_worker, chosen_workers, run_jobs
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, HandSimError, LayoutError
+from handsim.errors import ArgumentError, LayoutError
 from handsim.files.inputs import checksum
-from render.config import RenderConfig
-from render.session import render_take
+from render import RenderConfig, render_take
 from tests.waiting import LONG
+from train import GenerateSettings, SceneMix, simulate_take
 from train.simulation import generation
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
 ROOT = Path(__file__).resolve().parents[3]

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from handsim import HandSimError
 from handsim.app.workers import LocalProcesses, check_workers, run_jobs, usable_cores
-from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutError
+from handsim.errors import ArgumentError, DatasetError, LayoutError
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """

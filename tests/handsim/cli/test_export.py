@@ -8,12 +8,11 @@ import json
 import numpy as np
 import pytest
 
-from gloves.captures.formats import read_capture
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import LOST, TRACKED, RigidBody, Take, load_take
+from gloves import RigidBody, Take, attach, load_layout, load_take, read_capture
+from gloves.takes.take import LOST, TRACKED
+from handsim import HandModel, join_qpos
 from handsim.cli.main import main
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, join_qpos
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.space.transforms import random_quaternions
 
 FRAMES, RATE = 12, 120.0

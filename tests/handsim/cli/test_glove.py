@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from gloves.layout import list_layouts, load_layout, starter_layout
-from gloves.takes.take import load_take
+from gloves import load_layout, load_take
+from gloves.layout import list_layouts, starter_layout
 from handsim.cli.main import main
 from train.labelers.storage import shipped_labelers
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.fit import GloveFit, attach, attach_markers, wear
-from gloves.layout import load_layout
-from gloves.takes.take import Take, load_take
+from gloves import GloveFit, Take, attach, load_layout, load_take
+from gloves.fit import attach_markers, wear
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.cli.main import main
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import JOINT_NAMES, sample_shape
-from track.user import User, load_user
+from handsim.hand.shape import JOINT_NAMES
+from track import User, load_user
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

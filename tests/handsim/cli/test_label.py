@@ -9,12 +9,10 @@ import signal
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from gloves.layout import load_layout
+from gloves import Capture, load_layout, read_capture, write_capture
 from handsim.cli.main import main
 from track.kinematics import pose_solver
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 FRAMES = 40
 NAMES = load_layout("dense19").names

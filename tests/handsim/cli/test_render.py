@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 import tyro
 
+from handsim import HandSimError
 from handsim.cli import render as command
 from handsim.cli.parsing import registry
 from handsim.cli.render import RenderOptions
-from handsim.errors import HandSimError
-from render.config import RenderConfig
-from render.depth_sensor import DepthSensor
+from render import Backgrounds, DepthSensor, RenderConfig
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import Backgrounds
 from render.skin.look import TONES
 
 

@@ -13,11 +13,11 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from gloves.takes.take import load_take
+from gloves import load_take
 from handsim.cli.main import main
 from tests.waiting import LONG
+from track import LiveStream
 from track.streams import LOOPBACK
-from track.streams.live_stream import LiveStream
 from track.streams.natnet import open_stream
 
 RUN = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"

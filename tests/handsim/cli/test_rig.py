@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
+from handsim import HandSimWarning, load_rig
 from handsim.cli.main import main
-from handsim.errors import HandSimWarning
-from handsim.space.rig import list_rigs, load_rig
+from handsim.space.rig import list_rigs
 from handsim.space.rig_formats import import_cameras
 from tests.handsim.space.known_rig import MCAL, PIXELS, POINT, XCP, written
+from train import simulate_take
 from train.forecast import rig_plan
-from train.simulation.takes import simulate_take
 
 
 def test_every_shipped_rig_is_listed_with_what_it_is(capsys):

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.held_out import held_out_markers
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from gloves.layout import load_layout
-from gloves.takes.take import load_take
+from gloves import Capture, load_layout, load_take, read_capture, write_capture
 from handsim.cli.main import main
 from train.simulation.scenes import KINDS
 

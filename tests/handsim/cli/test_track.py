@@ -19,25 +19,17 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from gloves.fit import GloveFit, nominal_fit, wear
-from gloves.layout import load_layout
+from gloves import Capture, GloveFit, load_layout, load_take, read_capture, write_capture
+from gloves.fit import nominal_fit, wear
 from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
-from gloves.takes.take import LOST, load_take
+from gloves.takes.take import LOST
+from handsim import HandModel, sample_shape
 from handsim.cli.main import main
-from handsim.hand.model import HandModel
-from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track import captures
-from track.captures import track_capture
-from track.recorder import Recorder
+from track import Recorder, ReplayServer, captures, load_user, open_source, track_capture
 from track.rigid_body import load_body
-from track.streams.live_stream import open_source
-from track.streams.natnet import ReplayServer
-from track.user import load_user
 from track.viewer.editors import Corrector
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration

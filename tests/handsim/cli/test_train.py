@@ -8,11 +8,11 @@ import pytest
 
 import train.loop
 from handsim.cli.main import main
-from train.data.batches import Corruption, paper_corruption
+from train import CNNConfig, Corruption, GenerateSettings, SceneMix, TrainSettings
+from train.data.batches import paper_corruption
 from train.loop import _rate
-from train.settings import EPOCHS, CNNConfig, TrainSettings, usual_settings
+from train.settings import EPOCHS, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 FRAMES = 16
 

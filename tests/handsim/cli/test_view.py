@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gloves.takes.take import load_take
+from gloves import load_take
 from handsim.cli.main import main
-from track.streams.natnet import ReplayServer
+from track import ReplayServer
 from track.viewer.recordings import chosen_frames
 from track.viewer.timeline import LiveView
 

@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.captures.formats import read_capture
-from gloves.layout import load_layout
-from gloves.takes.take import load_take
+from gloves import load_layout, load_take, read_capture
 from handsim.errors import CaptureError, LayoutError
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import quoted, read_bytes

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.layout import load_layout
+from gloves import load_layout
 from gloves.takes.take import MOTION_FORMATS
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError
@@ -38,7 +38,8 @@ from handsim.files.outputs import (
 )
 from handsim.files.signals import ENDING, Stopped, signals_raise
 from tests.renames import fails_at
-from track.user import load_user, nominal_user
+from track import load_user
+from track.user import nominal_user
 
 
 def entries(folder: Path) -> list[str]:

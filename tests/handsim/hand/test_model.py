@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError
-from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS, SIDES, SIZES, named_shape, sample_shape
+from handsim.hand.model import NUM_VELOCITIES, skinned_jacobian
+from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS, SIDES, SIZES, named_shape
 from handsim.space.transforms import MIRROR, random_quaternions
 
 

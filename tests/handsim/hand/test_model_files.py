@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gloves.fit import attach
+from gloves import Take, attach
 from gloves.hand_files import write_hand
-from gloves.takes.take import Take
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim import HandModel, join_qpos, sample_shape
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model_files import coordinate_names, hand_osim, hand_urdf
-from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, sample_shape
+from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
 
 @pytest.fixture(params=["right", "left"])

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from handsim.hand.model import HandModel, build_skeleton, join_qpos
+from handsim import HandModel, HandShape, join_qpos, sample_shape
+from handsim.hand.model import build_skeleton
 from handsim.hand.shape import (
     ADULTS,
     BONES,
@@ -17,9 +18,7 @@ from handsim.hand.shape import (
     NUM_BONES,
     NUM_JOINTS,
     SIZES,
-    HandShape,
     named_shape,
-    sample_shape,
     shape_from_measures,
 )
 from handsim.hand.skin import (

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import RigidBody, Take
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
+from gloves import RigidBody, Take, attach, load_layout
+from handsim import HandModel, join_qpos, sample_shape
 
 FRAMES = 13
 

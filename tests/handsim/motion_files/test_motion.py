@@ -12,8 +12,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import posed_motion
+from handsim import HandModel, join_qpos
 from handsim.errors import CaptureError
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, join_qpos
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
 from handsim.motion_files.motion import (
     OPENXR_JOINTS,

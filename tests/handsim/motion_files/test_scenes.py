@@ -11,11 +11,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import Take, posed_motion
-from handsim.errors import HandSimError
-from handsim.hand.model import HandModel, join_qpos
+from gloves import Take, attach, load_layout
+from gloves.takes.take import posed_motion
+from handsim import HandModel, HandSimError, join_qpos
 from handsim.motion_files.scenes import write_glb, write_usd
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import Camera, Lens
 from handsim.errors import ArgumentError
-from handsim.space.camera import Camera, Lens
 
 # A webcam, a wide lens with strong barrel distortion, a pincushion, and the fisheye of two headsets.
 BROWN = (

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from handsim import RigidObject
 from handsim.errors import ArgumentError, ObjectError
 from handsim.hand.model import BodyMotion
-from handsim.space.objects import MARKER_RADIUS, RigidObject, load_object, named_object, object_names
+from handsim.space.objects import MARKER_RADIUS, load_object, named_object, object_names
 
 
 def mesh_of(obj: RigidObject) -> trimesh.Trimesh:

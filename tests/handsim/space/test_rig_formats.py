@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import HandSimWarning, RigError
+from handsim import CameraRig, HandSimWarning
+from handsim.errors import RigError
 from handsim.space import rig_formats
-from handsim.space.rig import CameraRig
 from handsim.space.rig_formats import LabCamera, import_cameras, load_cameras, read_xml
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from tests.handsim.space.known_rig import (
@@ -485,7 +485,7 @@ def test_hostile_xml(tmp_path, content, message):
 def test_a_giant_file(tmp_path):
     path = tmp_path / "lab.xcp"
     with path.open("wb") as file:
-        file.truncate(rig_formats._MOST_BYTES + 1)
+        file.truncate(rig_formats._MAX_XML_BYTES + 1)
     with pytest.raises(RigError, match="bytes long, expected at most"):
         read_xml(path)
 

@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import DatasetError, HandSimError
+from handsim import HandShape, HandSimError, look_at
+from handsim.errors import DatasetError
 from handsim.hand.model import KEYPOINT_NAMES
-from handsim.hand.shape import HandShape
-from handsim.space.camera import look_at
+from render import RenderedFrame, SkinLook
 from render.formats.coco import skeleton_lines
 from render.formats.records import hand_mask, to_order
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
-from render.skin.look import SkinLook
 
 
 @pytest.fixture

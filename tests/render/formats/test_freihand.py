@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import DatasetError, HandSimError
-from handsim.space.camera import Lens
+from handsim import HandSimError, Lens
+from handsim.errors import DatasetError
 from render.formats.freihand import FreihandWriter
 from render.formats.records import hand_mask
 from tests.render.formats.reading import depth_of

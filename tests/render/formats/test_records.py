@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from handsim import Camera, Lens
 from handsim.errors import ArgumentError
 from handsim.hand.model import KEYPOINT_NAMES
-from handsim.space.camera import Camera, Lens
+from render import Pictures
 from render.color_sensor import linear_of
 from render.formats.records import (
     ABSENT,
@@ -32,7 +33,7 @@ from render.formats.records import (
     to_order,
     write_exr,
 )
-from render.frames import FOREARM, PARTS_A_HAND, Pictures
+from render.frames import FOREARM, PARTS_A_HAND
 from tests.render.formats.reading import depth_of, exr_content
 
 

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.hand.model import HandModel, hand_keypoints, join_qpos
+from handsim import Camera, HandModel, Lens, join_qpos, look_at
+from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import Side
-from handsim.space.camera import Camera, Lens, camera_from_record, look_at, pinhole
+from handsim.space.camera import camera_from_record, pinhole
 from handsim.space.transforms import axis_angle_matrix, quaternion_matrix, random_quaternions
 from render.formats.records import to_json, to_order
 from render.formats.webdataset import (

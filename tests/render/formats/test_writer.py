@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from handsim import HandModel, HandSimError, look_at
 from handsim.cli.main import main
-from handsim.errors import DatasetError, HandSimError
+from handsim.errors import DatasetError
 from handsim.files.outputs import save_json
-from handsim.hand.model import HandModel
-from handsim.space.camera import look_at
+from render import Pictures, RenderedFrame, merge_renderings
 from render.formats.shards import BESIDE
-from render.formats.writer import CONFIG, FORMATS, FrameWriter, merge_renderings, open_writer
-from render.frames import Pictures, RenderedFrame
+from render.formats.writer import CONFIG, FORMATS, FrameWriter, open_writer
 from tests.render.formats.reading import depth_of, exr_content
 
 ROOT = Path(__file__).resolve().parents[3]

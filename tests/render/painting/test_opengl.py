@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from poses.shapes import gesture
+from render import SkinLook
 from render.illustrations import view_along
 from render.painting import opengl as gl
 from render.painting.figures import shade_colors, skin_material
@@ -23,7 +24,6 @@ from render.painting.opengl import (
     pyrender_material,
 )
 from render.scenery.lights import STUDIO, Lamp, Lighting
-from render.skin.look import SkinLook
 from render.skin.mesh import PosableSkin
 from render.skin.texture import skin_texture
 

@@ -11,11 +11,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from gloves import attach, load_layout
+from handsim import Camera, HandModel, join_qpos, look_at
 from handsim.hand.shape import SIDES, Side
-from handsim.space.camera import Camera, look_at, pinhole
+from handsim.space.camera import pinhole
 from poses.shapes import gesture
 from render.painting.figures import Drawn, HandFigure, Material, sample_people
 from render.painting.painter import Painter, paint, put_before

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from handsim import Camera, HandModel, Lens, join_qpos, look_at
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.skin import vertex_normals
-from handsim.space.camera import Camera, Lens, look_at, pinhole, preset
+from handsim.space.camera import pinhole, preset
 from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
 from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals

@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import HandSimError
-from handsim.space.camera import Camera, look_at, preset
-from handsim.space.rig import named_rig
-from render.config import RenderConfig
-from render.frames import Geometry, RenderedFrame
+from handsim import Camera, HandSimError, look_at
+from handsim.space.camera import preset
+from handsim.space.rig import load_rig
+from render import Backgrounds, RenderConfig, RenderedFrame, ViewConfig, draw
+from render.frames import Geometry
 from render.scenery.backgrounds import (
     KINDS,
     Background,
-    Backgrounds,
     Enclosure,
     draw_background,
     draw_surroundings,
@@ -25,9 +24,7 @@ from render.scenery.backgrounds import (
     sample_background,
 )
 from render.scenery.rooms import draw_room
-from render.session import draw
-from render.viewpoints import ViewConfig
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 SIZE = (160, 120)
 
@@ -256,7 +253,7 @@ def test_a_rig_sees_photographs_on_the_walls(tmp_path) -> None:
     file = tmp_path / "stripes.png"
     assert cv2.imwrite(str(file), picture)
     photo = dataclasses.replace(background("photo"), photo=str(file))
-    rig = named_rig("six")
+    rig = load_rig("six")
     box = enclose(np.concatenate([rig.positions, MIDDLE[None]]), 0)
     seen = draw_surroundings(photo, box, preset("vga").at(rig.T_world_camera[0]))
     assert seen.rgb.min() < 60 and seen.rgb.max() > 200 and (seen.depth > 0.5).all()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from render.scenery.backgrounds import Backgrounds
+from render import Backgrounds, SkinLook
 from render.scenery.lights import (
     expose_for,
     irradiance,
@@ -18,7 +18,6 @@ from render.scenery.lights import (
     sample_surroundings,
     surround,
 )
-from render.skin.look import SkinLook
 
 
 def test_lightings_are_plain_values_and_repeat() -> None:

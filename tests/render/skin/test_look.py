@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import HandSimError
-from render.skin.look import ALL_TONES, TONES, Forearm, SkinLook, sample_forearm, sample_skin_look
+from handsim import HandSimError
+from render import SkinLook
+from render.skin.look import ALL_TONES, TONES, Forearm, sample_forearm, sample_skin_look
 from render.skin.mesh import skin_atlas
 from render.skin.texture import SkinTexture, skin_texels, skin_texture
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side, sample_shape
+from handsim import HandModel, join_qpos, sample_shape
+from handsim.hand.shape import BONES, JOINT_NAMES, NUM_BONES, SIDES, Side
 from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR
 from poses.shapes import gesture

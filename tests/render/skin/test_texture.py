@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from handsim.hand.shape import SIDES, Side
 from poses.shapes import gesture
+from render import SkinLook
 from render.illustrations import view_along
 from render.painting.figures import skin_material
 from render.painting.opengl import (
@@ -16,7 +17,7 @@ from render.painting.opengl import (
     pyrender_material,
 )
 from render.scenery.lights import Lamp, Lighting
-from render.skin.look import CUFF, Forearm, SkinLook
+from render.skin.look import CUFF, Forearm
 from render.skin.mesh import PosableSkin, skin_atlas
 from render.skin.texture import (
     REFERENCE,

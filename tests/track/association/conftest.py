@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
+from handsim import join_qpos
 from handsim.hand.shape import Side
 from poses.shapes import resting_angles
 from track.association.frame_state import FrameState, Numbering

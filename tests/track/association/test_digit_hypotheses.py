@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from gloves import attach, load_layout
+from handsim import HandModel, join_qpos
 from poses.shapes import resting_angles, sample_valid_angles
+from track import TrackerConfig
 from track.association.digit_hypotheses import (
+    DigitHypotheses,
     DigitModel,
+    DigitPoints,
     digit_ranges,
     empty_hypotheses,
     evaluate_digit,
     fit_hypothesis,
 )
 from track.association.frame_state import peak_log_odds
-from track.config import TrackerConfig
 from track.kinematics.marker_kinematics import HandArrays, compute_markers, hand_arrays, workspace
 from track.kinematics.pose_solver import RESTING, PoseSolver
-from track.kinematics.pose_spread import digit_prior, predict_joints, resting_covariance
+from track.kinematics.pose_spread import digit_prior, predict_joints, predict_markers, resting_prior
 
 INDEX = 1
 MARKERS = np.array([4, 5, 6])
@@ -41,11 +42,9 @@ def digit_model(solver, qpos, missing):
     """What a tracker knows in a pose whose index finger lacks some markers."""
     target = solver.marker_positions(qpos)
     target[missing] = np.nan
-    prior = predict_joints(qpos[7:] + np.deg2rad(4.0), 0.1 * resting_covariance(), 0.05)
+    prior = predict_joints(qpos[7:] + np.deg2rad(4.0), 0.1 * resting_prior().covariance, 0.05)
     variance = np.full(19, SPREAD**2)
-    seen = solver.predict_markers(
-        qpos, target, prior, wrist_spread=(0.01, 0.1), variance=variance, noise=SPREAD
-    )
+    seen = predict_markers(solver.hand, solver.on_part, qpos, target, prior, (0.01, 0.1), variance, SPREAD)
     return DigitModel(
         prior,
         seen,
@@ -66,7 +65,7 @@ def search(solver, model_of_digit, points, log_odds):
         points,
         np.arange(len(points)),
         log_odds,
-        *(row[0] for row in hypotheses),
+        DigitHypotheses(*(row[0] for row in hypotheses)),
     )
     return hypotheses
 
@@ -93,8 +92,7 @@ def by_hand(solver, model_of_digit, points):
     prediction, precision = np.empty(4), np.empty((4, 4))
     digit_prior(
         model_of_digit.joint_prior,
-        model_of_digit.predicted.information_matrix,
-        model_of_digit.predicted.information_vector,
+        model_of_digit.predicted,
         INDEX,
         prediction,
         precision,
@@ -187,9 +185,8 @@ def fitted(hand, points, hypothesis, start=MEAN, cutoff=np.inf):
     """Cost, complexity and hinges."""
     work, angles, variance = workspace(19), np.array(start), np.full(19, SPREAD**2)
     compute_markers(hand, RESTING, work)
-    cost, complexity = fit_hypothesis(
-        hand, INDEX, MARKERS, points, variance, np.array(hypothesis), MEAN, PRECISION, cutoff, angles, work
-    )
+    own = DigitPoints(hand, INDEX, MARKERS, points, variance, MEAN, PRECISION)
+    cost, complexity = fit_hypothesis(own, np.array(hypothesis), cutoff, angles, work)
     return cost, complexity, angles
 
 

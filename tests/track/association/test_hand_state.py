@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
+from handsim import join_qpos
 from poses.shapes import resting_angles
 from track.association.hand_state import MOST_AGE_LOG_ODDS, SEEN_ELSEWHERE, STRAY_LIFETIME, HandState
 
@@ -55,7 +55,7 @@ def test_a_marker_that_is_missing_is_less_certain_than_its_neighbors(moving):
     prediction = moving.predict(30 / RATE)
     target = prediction.positions.copy()
     target[TIP] = np.nan
-    spread = np.trace(moving.fit(target, prediction.qpos, prediction).covariances, axis1=1, axis2=2)
+    spread = np.trace(moving.fit(target, prediction.qpos, prediction).predicted.covariances, axis1=1, axis2=2)
     assert spread.argmax() == TIP
 
 

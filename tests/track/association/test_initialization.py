@@ -8,9 +8,9 @@ from scipy.cluster.hierarchy import fclusterdata
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
+from handsim import join_qpos
 from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
@@ -123,8 +123,8 @@ def test_exchanged_hands_are_exchanged_back(initializer, states):
     clouds = markers(states, 0)
     points, labels = shuffled(clouds, 0, np.random.default_rng(0))
     of_hands = [np.where(labels // 19 == hand, labels % 19, -1) for hand in (0, 1)]
-    right = [initializer._first_fit(hand, points, of_hands[hand]) for hand in (0, 1)]
-    wrong = [initializer._first_fit(1 - hand, points, of_hands[hand]) for hand in (0, 1)]
+    right = [initializer._fit(hand, points, of_hands[hand]) for hand in (0, 1)]
+    wrong = [initializer._fit(1 - hand, points, of_hands[hand]) for hand in (0, 1)]
     assert initializer._sides_checked(right, points) is right
     for hand in initializer._sides_checked(wrong, points):
         seen = hand.labels >= 0

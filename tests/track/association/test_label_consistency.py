@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import join_qpos
-from poses.motion import sample_motion
+from gloves import GloveFit, load_layout
+from gloves.fit import nominal_fit
+from handsim import join_qpos
+from poses import sample_motion
 from poses.shapes import resting_angles
+from track import TrackerConfig
 from track.association.frame_state import FrameState, Numbering, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction
 from track.association.label_consistency import (
@@ -21,8 +22,7 @@ from track.association.label_consistency import (
     fit_labels,
     gate_labels,
 )
-from track.config import TrackerConfig
-from train.labelers.protocol import Labeling
+from train import Labeling, load_labeler
 
 RATE = 120.0
 

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from handsim.hand.shape import DIGITS
 from handsim.space.transforms import random_quaternions
 from poses.shapes import resting_angles, sample_valid_angles

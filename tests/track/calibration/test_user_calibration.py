@@ -10,16 +10,15 @@ import pytest
 
 from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
-from gloves.fit import GloveFit, attach, attach_markers, nominal_fit
-from gloves.layout import load_layout
-from handsim.errors import HandSimError
-from handsim.hand.model import HandModel, join_qpos
+from gloves import GloveFit, attach, load_layout
+from gloves.fit import attach_markers, nominal_fit
+from handsim import HandModel, HandSimError, join_qpos
 from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion import WristConfig, wrist_path
+from track import Calibration, HeldOut, User, load_user
 from track.calibration.hand_parameters import displace_markers
-from track.calibration.user_calibration import Calibration, HeldOut, calibrate_hand
-from track.user import User, load_user
+from track.calibration.user_calibration import calibrate_hand
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import SIDES, sample_shape
+from gloves import GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos, sample_shape
+from handsim.hand.model import skinned_jacobian
+from handsim.hand.shape import SIDES
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from track.kinematics.marker_kinematics import (
     MARKER_NOISE,
     NUM_UNKNOWNS,
+    PoseEnergy,
     accumulate_normal_equations,
     compute_markers,
     eliminate,
@@ -123,7 +125,7 @@ def test_the_minimum_is_the_one_that_scipy_finds(tightness, rng):
         center = np.concatenate([near[:7], rng.normal(0.3, 0.2, size=20)])
         pull = np.concatenate([rng.uniform(0.1, 30.0, size=20), np.zeros(6)])
         pose = near.copy()
-        cost, _ = levenberg_marquardt(hand, target, pose, center, pull, tightness, 50, 1e-6, work)
+        cost, _ = levenberg_marquardt(hand, PoseEnergy(target, center, pull, tightness), pose, 50, 1e-6, work)
         residuals = costs(model, glove, target, center, pull, tightness)
         assert cost == pytest.approx((residuals(pose) ** 2).sum(), rel=1e-9)
         # A robust cost has more minima than one: theirs starts from ours, and finds nothing better around.
@@ -146,7 +148,9 @@ def test_no_steps_leave_the_pose_alone(rng):
     pose = join_qpos(sample_valid_angles(model, 1, rng=rng))[0]
     before, pull = pose.copy(), np.zeros(26)
     hand, work = hand_arrays(GloveFit(model, glove)), workspace(19)
-    _, steps = levenberg_marquardt(hand, glove.points, pose, pose.copy(), pull, 0.0, 0, 1e-6, work)
+    _, steps = levenberg_marquardt(
+        hand, PoseEnergy(glove.points, pose.copy(), pull, 0.0), pose, 0, 1e-6, work
+    )
     assert steps == 0
     np.testing.assert_array_equal(pose, before)
 

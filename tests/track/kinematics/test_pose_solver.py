@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
+from gloves import GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIDES, sample_shape
+from handsim.hand.shape import SIDES
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from poses.motion import sample_motion
+from poses import sample_motion
 from poses.shapes import resting_angles, sample_valid_angles
-from track.kinematics.marker_kinematics import hand_arrays
-from track.kinematics.pose_solver import AnglePrior, PoseSolver, initial_poses, solve_pose, starting_shapes
+from track import solve_pose
+from track.kinematics.pose_solver import AnglePrior, PoseSolver
 
 INDEX = slice(11, 15)  # of qpos
 
@@ -288,23 +288,3 @@ def test_bad_starts_predictions_and_distances_are_told(rng):
         solver.solve(targets, flat, prior=AnglePrior(np.zeros((3, 20)), 0.1))
     with pytest.raises(ArgumentError, match="outlier_distance is -1 m, expected a positive distance"):
         PoseSolver(GloveFit(model, glove), outlier_distance=-1.0)
-
-
-def test_every_digit_is_taken_from_the_nearest_shape(rng):
-    model = HandModel.named("S", side="left")
-    glove = attach_markers(load_layout("dense19"), model)
-    shapes = starting_shapes(GloveFit(model, glove))
-    digits = hand_arrays(GloveFit(model, glove)).digits
-    low, high = model.skeleton.ranges.T
-    assert ((shapes.angles >= low) & (shapes.angles <= high)).all()
-    for _ in range(10):
-        chosen = np.repeat(rng.integers(len(shapes.angles), size=5), 4)
-        angles = shapes.angles[chosen, np.arange(20)]
-        qpos = join_qpos(angles[None], position=rng.normal(size=3), quaternion=random_quaternions(1, rng=rng))
-        target = glove.centers(model, model.forward_kinematics(qpos))[0]
-        poses = initial_poses(shapes, digits, target)
-        np.testing.assert_allclose(poses[0, 7:], angles)
-        np.testing.assert_allclose(
-            poses[0, :3], qpos[0, :3], atol=0.003
-        )  # skin between digits moves with both
-        assert {tuple(row) for row in poses[1:, 7:]} == {tuple(row) for row in shapes.angles}

@@ -10,26 +10,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import GloveFit, attach, nominal_fit
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, hand_keypoints
+from gloves import GloveFit, attach, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandModel
+from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import SIDES
-from poses.shapes import sample_poses
+from poses import sample_poses
 from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
+    MarkerPrediction,
     SpreadModel,
-    calibrated_doubt,
     digit_prior,
-    empty_prediction,
+    hand_doubt,
     known_hand,
-    measured_doubt,
-    named_doubt,
     pose_spreads,
     predict_joints,
-    resting_angles,
-    resting_covariance,
     resting_prior,
     tip_lengths,
 )
@@ -131,10 +128,10 @@ def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     named, measured, calibrated, noisy = (
         spreads_of(fit, doubt, qpos, seen, resting_prior().precision)
         for doubt in (
-            named_doubt(digits),
-            measured_doubt(digits),
-            calibrated_doubt(digits, 0.0002),
-            calibrated_doubt(digits, 0.001),
+            hand_doubt(digits, "named", 0.001),
+            hand_doubt(digits, "measured", 0.001),
+            hand_doubt(digits, "calibrated", 0.0002),
+            hand_doubt(digits, "calibrated", 0.001),
         )
     )
     for widest, wide, narrow, middle in zip(named, measured, calibrated, noisy, strict=True):
@@ -183,8 +180,8 @@ def test_at_once_they_are_as_they_were(seed, span):
 @given(SEEDS)
 def test_in_the_end_they_are_as_hands_rest(seed):
     prior = predict_joints(*draw_prior(seed), 100.0)
-    np.testing.assert_allclose(prior.covariance, resting_covariance() + LEAST, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(prior.angles, resting_angles())
+    np.testing.assert_allclose(prior.covariance, resting_prior().covariance + LEAST, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(prior.angles, resting_prior().angles)
 
 
 @settings(deadline=None)
@@ -212,13 +209,13 @@ def test_two_spans_are_as_good_as_one(seed, first, second):
 def test_less_is_known_of_well_known_hinges_the_longer_nobody_looks(seed, first, second):
     spans = sorted([first, second])
     angles, known = draw_prior(seed)
-    known *= 0.5 * np.linalg.eigvalsh(resting_covariance()).min() / np.linalg.eigvalsh(known).max()
+    known *= 0.5 * np.linalg.eigvalsh(resting_prior().covariance).min() / np.linalg.eigvalsh(known).max()
     soon, late = (predict_joints(angles, known, span).covariance for span in spans)
     assert np.linalg.eigvalsh(late - soon).min() > -1e-12
 
 
 def test_neighboring_fingers_rest_alike():
-    covariance = resting_covariance()
+    covariance = resting_prior().covariance
     spread = np.sqrt(np.diag(covariance))
     together = covariance / np.outer(spread, spread)
     assert (np.diag(together[5:20:4, 9:20:4]) > 0.4).all(), "fingers flex with their neighbors"
@@ -226,12 +223,13 @@ def test_neighboring_fingers_rest_alike():
 
 def conditioned(prior, seen, digit):
     angles, precision = np.empty(4), np.empty((4, 4))
-    digit_prior(prior, seen.information_matrix, seen.information_vector, digit, angles, precision)
+    digit_prior(prior, seen, digit, angles, precision)
     return angles, precision
 
 
 def nothing_seen():
-    seen = empty_prediction(19)
+    shapes = [(27,), (19, 3), (19, 3, 3), (19, 3, 3), (20, 20), (20, 20), (20,)]
+    seen = MarkerPrediction(*map(np.empty, shapes))
     seen.information_matrix[:], seen.information_vector[:] = 0.0, 0.0
     return seen
 

@@ -7,15 +7,12 @@ import functools
 import numpy as np
 import pytest
 
+from gloves import Status, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.points import Status
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
-from track.frames import TrackedBody, TrackedFrame, TrackedHand
-from track.live_message import LiveMessage, MessageEncoder
-from track.rigid_body import RigidTemplate
-from track.streams.frame_source import StreamedFrame
+from track import LiveMessage, RigidTemplate, StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
+from track.live_message import MessageEncoder
 
 
 @functools.cache

@@ -7,13 +7,12 @@ import sys
 import numpy as np
 import pytest
 
+from gloves import Status, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.points import Status
-from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from track.frames import TrackedFrame, TrackedHand
-from track.sinks import VALID, SinkGroup, open_sink, open_sinks
-from track.streams.frame_source import StreamedFrame
+from handsim import HandSimError, HandSimWarning
+from handsim.errors import ArgumentError
+from track import SinkGroup, StreamedFrame, TrackedFrame, TrackedHand, open_sinks
+from track.sinks import VALID, open_sink
 
 SOURCE = """
 class Counter:

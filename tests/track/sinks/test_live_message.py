@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gloves import load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from track.live_message import FORMATS, document_format, frame_document, header_document

@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from handsim.errors import HandSimError
-from track.streams.live_stream import VALID, open_source
+from handsim import HandSimError
+from track import open_source
+from track.streams.live_stream import VALID
 
 SOURCE = """
 import numpy as np

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from handsim.errors import CaptureError, HandSimWarning
+from gloves import Capture, read_capture, write_capture
+from handsim import HandSimWarning
+from handsim.errors import CaptureError
 from tests.track.streams.test_frame_source import Slow
-from track.streams.frame_source import SourceStream, StreamedFrame
-from track.streams.live_stream import FrameOrder, LiveStream
+from track import LiveStream, StreamedFrame
+from track.streams.frame_source import SourceStream
+from track.streams.live_stream import FrameOrder
 
 RATE = 120.0
 FRAMES = 120

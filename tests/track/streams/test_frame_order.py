@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from track.streams.frame_source import StreamedFrame
+from track import StreamedFrame
 from track.streams.live_stream import FrameOrder
 
 INTERVAL = 1.0 / 120.0

@@ -9,12 +9,14 @@ import time
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from gloves import Capture
+from handsim import HandSimWarning
+from handsim.errors import ArgumentError, CaptureError
 from tests.waiting import LONG
+from track import LiveStream, StreamedFrame
+from track.frames import capture_frames
 from track.streams import live_stream
-from track.streams.frame_source import SourceStream, StreamedFrame, capture_frames
-from track.streams.live_stream import LiveStream
+from track.streams.frame_source import SourceStream
 
 
 def frame(number: int, points: object = None, **changes: object) -> StreamedFrame:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from track.streams.frame_source import StreamedFrame
+from track import StreamedFrame
 from track.streams.natnet import (
     NEWEST,
     DamagedPacket,

@@ -13,18 +13,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gloves.captures.capture import Capture
-from gloves.takes.points import Status
-from gloves.takes.take import Take
-from handsim.errors import ArgumentError, CaptureError, HandSimError
+from gloves import Capture, Status, Take
+from handsim import HandSimError
+from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track.rigid_body import BodyTracker, RigidTemplate
+from track import LiveStream, ReplayServer, RigidTemplate, StreamedFrame, open_source
+from track.rigid_body import BodyTracker
 from track.streams import natnet
-from track.streams.frame_source import StreamedFrame
-from track.streams.live_stream import LiveStream, open_source
-from track.streams.natnet import Kind, PointStream, ReplayServer, ServerInfo, open_stream
-from train.simulation.takes import simulate_take
+from track.streams.natnet import Kind, PointStream, ServerInfo, open_stream
+from train import simulate_take
 
 LOOPBACK = "127.0.0.1"
 

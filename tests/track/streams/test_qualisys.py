@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import CaptureError
-from track.streams.live_stream import open_source
+from track import open_source
 from track.streams.qualisys import QualisysSource
 
 LOOPBACK = "127.0.0.1"

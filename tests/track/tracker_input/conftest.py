@@ -5,11 +5,9 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.paper.take_evaluation import true_users
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from gloves import GloveFit, Take
+from track import Tracker
+from train import load_labeler, simulate_take
 
 
 @pytest.fixture(scope="session")

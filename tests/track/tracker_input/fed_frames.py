@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import seen_frame
-from gloves.takes.points import Status
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel
-from track.frames import TrackedFrame
-from track.tracker import Tracker
+from gloves import Status, Take
+from handsim import HandModel
+from track import TrackedFrame, Tracker
 
 NUM_MARKERS = 38
 SURE = Status.TRACKED, Status.INITIALIZED

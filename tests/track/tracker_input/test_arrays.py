@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
+from gloves import GloveFit, Take
 from handsim.errors import ArgumentError
 from tests.track.tracker_input.fed_frames import (
     nothing,
     plain,
 )
-from track.tracker import Tracker
-from train.labelers.protocol import Labeler
+from track import Tracker
+from train import Labeler
 
 
 def changes_of(users: list[GloveFit], labeler: Labeler, take: Take, spoil: bool) -> list[np.ndarray]:

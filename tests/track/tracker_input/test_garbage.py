@@ -10,9 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
-from gloves.takes.take import Take
+from gloves import GloveFit, Status, Take
 from tests.track.tracker_input.fed_frames import (
     all_right,
     check_frame,
@@ -20,8 +18,8 @@ from tests.track.tracker_input.fed_frames import (
     plain,
     statuses,
 )
-from track.tracker import Tracker
-from train.labelers.protocol import Labeler
+from track import Tracker
+from train import Labeler
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

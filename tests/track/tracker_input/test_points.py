@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.takes.points import Status
+from gloves import Status
 from tests.track.tracker_input.fed_frames import (
     SURE,
     Fed,

@@ -16,13 +16,13 @@ import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from gloves import RigidBody, Take, load_layout
 from gloves.fit import nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.take import COASTING, LOST, TRACKED, RigidBody, Take
-from handsim.hand.model import join_qpos
+from gloves.takes.take import COASTING, LOST, TRACKED
+from handsim import join_qpos
 from handsim.space.objects import named_object
 from handsim.space.transforms import random_quaternions
-from poses.shapes import sample_poses
+from poses import sample_poses
 from tests.waiting import wait_for
 from track.streams import LOOPBACK
 from track.viewer import opened_server

@@ -8,9 +8,10 @@ import threading
 import numpy as np
 import pytest
 
+from gloves import load_take
 from gloves.takes.corrections import corrections_of, corrections_path
-from gloves.takes.take import load_take
-from handsim.errors import CaptureError, HandSimWarning
+from handsim import HandSimWarning
+from handsim.errors import CaptureError
 from track.viewer.contents import open_content, show_recording
 from track.viewer.editors import Corrector
 from track.viewer.recordings import TakeRecording

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout, starter_layout
+from gloves.layout import starter_layout
+from handsim import HandModel
 from handsim.errors import ArgumentError, LayoutError
-from handsim.hand.model import HandModel
 from track.viewer.contents import open_content
 from track.viewer.editors import LayoutEditor, edited_path
 

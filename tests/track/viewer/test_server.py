@@ -11,7 +11,8 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from handsim.errors import ArgumentError, HandSimError
+from handsim import HandSimError
+from handsim.errors import ArgumentError
 from track.streams import LOOPBACK
 from track.viewer import address_of, is_own_page, opened_server
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from train.data.batches import Corruption, corrupt
+from train import Corruption, corrupt
 
 
 def markers(rng, count=20_000):

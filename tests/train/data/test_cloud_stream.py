@@ -10,10 +10,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from handsim.errors import ArgumentError, DatasetError
-from train.data.batches import Corruption
-from train.data.cloud_stream import CloudStream
-from train.data.shards import Dataset
-from train.simulation.generation import generate_dataset
+from train import CloudStream, Corruption, Dataset, generate_dataset
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from train import Dataset, GenerateSettings, MappedRows, SceneMix, TrainSettings
 from train.data.batches import Part, draw_batch
-from train.data.shards import Dataset, MappedRows, row_dtype
-from train.settings import TrainSettings, batch_recipe
+from train.data.shards import row_dtype
+from train.settings import batch_recipe
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 
 def shards_of(sizes):

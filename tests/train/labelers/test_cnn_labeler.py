@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from train.data.batches import Corruption, corrupt
+from train import Corruption, corrupt
 from train.labelers.cnn_labeler import (
     MIRROR_IMAGE,
     SIGNS,

@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from train import CNNConfig
 from train.labelers.cnn_labeler import depth_images, random_views
 from train.labelers.cnn_network import DeepLabelCNN, filter_sparse
 from train.labelers.matching import GHOST, match_distances
-from train.settings import CNNConfig
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout
-from handsim.errors import HandSimWarning, WeightsError
-from train.data.batches import Corruption
-from train.evaluation import evaluate_labeler
+from gloves import load_layout
+from handsim import HandSimWarning
+from handsim.errors import WeightsError
+from train import Corruption, evaluate_labeler, load_labeler
 from train.labelers import layout_labeler
 from train.labelers.layout_labeler import (
     LayoutLabeler,
@@ -22,7 +22,7 @@ from train.labelers.layout_labeler import (
     shipped_network,
 )
 from train.labelers.protocol import learned_folder, learned_gloves
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.labelers.storage import shipped_labelers
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from gloves import load_layout
-from gloves.fit import attach
+from gloves import attach, load_layout
 from handsim import HandModel, sample_shape
 from poses import sample_poses
 from train import load_labeler

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.held_out import held_out_markers
-from train.data.batches import Corruption, corrupt
+from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, load_labeler
 from train.labelers import networks
 from train.labelers.networks import (
     LayoutNetwork,
@@ -21,8 +21,6 @@ from train.labelers.networks import (
     layout_loss,
     new_network,
 )
-from train.labelers.storage import load_labeler
-from train.settings import CNNConfig, SetLabelerConfig
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from gloves.fit import attach_markers
-from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout
+from gloves.layout import list_layouts
+from handsim import HandModel, join_qpos
 from handsim.errors import WeightsError
-from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import DIGITS
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles

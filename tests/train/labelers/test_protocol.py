@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from handsim.errors import ArgumentError
+from train import CNNConfig, SetLabelerConfig
 from train.labelers.networks import labeler_of, new_network
 from train.labelers.storage import OnnxLabeler, export_onnx
-from train.settings import CNNConfig, SetLabelerConfig
 
 NAMES = tuple(f"marker{number}" for number in range(19))
 

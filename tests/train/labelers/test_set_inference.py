@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from benchmarks.held_out import held_out_markers
+from train import SetLabelerConfig, load_labeler
 from train.labelers.networks import SetLabeler
 from train.labelers.protocol import pad_clouds
 from train.labelers.set_inference import CloudScorer, TrainedSetLabeler, _centers, weight_shapes
-from train.labelers.storage import load_labeler, load_network
-from train.settings import SetLabelerConfig
+from train.labelers.storage import load_network
 
 
 def scorer(network: SetLabeler) -> CloudScorer:

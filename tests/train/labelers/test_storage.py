@@ -16,16 +16,13 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture, write_capture
-from gloves.fit import attach
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from gloves import Capture, MarkerLayout, MarkerPlace, attach, load_layout, read_capture, write_capture
+from handsim import HandModel, HandSimError, HandSimWarning
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, HandSimError, HandSimWarning, LayoutError, WeightsError
-from handsim.hand.model import HandModel
+from handsim.errors import ArgumentError, LayoutError, WeightsError
 from handsim.hand.shape import DIGITS
 from poses import sample_poses
-from train import Corruption, corrupt
+from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, load_labeler
 from train.labelers.cnn_labeler import MeanHand
 from train.labelers.layout_labeler import LayoutLabeler
 from train.labelers.networks import labeler_of, new_network
@@ -37,13 +34,11 @@ from train.labelers.storage import (
     WEIGHTS,
     OnnxLabeler,
     export_onnx,
-    load_labeler,
     load_network,
     save_network,
     sign_model,
     weights_metadata,
 )
-from train.settings import CNNConfig, SetLabelerConfig
 
 SHIPPED = json.loads((_SHIPPED / "dense19.json").read_text())
 NETWORK = SHIPPED["network"]

@@ -15,11 +15,11 @@ import pytest
 from handsim.cli.main import main
 from handsim.errors import DatasetError
 from handsim.hand.shape import JOINT_NAMES, JOINTS
-from train.data.shards import Dataset, row_dtype
+from train import Dataset, GenerateSettings
+from train.data.shards import row_dtype
 from train.reports import dataset_page as report
 from train.simulation import generation
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
-from handsim.hand.model import HandModel
+from gloves import MarkerLayout, MarkerPlace, load_layout
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
+from handsim import HandModel
 from handsim.hand.shape import BONES, bones_of
 from train.reports.hand_plot import HAND_SIZE, arrow_curve, flat_hand, mistakes, name_extent, place_names
 

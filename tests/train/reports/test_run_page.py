@@ -14,22 +14,30 @@ import numpy as np
 import pytest
 import torch
 
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
+from gloves import MarkerLayout, MarkerPlace
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
 from handsim.hand.shape import BONES
 from handsim.pages import picture
 from tests.renames import fails_at
-from train.data.shards import Dataset
+from train import (
+    Dataset,
+    GenerateSettings,
+    LabelingReport,
+    SetLabelerConfig,
+    TrainSettings,
+    load_labeler,
+    train_labeler,
+)
 from train.evaluation import (
     History,
-    LabelingReport,
     error_without,
     expected_calibration_error,
     macro_f1,
     percent,
     reliability,
 )
-from train.labelers.storage import CARD, WEIGHTS, load_labeler
-from train.loop import CHECKPOINT, TrainingState, train_labeler
+from train.labelers.storage import CARD, WEIGHTS
+from train.loop import CHECKPOINT, TrainingState
 from train.reports.hand_plot import LONGEST_NAME, short
 from train.reports.run_page import (
     MODEL_CARD,
@@ -42,9 +50,7 @@ from train.reports.run_page import (
     write_model_card,
     write_run_page,
 )
-from train.settings import SetLabelerConfig, TrainSettings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))

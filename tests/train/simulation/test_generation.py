@@ -14,22 +14,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout
+from gloves import load_layout
+from handsim import HandModel, Population, join_qpos
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Population
-from handsim.space.rig import as_rig
+from handsim.space.rig import load_rig
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
-from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
+from train import Dataset, GenerateSettings, SceneMix
+from train.data.shards import MANIFEST, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH, GenerateSettings, SceneMix
+from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH
 
 CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
@@ -237,7 +237,7 @@ def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     config = GenerateSettings(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
     make_dataset(config, tmp_path / "set", workers=1)
     dataset = Dataset(tmp_path / "set")
-    assert as_rig(dataset.manifest.config["rig"]) == rig
+    assert load_rig(dataset.manifest.config["rig"]) == rig
     assert DatasetRecording(dataset).rig == rig
     write_dataset_page(dataset.path / REPORT, dataset)
     rig.save(tmp_path / "mixed.toml")  # the same cameras, whatever names them

@@ -7,12 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from gloves.layout import MarkerLayout, MarkerPlace
-from handsim.errors import ArgumentError, DatasetError, HandSimWarning
-from handsim.space.rig import load_rig
-from poses.shapes import sample_poses
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import simulate_take
+from gloves import MarkerLayout, MarkerPlace
+from handsim import HandSimWarning, load_rig
+from handsim.errors import ArgumentError, DatasetError
+from poses import sample_poses
+from train import generate_dataset, simulate_take
 
 DIGITS = ("thumb", "index", "middle", "ring", "little")
 LAYOUT = MarkerLayout(

@@ -10,25 +10,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.fit import GlovedHand, attach
-from gloves.layout import load_layout
+from gloves import GlovedHand, OpticsConfig, Take, attach, load_layout
 from gloves.optics.ghosts import StrayConfig
-from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.visibility import MAX_FACING
-from gloves.takes.take import Take
+from handsim import HandModel, RigidObject, look_at
 from handsim.errors import ArgumentError
-from handsim.hand.model import BodyMotion, HandModel
-from handsim.space.camera import look_at
-from handsim.space.objects import RigidObject, named_object
-from handsim.space.rig import named_rig
-from poses.motion import sample_motion
+from handsim.hand.model import BodyMotion
+from handsim.space.objects import named_object
+from handsim.space.rig import load_rig
+from poses import sample_motion
 from tests.rigs import square_rig
 from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources
 from train.simulation.scenes import MovingObject, SceneMotion
 
 RATE = 120.0
 FRAMES = 120
-RIG = named_rig("figure5")
+RIG = load_rig("figure5")
 CLEAN = RoomConfig(OpticsConfig(blob_loss=0.0, dropout=0.0), StrayConfig(number=0.0))
 
 

@@ -8,14 +8,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import Take
+from gloves import Take, attach, load_layout
+from handsim import HandModel
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.model import HandModel
 from handsim.space.transforms import quaternion_matrix
 from poses.shapes import is_valid
 from poses.touch import FINGERS, is_touching
+from train import simulate_take
 from train.simulation import scenes
 from train.simulation.scenes import (
     FLESH,
@@ -27,7 +26,7 @@ from train.simulation.scenes import (
     move_skin,
     sample_real_like_scene,
 )
-from train.simulation.takes import sample_scene, simulate_calibration, simulate_take
+from train.simulation.takes import sample_scene, simulate_calibration
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])

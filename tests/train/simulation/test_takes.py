@@ -9,23 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gloves import OpticsConfig, Take, load_layout, load_take
 from gloves.captures.capture import count_gaps
-from gloves.layout import load_layout
-from gloves.optics.reconstruction import OpticsConfig
-from gloves.takes.take import Take, load_take
-from handsim.errors import ArgumentError, HandSimError, PoseError
-from handsim.hand.model import HandModel
+from handsim import HandModel, HandSimError
+from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
-from handsim.space.rig import ROOM_CENTER, as_rig, named_rig
+from handsim.space.rig import ROOM_CENTER, load_rig
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
 from poses.two_hands import two_hands_penetration
 from tests.rigs import mixed_rig
+from train import OpticsOptions, SimulateSettings, simulate_take
 from train.simulation import takes
-from train.simulation.room import TWINS, OpticsOptions
+from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS, RATE
-from train.simulation.takes import WRIST_VOLUME, SimulateSettings, simulate_take
+from train.simulation.takes import WRIST_VOLUME
 
 FRAMES = 200
 SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
@@ -118,10 +117,10 @@ def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
         take = simulate_take(num_frames=40, rig=given)
         take.save(tmp_path / "take.truth.npz")
         takes.append(load_take(tmp_path / "take.truth.npz"))
-        assert as_rig(takes[-1].settings["rig"]) == rig
+        assert load_rig(takes[-1].settings["rig"]) == rig
     np.testing.assert_array_equal(takes[0].points, takes[1].points)
     assert takes[0].markers_present().mean() > 0.4
-    six = simulate_take(num_frames=40, rig=named_rig("six"))
+    six = simulate_take(num_frames=40, rig=load_rig("six"))
     assert six.settings["rig"] == "six"
     np.testing.assert_array_equal(six.points, simulate_take(num_frames=40, rig="six").points)
     with pytest.raises(ArgumentError, match="rig is 3, expected a CameraRig, or the name or path of one"):

@@ -9,9 +9,9 @@ from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
 from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents
+from train import simulate_take
 from train.simulation import generation
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from upath import UPath
 
 from handsim.files.inputs import checksum
-from train.simulation.training_frames import GenerateSettings, SceneMix
+from train import GenerateSettings, SceneMix
 
 ROWS = 100
 ALONE = SceneMix(alone=1.0, together=0.0, holding=0.0)

@@ -15,13 +15,14 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
+from handsim import HandSimError
 from handsim.app.output import open_output, place_of
 from handsim.app.workers import run_jobs
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, DatasetError, HandSimError
+from handsim.errors import ArgumentError, DatasetError
 from handsim.files.signals import Stopped
-from render.config import RenderConfig
-from render.session import left_out_frames, render_take
+from render import RenderConfig, render_take
+from render.session import left_out_frames
 from tests.handsim.app.object_stores.stored_set import (
     CONFIG,
     contents,
@@ -29,7 +30,8 @@ from tests.handsim.app.object_stores.stored_set import (
     names,
     write_three,
 )
-from train.data.shards import MANIFEST, Dataset, array_bytes, row_dtype, rows_name, save_array
+from train import Dataset
+from train.data.shards import MANIFEST, array_bytes, row_dtype, rows_name, save_array
 from train.simulation.generation import make_dataset
 
 pytestmark = [pytest.mark.xdist_group("object stores"), pytest.mark.slow]  # what they share is made once

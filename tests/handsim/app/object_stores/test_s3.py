@@ -21,10 +21,10 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from handsim import HandSimError
 from handsim.app.output import open_output
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.cli.main import main
-from handsim.errors import HandSimError
 from tests.handsim.app.object_stores.stored_set import (
     ALONE,
     CONFIG,
