@@ -329,7 +329,7 @@ def _paint(rng: np.random.Generator, count: int) -> Doubles:
 
 
 def paint_tints(rng: np.random.Generator, count: int) -> Doubles:
-    """Logarithms (count, 3) of red, green and blue of paints over their gray; few are strong, green or magenta."""
+    """Logarithms (count, 3) of paints' colors over their gray; few are strong, green or magenta."""
     strong = rng.random(count) < _COLORED
     warm = rng.normal(0.08, np.where(strong, 0.32, 0.10))
     green = rng.normal(0.0, np.where(strong, 0.10, 0.04))
