@@ -207,12 +207,7 @@ RATE = 120.0
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.integers(1, 700),
-    st.floats(0.0, 0.5),
-    st.sampled_from([0.0, 0.5]),
-)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 700), st.floats(0.0, 0.5), st.sampled_from([0.0, 0.5]))
 def test_a_wrist_stays_in_its_cube_and_moves_smoothly(seed, frames, volume, turning):
     config = WristConfig(center=(0.2, -0.1, 1.0), volume=volume, turning=turning)
     position, quaternion = wrist_path(frames, RATE, config, rng=np.random.default_rng(seed))

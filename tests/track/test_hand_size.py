@@ -13,13 +13,7 @@ from handsim.hand.shape import ADULTS, DIGITS, SIZES, shape_from_measures
 from poses import sample_motion
 from track import StreamedFrame
 from track.frames import checked_frames
-from track.hand_size import (
-    SizeFit,
-    _is_found,
-    fit_size,
-    sample_frames,
-    usual_breadth,
-)
+from track.hand_size import SizeFit, _is_found, fit_size, sample_frames, usual_breadth
 from train import load_labeler, simulate_take
 
 RATE = 120.0

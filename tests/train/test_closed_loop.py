@@ -135,10 +135,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
         (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "ghosts is -1, expected 0 to 100"),
         (["train", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
-        (
-            ["train", "SET", "--out", "RUN", "--seed", "5"],
-            "begun with other settings (train.batch: ",
-        ),
+        (["train", "SET", "--out", "RUN", "--seed", "5"], "begun with other settings (train.batch: "),
     ],
 )
 def test_mistakes_end_in_one_sentence(run, tmp_path, capsys, arguments, sentence):

@@ -133,11 +133,7 @@ def test_a_returned_number_is_the_exit_code(invoke: Callable[..., int]) -> None:
     ],
 )
 def test_what_a_user_can_set_right_is_told_in_one_line(
-    error: BaseException,
-    code: int,
-    line: str,
-    invoke: Callable[..., int],
-    capsys: pytest.CaptureFixture[str],
+    error: BaseException, code: int, line: str, invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert invoke(raising(error)) == code
     err = capsys.readouterr().err

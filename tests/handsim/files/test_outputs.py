@@ -385,10 +385,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are text"
 NAME = os.fsdecode(b"t\xe4ke")  # of an old Windows system
 SHOWN = "t\N{REPLACEMENT CHARACTER}ke"
 
-SAID = {
-    ".mot": f"{SHOWN}\n",
-    ".html": "<title>Take t?ke.truth.npz</title>",
-}
+SAID = {".mot": f"{SHOWN}\n", ".html": "<title>Take t?ke.truth.npz</title>"}
 """What files say of names, by their endings."""
 
 

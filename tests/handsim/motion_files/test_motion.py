@@ -220,10 +220,7 @@ def test_joints_are_where_ours_are(motion, tmp_path):
     positions, rate, _, _ = read_bvh(tmp_path / "hands.bvh")
     assert abs(rate - 60.0) < 1e-5
     for hand in posed_motion(motion).hands:
-        bones, tips = (
-            hand.model.forward_kinematics(hand.qpos),
-            hand_keypoints(hand.model, hand.qpos),
-        )
+        bones, tips = (hand.model.forward_kinematics(hand.qpos), hand_keypoints(hand.model, hand.qpos))
         for number, bone in enumerate(BONE_NAMES):
             np.testing.assert_allclose(positions[f"{hand.side}_{bone}"], bones[:, number, :3, 3], atol=1e-7)
         for number, digit in enumerate(DIGITS):

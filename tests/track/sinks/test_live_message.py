@@ -24,12 +24,7 @@ DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
 @pytest.mark.parametrize("name", FORMATS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    number=st.integers(0, 2**40),
-    seed=st.integers(0, 99),
-    lost=st.booleans(),
-    points=st.integers(0, 9),
-)
+@given(number=st.integers(0, 2**40), seed=st.integers(0, 99), lost=st.booleans(), points=st.integers(0, 9))
 def test_a_frame_comes_back(name, message, number, seed, lost, points):
     one = message(number, seed=seed, lost=lost, points=points)
     there = DECODE[name](document_format(name, points=True).frame(one))

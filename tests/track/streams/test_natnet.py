@@ -178,8 +178,7 @@ def test_a_count_takes_no_memory():
 
 
 @pytest.mark.parametrize(
-    "info",
-    [ServerInfo("Motive", (3, 1), 1511, "239.255.42.99"), ServerInfo("a" * 255, (4, 1), 50000, None)],
+    "info", [ServerInfo("Motive", (3, 1), 1511, "239.255.42.99"), ServerInfo("a" * 255, (4, 1), 50000, None)]
 )
 def test_server_infos_are_read(info):
     kind, payload = unpack(pack_server_info(info))

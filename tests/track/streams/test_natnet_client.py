@@ -134,10 +134,7 @@ def test_a_body_is_tracked_live():
 def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
     positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
     positions[1, 0] = np.nan
-    with (
-        ReplayServer(Capture(("a", "b"), positions, 100.0)) as server,
-        opened(server.url) as stream,
-    ):
+    with ReplayServer(Capture(("a", "b"), positions, 100.0)) as server, opened(server.url) as stream:
         ids = [list(one.ids) for one in itertools.islice(stream, 4)]
     assert ids == [[0, 1], [1], [2, 1], [2, 1]]
 
@@ -293,10 +290,7 @@ def test_servers_that_cannot_be_used_are_told(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(natnet, "_PATIENCE", 0.2)
         patch.setattr(natnet, "_RETRY", 0.1)
-        with (
-            Puppet() as server,
-            pytest.raises(CaptureError, match="no NatNet server answers; in Motive"),
-        ):
+        with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers; in Motive"):
             opened(server.url)
         with (
             Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
@@ -389,10 +383,7 @@ def test_a_stream_ends_while_frames_arrive():
 
 def test_a_stream_ends_when_it_is_told_to():
     ended = threading.Event()
-    with (
-        Puppet(unicast((4, 1))) as server,
-        opened(server.url, ended=ended.is_set, silence=1.0) as stream,
-    ):
+    with Puppet(unicast((4, 1))) as server, opened(server.url, ended=ended.is_set, silence=1.0) as stream:
         for number in (0, 1, 3):  # the last one is held, because one is missing before it
             server.say(frame(number, (4, 1)))
         got = [next(stream), next(stream)]

@@ -7,10 +7,7 @@ import pytest
 
 from gloves import GloveFit, Take
 from handsim.errors import ArgumentError
-from tests.track.tracker_input.fed_frames import (
-    nothing,
-    plain,
-)
+from tests.track.tracker_input.fed_frames import nothing, plain
 from track import Tracker
 from train import Labeler
 

@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gloves import GloveFit, Status, Take
-from tests.track.tracker_input.fed_frames import (
-    all_right,
-    check_frame,
-    feed,
-    plain,
-    statuses,
-)
+from tests.track.tracker_input.fed_frames import all_right, check_frame, feed, plain, statuses
 from track import Tracker
 from train import Labeler
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.track.tracker_input.fed_frames import (
-    Fed,
-    all_right,
-    feed,
-    only,
-)
+from tests.track.tracker_input.fed_frames import Fed, all_right, feed, only
 
 
 def test_an_id_that_goes_over_while_its_marker_is_hidden_does_not_take_the_name_along(tracker, take):

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 
 from gloves import Status
-from tests.track.tracker_input.fed_frames import (
-    SURE,
-    Fed,
-    all_right,
-    feed,
-    nothing,
-    only,
-    plain,
-    statuses,
-)
+from tests.track.tracker_input.fed_frames import SURE, Fed, all_right, feed, nothing, only, plain, statuses
 
 
 def test_nothing_ever_comes(tracker, take):

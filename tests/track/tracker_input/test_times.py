@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.track.tracker_input.fed_frames import (
-    Fed,
-    all_right,
-    feed,
-    plain,
-)
+from tests.track.tracker_input.fed_frames import Fed, all_right, feed, plain
 
 
 @pytest.mark.parametrize(
