@@ -192,7 +192,7 @@ def test_a_mistake_is_one_sentence(command, folder, capsys, monkeypatch):
     assert main(command.split()) == 1
     said = capsys.readouterr().err
     assert said.startswith(f"handsim {command.split()[0]}: ")
-    assert_names(said, CASES[command])
+    assert_names(said.strip(), CASES[command])
     assert {path.name for path in folder.iterdir()} == before, "something was left behind"
 
 
