@@ -76,7 +76,7 @@ def test_a_missing_package_is_told(monkeypatch):
 
 def test_the_page_shows_what_is_sent(message):
     """Keys and kinds of values in docs/live_output.md are those of real documents."""
-    page = Path(__file__).parents[3] / "docs" / "live_output.md"
+    page = Path(__file__).parents[2] / "docs" / "live_output.md"
     shown = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", page.read_text(), re.DOTALL)]
     one = message(lost=True)
     header, frame = header_document(one.header), frame_document(one)
