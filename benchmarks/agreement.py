@@ -19,7 +19,7 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import HIGH, LOW, sample_valid_angles
 from train.simulation.training_frames import sample_hands
@@ -52,7 +52,7 @@ def main() -> None:
     arguments = parser.parse_args()
     print(describe("mujoco"))
     rng = np.random.default_rng(0)
-    layout, cameras = load_layout("dense19"), named_rig("figure5").positions
+    layout, cameras = load_layout("dense19"), load_rig("figure5").positions
     deepest = kinematics = 0.0
     outside = rays = disagreeing = 0
     for _ in range(arguments.hands):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import load_layout
-from handsim.space.rig import as_rig
+from handsim.space.rig import load_rig
 from train.data.shards import row_dtype
 from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
@@ -24,7 +24,7 @@ def held_out_markers(glove: str, num_frames: int, *, seed: int) -> Float[np.ndar
         seed: Seed of the people and poses.
     """
     config = GenerateSettings(glove=glove, num_frames=num_frames, seed=seed)
-    layout, rig = load_layout(glove), as_rig(config.rig)
+    layout, rig = load_layout(glove), load_rig(config.rig)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY,)))
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
     source = FrameSource(config, layout, rig)

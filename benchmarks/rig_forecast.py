@@ -23,7 +23,7 @@ from benchmarks.record import describe
 from gloves.captures.capture import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, named_rig
+from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, load_rig
 from train.forecast.rig_forecast import Forecast, forecast, light_work, sample_work
 from train.forecast.rig_plan import plan_rig
 from train.simulation.scenes import SimulatedKind
@@ -39,7 +39,7 @@ CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
 )
 CENTER, SIDES = np.array(ROOM_CENTER), np.full(3, 0.6)
 FRAME = np.array([2.4, 1.8, 2.2])
-CAMERA = named_rig("six").cameras[0]
+CAMERA = load_rig("six").cameras[0]
 FIGURES = ("missing [%]", "gaps [1/marker/min]", "ghosts [1/frame]")
 ERROR = "error [mm]"
 COUNTS = (4, 5, 6, 8, 10, 12)  # cameras of the rigs that are planned and hung by hand
@@ -96,9 +96,9 @@ def rigs() -> list[CameraRig]:
         for number, x in enumerate((-0.75, -0.25, 0.25, 0.75), 1)
     ]
     return [
-        *(named_rig(name) for name in list_rigs()),
+        *(load_rig(name) for name in list_rigs()),
         *planned,
-        CameraRig("three", named_rig("six").cameras[:3]),
+        CameraRig("three", load_rig("six").cameras[:3]),
         CameraRig("row", row),
     ]
 

@@ -26,7 +26,7 @@ from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import clear_of_mesh, facing_cameras, hand_tree, visible_cameras
 from handsim.hand.model import join_qpos
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 from train.simulation.room import (
@@ -78,7 +78,7 @@ class Stopwatch:
 def one_hand(frames: int, seed: int, watch: Stopwatch) -> None:
     """What a training set would cost with full optics: a new person every 128 frames, poses of no motion."""
     rng = np.random.default_rng(seed)
-    layout, rig = load_layout("dense19"), named_rig("figure5")
+    layout, rig = load_layout("dense19"), load_rig("figure5")
     spent: dict[str, float] = {}
 
     def timed(name: str, job: Callable[[], Any]) -> Any:
@@ -112,7 +112,7 @@ def one_hand(frames: int, seed: int, watch: Stopwatch) -> None:
 def room_of(kind: str, frames: int, seed: int, watch: Stopwatch) -> None:
     """The stages of `train.simulation.takes.simulate_take`."""
     rng = np.random.default_rng(seed)
-    rig, config = named_rig("figure5"), TWINS[kind].room
+    rig, config = load_rig("figure5"), TWINS[kind].room
     layout, optics = load_layout("dense19"), config.optics
     scene = watch("people, gloves, motions", lambda: sample_scene(kind, layout, frames, rng=rng))
     sight = watch("bones, markers", lambda: _prepared(SceneSight(scene, rig)))
@@ -201,7 +201,7 @@ def floor(frames: int) -> None:
     """Lines, boxes and bytes of a frame of two hands and a controller."""
     rng = np.random.default_rng(0)
     scene = sample_scene("hand-controller", load_layout("dense19"), frames, rng=rng)
-    sight = SceneSight(scene, named_rig("figure5"))
+    sight = SceneSight(scene, load_rig("figure5"))
     markers, normals = sight.markers
     facing = facing_cameras(markers, normals, sight.rig)
     tree, tested = hand_tree(), 0

@@ -30,7 +30,7 @@ from gloves.optics.visibility import (
 )
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Side, sample_shape
-from handsim.space.rig import CameraRig, list_rigs, named_rig
+from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 
@@ -78,7 +78,7 @@ def embree_clear(scene: Scene, cameras: np.ndarray, wanted: np.ndarray) -> np.nd
 
 
 def agreement(poses: int, rng: np.random.Generator) -> Figures:
-    rig, sides = named_rig("figure5"), ("right", "left")
+    rig, sides = load_rig("figure5"), ("right", "left")
     embree, skin, capsules, asked = [], [], [], []
     for number in range(poses // POSES_A_HAND):
         side: Side = sides[number % 2]  # type: ignore[assignment]
@@ -124,7 +124,7 @@ def rigs(poses: int, rng: np.random.Generator) -> None:
     cube = CENTER + rng.uniform(-0.3, 0.3, size=(100_000, 3))
     print("\nrigs: cube of half side 0.3 m in >= 2, >= 3 views; markers seen by >= 2, >= 3; cameras a marker")
     for name in list_rigs():
-        rig = named_rig(name)
+        rig = load_rig(name)
         views = rig.in_view(cube).sum(axis=-1)
         wanted = in_view_and_facing(scene.markers, scene.normals, rig)
         seen = clear_of_mesh(hand_tree(), scene.skin, scene.markers, rig.positions, wanted).sum(axis=-1)
@@ -144,7 +144,7 @@ def cost(job: Callable[[], object]) -> float:
 
 
 def speeds(rng: np.random.Generator) -> None:
-    rig = named_rig("figure5")
+    rig = load_rig("figure5")
     cameras, tree = rig.positions, hand_tree()
     hands = []
     for side, offset in (("right", -0.06), ("left", 0.06)):

@@ -57,7 +57,7 @@ from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from poses.shapes import sample_valid_angles
 from track.tracker import Tracker, warm_up
 from train.data.batches import Corruption, corrupt, draw_batch
@@ -377,7 +377,7 @@ def solvers(speeds: Speeds) -> None:
 
 def rays(speeds: Speeds) -> None:
     rng, model = np.random.default_rng(0), HandModel.named("M")
-    cameras, count = named_rig("figure5").positions, speeds.some(2000, 100)
+    cameras, count = load_rig("figure5").positions, speeds.some(2000, 100)
     qpos = join_qpos(sample_valid_angles(model, count, rng=rng), position=[0.0, 0.0, 1.1])
     bones = model.forward_kinematics(qpos)
     markers, _ = attach_markers(load_layout("dense19"), model).markers(model, bones)

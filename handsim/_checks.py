@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import reprlib
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Collection, Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handsim.errors import ArgumentError, HandSimError, choices
 
-Settings = TypeVar("Settings")
-
 
 def check_type(
     name: str, value: object, kinds: type | tuple[type, ...], expected: str, valid: Iterable[str] = ()
 ) -> None:
-    """Refuse an argument of another type by an `ArgumentError`; the one check of all public functions."""
+    """Refuse an argument of another type than `kinds`; True and False are no numbers."""
     named = kinds if isinstance(kinds, tuple) else (kinds,)
     if isinstance(value, kinds) and (not isinstance(value, bool) or bool in named):
         return
@@ -34,34 +31,6 @@ def check_choice(
     """Refuse a name that is none of the valid ones, as `choices` tells it."""
     if given not in valid:
         raise error(choices(str(given), valid, noun=noun))
-
-
-def fill_settings(config: Any) -> None:
-    """Put settings in the place of mappings, in the fields of a frozen dataclass that are groups of settings.
-
-    A mapping holds what differs from the field's default.
-    """
-    for one in dataclasses.fields(config):
-        if one.default_factory is dataclasses.MISSING:
-            continue
-        value, default = getattr(config, one.name), one.default_factory()
-        if value is None and "None" in str(one.type):
-            continue
-        if not dataclasses.is_dataclass(default) or type(value) is type(default):
-            continue
-        check_type(one.name, value, Mapping, f"a {type(default).__name__} or a mapping of its settings")
-        made = make_settings(type(default), f"setting of {one.name}", value, default=default)
-        object.__setattr__(config, one.name, made)
-
-
-def make_settings(
-    kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
-) -> Settings:
-    """A dataclass of settings, some given by name, the others from `default` or the dataclass."""
-    known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
-    for name in given:
-        check_choice(name, known, noun=noun)
-    return kind(**given) if default is None else dataclasses.replace(default, **given)
 
 
 def check_rng(rng: object) -> None:

@@ -32,7 +32,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
-from handsim.space.rig import CameraRig, as_rig
+from handsim.space.rig import CameraRig, load_rig
 from track.glove_score import (
     Trial,
     digit_of,
@@ -141,7 +141,7 @@ def improve_glove(
             name to keep is none of the layout's.
     """
     chosen = ImproveGloveSettings.of(settings, options)
-    layout, rig = load_layout(glove), as_rig(chosen.rig)
+    layout, rig = load_layout(glove), load_rig(chosen.rig)
     count = layout.num_markers if chosen.markers is None else chosen.markers
     on_step("putting the glove on")
     search = Improvement(layout, rig, chosen.keep, rng=np.random.default_rng(chosen.seed))

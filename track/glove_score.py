@@ -23,7 +23,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
-from handsim.space.rig import CameraRig, as_rig
+from handsim.space.rig import CameraRig, load_rig
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
 from track.config import BOTH
@@ -174,7 +174,7 @@ def score_glove(
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     chosen = ScoreGloveSettings.of(settings, options)
-    layout, rig, given = load_layout(glove), as_rig(chosen.rig), chosen.labeler
+    layout, rig, given = load_layout(glove), load_rig(chosen.rig), chosen.labeler
     rng = np.random.default_rng(chosen.seed)
     on_step("simulating hands")
     hands, seen = _hands(chosen, layout, rig, rng)

@@ -1,12 +1,12 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
-Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file, pads a cut
-one silently, and stops at 65,535 frames. Only what a capture needs is read: the points, their labels, units
-and rate; analog channels, events and force plates are passed over.
+Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file, silently
+pads a file that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read,
+no analog channels, events and force plates.
 
-Header and parameters both state where the frames lie and how numbers are written, and some programs write one
-of them wrong. Where they contradict each other, the size of the data decides and the user is told; where it
-does not decide, the file is refused.
+Header and parameters both state where the frames lie and how numbers are written, and some programs get one
+of them wrong. Where they contradict each other, the size of the data decides, with a warning; where it does
+not decide, the file is refused.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
 BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
-_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # which say where points are; damage to others does not matter
-_MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
-_LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
+_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # groups that locate the points; damage to others is ignored
+_MAX_BYTES: Final = 1 << 22  # of all values together; damaged records may overlap and state far more
+_MAX_RECORD: Final = 1 << 17  # bytes; records are chained by 16-bit offsets
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
-    """Floats of a file as doubles; a DEC float has its halves swapped and is four times too big."""
+    """Floats of a file as doubles; DEC floats have swapped halves and are four times too large."""
     if processor != _DEC:
         with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
             return values.astype(np.float64)
@@ -54,20 +54,20 @@ class Parameters:
     """Parameters by upper-case group and name: numbers, or strings for characters."""
 
     processor: int
-    """Which of the three number formats the whole file uses."""
+    """Number format of the file: Intel, DEC or SGI."""
     values: dict[tuple[str, str], list[float] | list[str]]
 
     @staticmethod
     def parse(data: bytes, start: int, tell: Tell) -> Parameters:
-        """Read the records from byte `start` of a file of a block or more; nothing outside it is touched."""
+        """Read the records from byte `start` of a file of at least one block."""
         if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
         try:
             groups, found = _walk(data, start + 4, processor, tell)
             read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
-            if sum(_num_bytes(raw) for _, _, raw in read) > _MOST_BYTES:
-                raise CaptureError(f"damaged: the parameters hold more than {_MOST_BYTES} bytes")
+            if sum(_num_bytes(raw) for _, _, raw in read) > _MAX_BYTES:
+                raise CaptureError(f"damaged: the parameters hold more than {_MAX_BYTES} bytes")
             values = {(group, name): _read_values(bytes(raw), processor) for group, name, raw in read}
         except (ValueError, IndexError) as error:
             raise CaptureError("damaged: the parameter section cannot be read") from error
@@ -85,7 +85,7 @@ class Parameters:
         return float(default)
 
     def words(self, group: str, name: str) -> list[int]:
-        """A parameter as unsigned 16-bit words; empty if it is absent or holds other values."""
+        """A parameter as unsigned 16-bit words; empty if it is absent or holds no numbers."""
         values = self.values.get((group, name), [])
         numbers = [value for value in values if isinstance(value, float) and math.isfinite(value)]
         return [int(value) & 0xFFFF for value in numbers]
@@ -98,7 +98,7 @@ class Parameters:
 def _walk(
     data: bytes, at: int, processor: int, tell: Tell
 ) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
-    """Names of groups by number; and of each parameter its group, name and record from the type on."""
+    """Names of groups by number, and (group, name, record from its type on) of each parameter."""
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     groups: dict[int, str] = {}
     found: list[tuple[int, str, memoryview]] = []
@@ -116,7 +116,7 @@ def _walk(
         if group < 0:
             groups[-group] = name
         else:
-            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]))
+            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]))
         if offset == 0:
             break
         at = offset_at + offset
@@ -127,7 +127,7 @@ def _walk(
 
 
 def _num_bytes(raw: memoryview) -> int:
-    """Bytes that a parameter record takes and states."""
+    """Upper bound of the bytes that the values of a parameter record need."""
     return 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
 
 
@@ -155,33 +155,33 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
 
 
 def _text(raw: bytes) -> str:
-    raw = raw.partition(b"\0")[0].strip(b" ")  # what follows a zero byte is left over from another text
+    raw = raw.partition(b"\0")[0].strip(b" ")  # bytes after a zero are garbage
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError:
         return raw.decode("latin-1")
 
 
-MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
-_MOST_FILLING: Final = 2 * BLOCK  # bytes behind the last frame
-_SAME_SCALE: Final = 1e-3  # by which the two scales of a file may differ, of themselves
+MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state their length in TRIAL:ACTUAL_END_FIELD
+_MAX_PADDING: Final = 2 * BLOCK  # bytes after the last frame
+_SCALE_TOLERANCE: Final = 1e-3  # relative difference of the two scales of a file
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the first block of a file states."""
+    """The content of the first block of a file."""
 
     num_points: int
     per_frame: int
-    """Analog numbers of a frame."""
+    """Analog numbers per frame."""
     num_frames: int
-    """By the numbers of the first and the last frame."""
+    """Number of frames, from the numbers of the first and the last frame."""
     scale: float
-    """Negative where positions are written as floats; otherwise the size of one step of integers."""
+    """Negative if positions are floats; otherwise the unit of integer positions."""
     start: int
     """First byte of the frames."""
     samples: int
-    """Analog samples of a channel in a frame."""
+    """Analog samples per channel and frame."""
     rate: float
 
     @staticmethod
@@ -203,21 +203,20 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
-    """Bytes that the frames have room for, and the number of frames."""
+    """Room for the frames in the file [bytes], and the stated number of frames, None if there is none."""
 
     room: int
     stated: int | None
-    """None where a long take states its length nowhere."""
 
     def fits(self, frame_bytes: int) -> bool:
-        """Whether frames of this size fill the room, but for the blocks that fill a file."""
-        return self.stated is not None and 0 <= self.room - self.stated * frame_bytes < _MOST_FILLING
+        """Whether the stated number of frames of this size fills the room up to the padding."""
+        return self.stated is not None and 0 <= self.room - self.stated * frame_bytes < _MAX_PADDING
 
 
 def read_points(
     data: bytes, parameters: Parameters, header: Header, tell: Tell
 ) -> Float[np.ndarray, "T N 4"]:
-    """Coordinates in the file's unit and residuals of all frames."""
+    """Coordinates in the file's unit, and residuals."""
     processor = parameters.processor
     num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
     if not num_points:
@@ -231,7 +230,7 @@ def read_points(
     dtype = FLOAT_DTYPES[processor] if scale < 0.0 else INTEGER_DTYPES[processor]
     size = np.dtype(dtype).itemsize
     analog = _analog_numbers(parameters, header, extent, size, num_points, tell)
-    words = 4 * num_points + analog  # points, then the analog samples of the frame
+    words = 4 * num_points + analog
     count = _num_frames(data, header, extent, words, size, num_points == header.num_points, tell)
     frames = np.frombuffer(data, dtype, count=count * words, offset=header.start).reshape(-1, words)
     if extent.stated is None:
@@ -244,7 +243,7 @@ def read_points(
 
 
 def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
-    """POINT:SCALE, or the header's where there is none; see `Header.scale`."""
+    """POINT:SCALE, or the header's scale without it; see `Header.scale`."""
     scale = parameters.number("POINT", "SCALE", default=header.scale)
     if scale == 0.0 or not np.isfinite(scale):
         raise CaptureError(f"POINT:SCALE is {scale:g}, expected a number that is not 0")
@@ -261,7 +260,7 @@ def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: 
             )
         tell(f"{text}; by the file's size its numbers are {'floats' if as_floats else 'integers'}")
         return scale if (scale < 0.0) == as_floats else other
-    if scale > 0.0 and abs(scale - other) > _SAME_SCALE * scale:
+    if scale > 0.0 and abs(scale - other) > _SCALE_TOLERANCE * scale:
         raise CaptureError(f"{text}: the size of the positions is not known; export the file again")
     return scale
 
@@ -269,10 +268,10 @@ def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: 
 def _analog_numbers(
     parameters: Parameters, header: Header, extent: _Extent, size: int, num_points: int, tell: Tell
 ) -> int:
-    """Analog numbers of a frame, which lie between its points and those of the next."""
+    """Analog numbers per frame, which follow the points of each frame."""
     channels = int(parameters.number("ANALOG", "USED", default=0.0 if header.per_frame == 0 else -1.0))
     stated = header.per_frame
-    if channels < 0 or stated == channels * header.samples:  # less than none: nothing is stated
+    if channels < 0 or stated == channels * header.samples:  # negative: not stated
         return stated
     rates = [parameters.number(group, "RATE", default=0.0) for group in ("ANALOG", "POINT")]
     ratio = round(rates[0] / rates[1]) if rates[1] > 0.0 else 0
@@ -291,9 +290,9 @@ def _analog_numbers(
 
 
 def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
-    """Number of frames: POINT:FRAMES or the header; where 16 bits are full, the fields for long takes.
+    """POINT:FRAMES or the header's number of frames; for more than 16 bits, the fields of long takes.
 
-    None means that a long take states its length nowhere, as ezc3d writes it; the data itself decides.
+    None means that the length of a long take is stated nowhere, as in files of ezc3d.
     """
     frames = int(parameters.number("POINT", "FRAMES", default=in_header))
     frames = frames & 0xFFFF if frames < 0 else frames
@@ -309,7 +308,7 @@ def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
 def _num_frames(
     data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, tell: Tell
 ) -> int:
-    """Number of frames to read, each of so many words (numbers) of so many bytes."""
+    """Number of frames to read, each of `words` numbers of `size` bytes."""
     present, stated = extent.room // (words * size), extent.stated
     if stated == 0 or (stated is None and present == 0):
         raise CaptureError("no frames: the file holds no frame")
@@ -321,8 +320,8 @@ def _num_frames(
         tell(f"POINT:FRAMES is {stated}, and header and data have {present} frames; these are read")
         return present
     used = stated * words * size
-    behind = data[header.start + used + _MOST_FILLING : header.start + extent.room]
-    if extent.room - used >= _MOST_FILLING and any(behind):
+    behind = data[header.start + used + _MAX_PADDING : header.start + extent.room]
+    if extent.room - used >= _MAX_PADDING and any(behind):
         frames = f"{stated} frames of {words} numbers"
         text = f"the file states {frames}, which are {used} bytes, and has {extent.room}"
         if not agreed or stated != header.num_frames:
@@ -332,7 +331,7 @@ def _num_frames(
 
 
 def _without_padding(frames: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Frames without the zeros that fill the last block."""
+    """Frames without the zeros that pad the last block."""
     most = BLOCK // frames[:1].nbytes
     end = len(frames)
     while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
@@ -344,7 +343,7 @@ _MOST_LABEL_BYTES: Final = 255
 
 
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a C3D file; points with a negative residual are missing."""
+    """Read the bytes of a C3D file; points with a negative residual are missing."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
     parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)
@@ -365,8 +364,8 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
 def write_c3d(path: Path, capture: Capture) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
 
-    A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
-    programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
+    The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
+    this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:

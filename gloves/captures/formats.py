@@ -1,23 +1,20 @@
 """Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in.
 
-TRC is tab-separated. Five header lines (file type, keys, their values, marker names, axes), then one line per
-frame: number, time, and three cells per marker. Rows may hold more trajectories than line 4 names.
+A TRC is tab-separated, with five header lines (file type, keys, their values, marker names, axes) and one
+line per frame: number, time, and three cells per marker. Rows may hold more trajectories than line 4 names.
 
-Of OptiTrack Motive's CSV, format versions 1.2x and 1.3x are read, and 1.23 is written. Line 1 is a list of
-keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row of quantities, a row
-of axes that begins with 'Frame', and one row per frame. Labels and types decide, not positions: newer exports
-add rows and a TimeCode column. Exports of Motive 1.9 and before (1.20, 1.21) have the same rows without
-labels: types first, then names.
+OptiTrack Motive's CSV is read in format versions 1.2x and 1.3x, and written in 1.23. Line 1 lists keys and
+values. Rows with a label follow (Type, Name, ID, in newer files Parent), a row of quantities, a row of axes
+that begins with 'Frame', and one row per frame. Rows and columns are found by labels and types, since newer
+exports add some. Motive 1.9 and before (versions 1.20, 1.21) write rows of types and names without labels.
 
-Vicon Nexus, and Vicon Workstation before it, write sections. A section is a line with its title, a line with
-its rate, a row of names (one in three cells), a row that begins with 'Frame' (in Workstation 'Field #') and
-holds the axes, in Nexus a row of units, one row per frame, and a blank line. Sections of other data (Devices,
-Model Outputs, ...) may precede and follow that of the trajectories.
+Vicon Nexus and Vicon Workstation write sections: a title, a rate, a row of names (one in three cells), a row
+of axes that begins with 'Frame' (Workstation: 'Field #'), in Nexus a row of units, one row per frame, and a
+blank line. Other sections (Devices, Model Outputs, ...) may precede and follow the trajectories.
 
-Qualisys Track Manager's TSV of 3D data has lines of a key and its values (NO_OF_FRAMES, FREQUENCY,
-MARKER_NAMES, ...), then, if it was asked for, a line of column names, then one line per frame: frame number
-and time, if they were asked for, and three cells per marker in millimeters. Newer exports begin with
-FILE_VERSION.
+Qualisys Track Manager's TSV of 3D data has lines of keys and values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES,
+...; newer exports begin with FILE_VERSION), optionally a line of column names, and one line per frame:
+optionally frame number and time, then three cells per marker in millimeters.
 """
 
 from __future__ import annotations
@@ -81,12 +78,12 @@ _KEYS: Final = (
 
 
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
-    """The capture in the bytes of a TRC file."""
+    """Read the bytes of a TRC file."""
     lines, ended = split_lines(data)
     if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
     lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
-    # A header line counts only with its line end: what precedes a cut may be incomplete.
+    # a header line without a line end may be cut
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
@@ -116,10 +113,10 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
-    """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
+    """Write millimeters with five decimals; a missing marker gets three blank cells.
 
-    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
-    count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
+    Rows, and the two header lines above them, end with a tab, as in the files of Cortex: without it OpenSim
+    refuses rows whose last marker is missing.
     """
     num_frames, num_markers = capture.positions.shape[:2]
     rate = repr(capture.rate).removesuffix(".0")
@@ -147,7 +144,7 @@ def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
 
 
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
-    """Names of line 4, one in every three cells; a blank one becomes '*n'. There may be none."""
+    """Names of line 4, one in three cells; a blank name becomes '*n'. There may be none."""
     lower = [title.lower() for title in titles[: 2 * _LEADING]]
     if not lower[0].startswith("frame"):
         raise CaptureError(_NO_MARKERS)
@@ -165,7 +162,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
 
 
 def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
-    """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them."""
+    """Names '*n' for trajectories that line 4 does not name, as Cortex writes them at the ends of rows."""
     expected = _LEADING + 3 * num_named
     widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)
@@ -189,7 +186,7 @@ _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Mark
 
 
 def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out."""
+    """Read the markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are ignored."""
     lines, ended = split_lines(data)
     separator = separator_behind([MOTIVE_BEGIN], lines[0])
     if separator is None:
@@ -205,11 +202,14 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     axes = rows[end]
-    types, names = _types_and_names(rows[1:end], len(axes))
-    header = rows[1:end]
-    row = next((row for row in reversed(header) if any(row)), [])
-    quantities = row + [""] * (len(axes) - len(row))
-    columns = _marker_columns(types, quantities, axes)
+    header = [row for row in rows[1:end] if any(row)]
+    # files without labels begin with the types, behind two blank cells
+    if len(header) > 2 and not any(header[0][:2]) and set(header[0]) & _TYPES:
+        types, names = header[:2]
+    else:
+        types, names = (_labeled_row(header, label) for label in ("Type", "Name"))
+    names = names + [""] * (len(axes) - len(names))
+    columns = _marker_columns(types, header[-1], axes)
 
     table = parse_table(
         lines,
@@ -264,19 +264,8 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
             file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
 
 
-def _types_and_names(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
-    """Type and name of each column, from the header rows between line 1 and the axes."""
-    filled = [row for row in rows if any(row)]
-    # Without labels the first row says 'Marker' itself, behind two blank cells.
-    if len(filled) > 2 and not any(filled[0][:2]) and set(filled[0]) & _TYPES:
-        types, names = filled[:2]
-    else:
-        types, names = (_labeled_row(filled, label) for label in ("Type", "Name"))
-    return types + [""] * (width - len(types)), names + [""] * (width - len(names))
-
-
 def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
-    """The header row whose first cell with text is `label`."""
+    """The header row whose first text is `label`."""
     for row in rows:
         if next(cell for cell in row if cell) == label:
             return row
@@ -284,7 +273,7 @@ def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
 
 
 def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) -> list[int]:
-    """Where the position of each marker begins."""
+    """First column of the position of each marker."""
     columns = [
         index
         for index, (kind, quantity, axis) in enumerate(zip(types, quantities, axes, strict=False))
@@ -311,20 +300,20 @@ _BLANKS: Final = b' \t",;'
 
 
 def vicon_sections(lines: list[bytes]) -> dict[str, int]:
-    """Where the sections of a Vicon export begin: index of the title's line by title."""
+    """Index of the title line of each section of a Vicon export."""
     titles = {name.lower().encode(): name for name in _SECTIONS}
     found: dict[str, int] = {}
     for index, line in enumerate(lines):
         if line[:1].isalpha() or line[:1] == b'"':
             title = titles.get(line.strip(_BLANKS).lower())
-            # Such a word may stand anywhere: the next line has to be the section's rate.
+            # the word is a title only if the next line is a rate
             if title and index + 1 < len(lines) and lines[index + 1].lstrip(_BLANKS)[:1].isdigit():
                 found.setdefault(title, index)
     return found
 
 
 def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
-    """The trajectories in the bytes of a Vicon CSV, labeled or not."""
+    """Read the trajectories, labeled or not, in the bytes of a Vicon CSV."""
     lines, ended = split_lines(data)
     sections = vicon_sections(lines)
     if _TITLE not in sections:
@@ -355,7 +344,7 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def _vicon_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
-    """Where the position of each trajectory begins, by the row of axes."""
+    """First column of the position of each trajectory, from the row of axes."""
     if axes[0].lower() not in _FIRST_CELLS:
         raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
     columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]
@@ -378,19 +367,18 @@ def _scales(
 
 
 def _name_of(names: list[str], column: int) -> str:
-    """The name over a column, or over one of the two columns before it."""
+    """The name above a column, or above one of the two columns before it."""
     return next((name for name in reversed(names[max(0, column - 2) : column + 1]) if name), "")
 
 
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
 _KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _QTM_LEADING: Final = ("frame", "time")
-_MOST_DIGITS: Final = 12  # of a count
-_UNIT: Final = "mm"  # the only one that QTM writes
+_MAX_DIGITS: Final = 12  # of a count
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
-    """The markers in the bytes of a Qualisys TSV with 3D data; frames missing or too many are told."""
+    """Read the markers in the bytes of a Qualisys TSV with 3D data."""
     lines, ended = split_lines(data)
     separator = separator_behind(_BEGINS, lines[0])
     if separator is None:
@@ -416,7 +404,7 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
 
     titles = marker_titles(_QTM_LEADING[:leading], names)
     table = parse_table(lines, start=start, ended=ended, titles=titles)
-    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per(_UNIT)
+    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per("mm")
     times = StatedTimes(
         _first(stated, "FREQUENCY"),
         "FREQUENCY",
@@ -429,17 +417,17 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
 
 
 def _first(stated: dict[str, list[str]], key: str) -> str:
-    """The first value of a key, blank if there is none."""
+    """The first value of a key, or a blank."""
     return next(iter(stated.get(key, ())), "")
 
 
 def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
-    """One name per marker; one without a name becomes '*n'."""
+    """The names of all markers; a missing name becomes '*n'."""
     names = stated["MARKER_NAMES"]
     while names and not names[-1]:
         names = names[:-1]
     text = _first(stated, "NO_OF_MARKERS")
-    count = int(text[:_MOST_DIGITS]) if text.isdecimal() else len(names)
+    count = int(text[:_MAX_DIGITS]) if text.isdecimal() else len(names)
     if count < len(names) or count > MOST_CELLS // 3:
         raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
     if not count:
@@ -449,7 +437,7 @@ def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
 
 
 def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int]:
-    """Index of the first row of numbers, and how many of its cells precede the positions (`width` cells)."""
+    """Index of the first row of numbers, and its number of cells before the positions (`width` cells)."""
     while start < len(lines) and not lines[start].strip():
         start += 1
     if start == len(lines):
@@ -459,7 +447,7 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
         return start + 1, 2 if cells[1:2] and cells[1].lower() == _QTM_LEADING[1] else 1
     try:
         cell_number(cells[0])
-    except ValueError:  # names of columns, without frame and time
+    except ValueError:  # column names without frame and time
         return start + 1, 0
     while cells and not cells[-1]:
         cells.pop()
@@ -472,7 +460,7 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
-    """A CSV by its content, since Motive's and Vicon's have the same suffix."""
+    """Read a CSV of Motive or of Vicon, which differ in their content only."""
     if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
         return read_motive_csv(data, tell)
     if vicon_sections(split_lines(data)[0]):
@@ -494,21 +482,20 @@ def read_capture(capture: Capture | str | Path) -> Capture:
     """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
 
     Args:
-        capture: The file; its suffix decides the format, its content between the two kinds of `.csv`. A
-            capture that was read before is returned as it is.
+        capture: The file, whose suffix decides the format; a `Capture` is given back.
 
     Returns:
         Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate
         [Hz].
 
     Raises:
-        ArgumentError: It is neither.
+        ArgumentError: `capture` is neither a path nor a capture.
         CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its unit is unknown or
             cannot be that of its positions.
 
     Warns:
-        HandSimWarning: Points at exactly (0, 0, 0) were taken as missing; the file states no unit or rate, or
-            contradicts itself, in a way that leaves one reading.
+        HandSimWarning: Points at exactly (0, 0, 0) were taken as missing, or the file states no unit or rate,
+            or contradicts itself.
     """
     if isinstance(capture, Capture):
         return capture
@@ -530,7 +517,7 @@ def read_capture(capture: Capture | str | Path) -> Capture:
 
 
 def _checked(path: Path, capture: Capture) -> Capture:
-    """The capture without zeros for missing points, if its positions can be in the unit of its file."""
+    """The capture with NaN in place of zeros; refuse positions that cannot be in the unit of the file."""
     capture, zeros = zeros_as_missing(capture)
     if zeros:
         warnings.warn(
@@ -565,12 +552,8 @@ def write_capture(path: str | Path, capture: Capture) -> None:
         CaptureError: The suffix is unknown, a name cannot be written to the file, or writing fails.
     """
     check_type("path", path, (str, Path), "the path of a file", WRITABLE)
-    check_type(
-        "capture",
-        capture,
-        Capture,
-        "a Capture, as read_capture, Take.capture() or Take.labeled_capture() give it",
-    )
+    expected = "a Capture, as read_capture, Take.capture() or Take.labeled_capture() give it"
+    check_type("capture", capture, Capture, expected)
     path = Path(path)
     check_suffix(path, WRITABLE)
     for name in capture.names:
@@ -592,20 +575,18 @@ def write_capture(path: str | Path, capture: Capture) -> None:
 
 
 def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
-    """Raise a `CaptureError` with the valid suffixes unless the path has one of them."""
+    """Refuse a path without one of the valid suffixes."""
     if path.suffix.lower() not in valid:
         raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")
 
 
 def find_captures(paths: Sequence[Path]) -> list[Path]:
-    """The capture files among paths, folders searched through."""
+    """The given capture files, and those in the given folders."""
     files = []
     for path in paths:
-        inside = (
-            sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
-            if path.is_dir()
-            else [path]
-        )
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
         if not inside:
             raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
         files += inside
@@ -615,7 +596,7 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of labeled captures [m], NaN where missing, hand by hand; no frames without any."""
+    """The named markers of each hand in labeled captures [m], without frames in which all are missing."""
     markers = np.concatenate([_markers_of(file, names) for file in files])
     shown: Float[np.ndarray, "T M 3"] = markers[np.isfinite(markers).any(axis=(1, 2))]
     return shown

@@ -1,10 +1,10 @@
 """Parsing shared by the formats: lines, cells, units of length, tables of numbers, times of frames.
 
-Every text is read as lines of UTF-8 whose cells are separated by tabs, whatever it was written as:
-`split_lines` reads UTF-16, `plain_lines` other separators and quotes, and `parse_table` decimal commas.
+Every text is turned into lines of UTF-8 with tabs between cells: `split_lines` reads UTF-16, `plain_lines`
+other separators and quotes, and `parse_table` decimal commas.
 
-Rate, times and numbers of the frames have to agree. A gap in the numbers or in the times becomes frames
-without a point, and is told. What cannot agree is refused in a sentence that says both values.
+Rate, times and numbers of the frames have to agree. A gap in the numbers or the times is filled with frames
+without points, with a warning. Values that contradict each other are refused by a sentence with both.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ _WORDS: Final = {
     "meters": 1.0,
     "metres": 1.0,
 }
-_SHORTEST: Final = 4  # letters that a cut word needs; 'mil' is a thousandth of an inch, too
+_MIN_WORD: Final = 4  # letters of a unit that is cut off; 'mil' may also be a thousandth of an inch
 MOST_CELLS: Final = 400_000
-"""Of a row: twice what the largest number of trajectories of a C3D would take."""
+"""Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
-_BLANKS: Final = ("", "NULL")  # Qualisys writes this word for what was not seen
+_BLANKS: Final = ("", "NULL")  # Qualisys writes NULL for a missing marker
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
 _DECIMALS: Final = re.compile(rb",0\d")  # no whole number begins with a zero
 _NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
-_LOOKED_AT: Final = 50  # rows that show how a writer formats numbers
-_MANY_NUMBERS: Final = 60
+_SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
+_MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
 _LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
 _MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
 
 Tell = Callable[[str], None]
-"""What a reader calls with a sentence about something suspicious in a file that it reads nevertheless."""
+"""Called with a sentence about something suspicious in a file that is read nevertheless."""
 
 
 def warn(text: str) -> None:
-    """Warn of something suspicious in a file whose name is not known here."""
+    """Warn of something suspicious, without the name of the file."""
     warnings.warn(text, HandSimWarning, stacklevel=3)
 
 
 def meters_per(unit: str) -> float:
-    """Meters per unit of length of a file, in any case; a word may be cut ("Mete") or in the singular."""
+    """Meters per unit of length; the unit may be upper-case, cut off ("Mete") or in the singular."""
     word = unit.strip(" .\t\0").lower()
     scale = METERS.get(word)
-    if scale is None and len(word) >= _SHORTEST:
+    if scale is None and len(word) >= _MIN_WORD:
         scale = next((scale for name, scale in _WORDS.items() if name.startswith(word)), None)
     if scale is None:
         raise CaptureError(f"unknown unit of length {shortened(unit.strip())!r}; valid units: mm, cm, m")
@@ -68,7 +68,7 @@ def meters_per(unit: str) -> float:
 
 
 def header_cells(line: bytes, number: int) -> list[str]:
-    """Cells of a plain header line without outer blanks; what is not UTF-8 is taken as Windows-1252."""
+    """Stripped cells of a header line, which is read as Windows-1252 if it is not UTF-8."""
     check_width(line.count(TAB) + 1, number)
     try:
         text = line.decode("utf-8")
@@ -78,7 +78,7 @@ def header_cells(line: bytes, number: int) -> list[str]:
 
 
 def check_width(num_cells: int, number: int) -> None:
-    """Refuse a line with more cells than a marker file has, before they are made."""
+    """Refuse a line with more cells than a marker file has, before it is split."""
     if num_cells > MOST_CELLS:
         raise CaptureError(f"damaged: line {number} has {num_cells} cells, expected at most {MOST_CELLS}")
 
@@ -90,7 +90,7 @@ def cell_number(text: str) -> float:
 
 
 def split_lines(data: bytes) -> tuple[list[bytes], bool]:
-    """Lines of a file with any kind of line ends, in UTF-8, and whether the last one has its line end."""
+    """Lines of a file in UTF-8, and whether the last one has a line end."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         data = data.decode("utf-16", "replace").encode()
     data = data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -100,16 +100,16 @@ def split_lines(data: bytes) -> tuple[list[bytes], bool]:
 
 
 def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
-    """The tab, comma or semicolon behind the word, in quotes or not, that a line begins with."""
+    """The tab, comma or semicolon after one of the words, quoted or not, at the beginning of a line."""
     begin = re.match(rb'\s*("?)(?:' + b"|".join(words) + rb")\1 *([\t,;])", line)
     return None if begin is None else begin[2]
 
 
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
-    """The same lines with tabs between their cells, and without quotes around them.
+    """The lines with tabs between their cells and without quotes.
 
-    Quotes in a file with tabs count only where the first cell of the file is quoted. `first` is the number of
-    the first line in the file; where `wider`, rows may have more cells than the line above them.
+    In a file with tabs, quotes are quotes only if its first cell is quoted. `first` is the number of the
+    first line in the file. With `wider`, rows may have more cells than the line above them.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
@@ -139,13 +139,13 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
     decimals = False
     for index, line in enumerate(lines):
         numbers = _TIME_CODE.sub(b"", line)
-        # A row of a frame and a position, with decimal points or commas and without quotes.
+        # a row of numbers without quotes
         if numbers.count(b",") > _LEADING and _NUMBERS.fullmatch(numbers) is not None:
             if b"." in numbers:
                 return
             rows.append(index)
             decimals = decimals or _DECIMALS.search(numbers) is not None
-        if len(rows) == _LOOKED_AT:
+        if len(rows) == _SAMPLED_ROWS:
             break
     if not rows or (wider and not decimals):
         return
@@ -161,7 +161,7 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
 
 
 def marker_titles(leading: Sequence[str], names: Sequence[str]) -> list[str]:
-    """What messages call the columns of a table with three cells per marker."""
+    """Names in messages for the columns of a table with three cells per marker."""
     return [*leading, *(f"{name} {axis}" for name in names for axis in "XYZ")]
 
 
@@ -176,11 +176,9 @@ def parse_table(
     """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
 
     Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its
-    end, because some writers leave out what was not seen, and may have blank cells too many. Only the last
-    line of a file can have been cut: it counts as cut if it has no line end and fewer cells than
-    `titles` or than the first row, which tells whether rows end in a separator, or if its last number
-    alone has fewer decimals. (A cut inside the last cell of a row whose numbers have as many decimals as it
-    happens leaves no trace and is not noticed.)
+    end, because some writers omit missing markers, or have blank cells too many. A last line without a line
+    end is refused as cut if it has fewer cells than `titles` or than the first row, or if only its last
+    number has fewer decimals than the others.
     """
     num_columns = len(titles)
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
@@ -191,7 +189,11 @@ def parse_table(
     if not ended and rows[-1] == len(lines) - 1:
         _check_whole(lines[rows[0]], lines[-1], len(lines), num_columns)
         _check_last_number([lines[index] for index in rows], len(lines))
-    _check_size(lines, len(rows), num_columns)
+    written = sum(map(len, lines))  # a cell takes at least one byte, its separator
+    if len(rows) * num_columns > written + _MOST_BLANKS:  # before the table is allocated
+        raise CaptureError(
+            f"damaged: {len(rows)} rows of {num_columns} columns are more than {written} bytes can hold"
+        )
     table = np.full((len(rows), num_columns), np.nan)
     for row, index in enumerate(rows):
         number, line = index + 1, lines[index]
@@ -207,12 +209,18 @@ def parse_table(
             table[row, : len(cells)] = [float(cell) if cell else _BLANK for cell in cells]
         except ValueError:
             table[row, : len(cells)] = _parse_cells(cells, number, titles)
-    _check_finite(table, rows, titles)
+    infinite = np.argwhere(np.isinf(table))
+    if len(infinite):
+        row, column = infinite[0].tolist()
+        raise CaptureError(
+            f"line {rows[row] + 1}, column {column + 1} ({titles[column]}): infinite, expected a "
+            "finite number or a blank cell"
+        )
     return table
 
 
 def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool:
-    """Whether the numbers of a table have decimal commas: some have one, and none has a point."""
+    """Whether the numbers of a table have decimal commas: some have a comma, and none has a point."""
     found = False
     for row in rows:
         cells = [row]
@@ -224,18 +232,9 @@ def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool
     return found
 
 
-def _check_size(lines: list[bytes], num_rows: int, num_columns: int) -> None:
-    """Refuse a table whose cells are mostly absent before it is allocated."""
-    written = sum(map(len, lines))  # a cell takes one byte at least, its separator
-    if num_rows * num_columns > written + _MOST_BLANKS:
-        raise CaptureError(
-            f"damaged: {num_rows} rows of {num_columns} columns are more than {written} bytes can hold"
-        )
-
-
 def _check_whole(first: bytes, line: bytes, number: int, num_columns: int) -> None:
-    """Whether the last line, which has no line end, is as long as the first row of the table."""
-    # At most one blank cell beyond the table counts: the separator that may end a row.
+    """Refuse a last line without a line end that has fewer cells than the first row of the table."""
+    # a separator may end a row, so one blank cell beyond the table counts
     usual = min(first.count(TAB) + 1, num_columns + 1)
     expected, got = max(usual, num_columns), line.count(TAB) + 1
     if got < expected:
@@ -245,13 +244,13 @@ def _check_whole(first: bytes, line: bytes, number: int, num_columns: int) -> No
 
 
 def _check_last_number(lines: list[bytes], number: int) -> None:
-    """Whether the last number of a file without a line end has as many decimals as all others."""
+    """Refuse a last number without a line end that has fewer decimals than all others."""
     *others, last = lines[-1].split(TAB)
-    cells = [cell for line in lines[:-1][:_LOOKED_AT] for cell in line.split(TAB)[_LEADING:]]
+    cells = [cell for line in lines[:-1][:_SAMPLED_ROWS] for cell in line.split(TAB)[_LEADING:]]
     cells += others[_LEADING:]
     numbers = [cell.strip() for cell in cells if cell.strip()]
     decimals = {len(cell.partition(b".")[2]) for cell in numbers}
-    # A writer that drops zeros at the end has numbers of all lengths, even if the first few have the same.
+    # numbers of a writer that drops zeros at the end may agree in length by chance
     fixed = any(cell.endswith(b"0") for cell in numbers) or len(numbers) >= _MANY_NUMBERS
     if (
         len(decimals) == 1
@@ -265,7 +264,7 @@ def _check_last_number(lines: list[bytes], number: int) -> None:
 
 
 def _parse_cells(cells: list[bytes], number: int, titles: Sequence[str]) -> list[float]:
-    """The slow parser for one row: cells may hold blanks, and a cell that is not a number is named."""
+    """Parse a row whose cells may hold blanks; an error names the cell that is not a number."""
     values = []
     for column, cell in enumerate(cells):
         text = cell.decode("utf-8", "replace").strip()
@@ -280,51 +279,37 @@ def _parse_cells(cells: list[bytes], number: int, titles: Sequence[str]) -> list
     return values
 
 
-def _check_finite(
-    table: Float[np.ndarray, "T columns"],
-    rows: list[int],
-    titles: Sequence[str],
-) -> None:
-    infinite = np.argwhere(np.isinf(table))
-    if len(infinite):
-        row, column = (int(index) for index in infinite[0])
-        raise CaptureError(
-            f"line {rows[row] + 1}, column {column + 1} ({titles[column]}): infinite, expected a "
-            "finite number or a blank cell"
-        )
-
-
 LOWEST_RATE: Final = 1.0
 HIGHEST_RATE: Final = 5000.0
-"""Frames per second of any optical system [Hz]."""
-_SAME_RATE: Final = 0.02  # by which two rates may differ: 119.88 is called 120, 29.97 is called 30
-_COARSEST: Final = 1  # decimals of times, at least; whole seconds are no times of frames
-_FINEST: Final = 9  # decimals
-_UNEVEN: Final = 0.1  # of the step between two frames, by which times without a stated rate may differ
-_JITTER: Final = 0.25  # of a frame's time, which times vary by where nothing is missing
-_MOST_MISSING: Final = 10  # times as many frames as are there
-_MOST_DIGITS: Final = 12  # of a count
-_SHOWN: Final = 3  # gaps that a sentence names
+"""Highest frame rate of an optical system [Hz]."""
+_RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
+_MIN_DECIMALS: Final = 1  # of times; frames are not timed in whole seconds
+_MAX_DECIMALS: Final = 9  # of times
+_INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
+_JITTER: Final = 0.25  # of a frame: spread of times without a gap
+_MAX_MISSING: Final = 10  # missing frames for each frame that is present
+_MAX_DIGITS: Final = 12  # of a count
+_SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 
 @dataclass(frozen=True, slots=True)
 class StatedTimes:
-    """What a file states of the times of its T frames."""
+    """Rate, times and numbers of the T frames in a file."""
 
     rate: str
-    """The frame rate, as it is written."""
+    """Text of the frame rate."""
     rate_name: str
-    """What the file calls it."""
+    """Name of the rate in the file."""
     numbers: Float[np.ndarray, "T"] | None = None
-    """Number of each frame; None, or NaN anywhere, where there is none."""
+    """Frame numbers; ignored if any is NaN."""
     times: Float[np.ndarray, "T"] | None = None
-    """Time of each frame [s]; None, or NaN anywhere, where there is none."""
+    """Times of the frames [s]; ignored if any is NaN."""
     count: str = ""
-    """Number of frames, as it is written."""
+    """Text of the number of frames."""
     count_name: str = ""
-    """What the file calls it."""
+    """Name of that number in the file."""
     count_is_reliable: bool = True
-    """Whether fewer frames mean that the file is cut; many programs and people shorten a TRC as it is."""
+    """Whether a larger count means that the file is cut; people shorten TRC files without changing it."""
 
 
 def check_rate(rate: float, name: str = "the rate") -> None:
@@ -336,8 +321,8 @@ def check_rate(rate: float, name: str = "the rate") -> None:
 
 
 def check_same_rate(name: str, rate: float, other_name: str, other: float) -> None:
-    """Refuse two stated rates [Hz] of the same frames that differ; one that is none does not count."""
-    if 0.0 < other < np.inf and abs(rate - other) > _SAME_RATE * other:
+    """Refuse two different rates [Hz] of the same frames; an `other` that is no rate is ignored."""
+    if 0.0 < other < np.inf and abs(rate - other) > _RATE_TOLERANCE * other:
         raise CaptureError(
             f"{name} is {rate:g} Hz and {other_name} {other:g} Hz; correct the one that is wrong"
         )
@@ -346,12 +331,12 @@ def check_same_rate(name: str, rate: float, other_name: str, other: float) -> No
 def timed_positions(
     positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, tell: Callable[[str], None]
 ) -> tuple[Float[np.ndarray, "T N 3"], float]:
-    """Positions of all frames from the first to the last [m], and their rate [Hz]."""
+    """Positions of all frames from the first to the last [m], NaN in gaps, and their rate [Hz]."""
     numbers, times = _increasing_numbers(stated.numbers), _increasing_times(stated)
     steps, stride = np.ones(len(positions) - 1, dtype=np.int64), 1
     if numbers is not None and len(numbers) > 1:
         steps = np.diff(numbers)
-        stride = int(np.gcd.reduce(steps))  # some programs keep the cameras' numbers of every other frame
+        stride = int(np.gcd.reduce(steps))  # some programs number every n-th frame of the cameras
         steps //= stride
     rate = _stated_rate(stated.rate)
     if rate is None:
@@ -382,44 +367,42 @@ def timed_positions(
 
 @dataclass(frozen=True, slots=True)
 class _Ticks:
-    """Times of frames, beside the rate that is stated."""
+    """Times of frames [s], and the stated rate [Hz]."""
 
     times: Float[np.ndarray, "T"]
-    """[s]"""
     stated: float
-    """[Hz]"""
     rounding: float
-    """The step to which times were rounded [s]."""
+    """Rounding step of the times [s]."""
     window: int
-    """Frames between two times whose distance shows the rate."""
+    """Number of frames between two times that the rate is measured on."""
 
     @staticmethod
     def of(times: Float[np.ndarray, "T"], rate: float) -> _Ticks:
-        rounding = 10.0**-_FINEST
-        for decimals in range(_COARSEST, _FINEST):
+        rounding = 10.0**-_MAX_DECIMALS
+        for decimals in range(_MIN_DECIMALS, _MAX_DECIMALS):
             scaled = times * 10.0**decimals
             if np.abs(scaled - np.round(scaled)).max() < 1e-3:
                 rounding = 10.0**-decimals
                 break
-        window = min(len(times) - 1, math.ceil(max(1.0, rounding * rate / _SAME_RATE)))
+        window = min(len(times) - 1, math.ceil(max(1.0, rounding * rate / _RATE_TOLERANCE)))
         return _Ticks(times, rate, rounding, window)
 
     def rate(self, steps: Int[np.ndarray, "T-1"]) -> float:
-        """The usual rate of the times [Hz]."""
+        """Median rate of the times [Hz]."""
         frames = np.concatenate([[0], np.cumsum(steps)])
         spans = self.times[self.window :] - self.times[: -self.window]
         interval = float(np.median(spans / (frames[self.window :] - frames[: -self.window])))
         return 1.0 / interval if interval > 0.0 else np.inf
 
     def agree(self, steps: Int[np.ndarray, "T-1"]) -> bool:
-        """Whether the rate of the times is the stated one, as far as they are rounded."""
-        tolerance = _SAME_RATE + self.rounding * self.stated / self.window
+        """Whether the times have the stated rate, within their rounding."""
+        tolerance = _RATE_TOLERANCE + self.rounding * self.stated / self.window
         rate = self.rate(steps)
         return rate < np.inf and abs(self.stated / rate - 1.0) <= tolerance
 
 
 def _stated_rate(text: str) -> float | None:
-    """The rate that a header states [Hz]; None where that is no positive number."""
+    """The rate in a header [Hz]; None if it is not a positive number."""
     try:
         rate = cell_number(text)
     except ValueError:
@@ -428,7 +411,7 @@ def _stated_rate(text: str) -> float | None:
 
 
 def _increasing_numbers(numbers: Float[np.ndarray, "T"] | None) -> Int[np.ndarray, "T"] | None:
-    """The numbers of the frames, if all have one; a `CaptureError` unless they are whole and increase."""
+    """Frame numbers if every frame has one; refuse numbers that are not whole or do not increase."""
     if numbers is None or np.isnan(numbers).any():
         return None
     odd = np.flatnonzero((numbers != np.round(numbers)) | (np.abs(numbers) > 2.0**52))
@@ -442,7 +425,7 @@ def _increasing_numbers(numbers: Float[np.ndarray, "T"] | None) -> Int[np.ndarra
 
 
 def _increasing_times(stated: StatedTimes) -> Float[np.ndarray, "T"] | None:
-    """The times of the frames [s], if all have one; a `CaptureError` unless they increase."""
+    """Times of the frames [s] if every frame has one; refuse times that decrease."""
     times = stated.times
     if times is None or np.isnan(times).any():
         return None
@@ -464,10 +447,10 @@ def _rate_of_times(
     times: Float[np.ndarray, "T"] | None,
     tell: Callable[[str], None],
 ) -> float:
-    """The rate of evenly spaced times [Hz], where none is stated."""
+    """The rate of evenly spaced times [Hz], for a file without a stated rate."""
     text = f"{stated.rate_name} is '{stated.rate.strip()[:40]}', expected a positive number"
     intervals = np.empty(0) if times is None else np.diff(times) / steps
-    if len(intervals) < 2 or np.ptp(intervals) > _UNEVEN * intervals.mean():
+    if len(intervals) < 2 or np.ptp(intervals) > _INTERVAL_TOLERANCE * intervals.mean():
         raise CaptureError(f"{text} of frames per second")
     rate = float(1.0 / intervals.mean())
     tell(f"{text}; by the column of times it is {rate:.6g} Hz")
@@ -475,14 +458,14 @@ def _rate_of_times(
 
 
 def _with_gaps_in_time(steps: Int[np.ndarray, "T-1"], ticks: _Ticks) -> Int[np.ndarray, "T-1"]:
-    """Frames from each row to the next, with those that are missing by the times alone.
+    """Number of frames from each row to the next, increased where the times show a gap.
 
-    A time that is late and made up for by the next one is no gap: clocks jitter. Numbers that go on by more
-    frames than times are a `CaptureError`.
+    A late time that the next one makes up for is jitter and no gap. Numbers that advance by more frames than
+    the times do are refused.
     """
     interval = 1.0 / ticks.rate(steps)
     excess = np.diff(ticks.times) / interval - steps
-    slack = ticks.rounding / interval + 0.5 * _SAME_RATE * steps
+    slack = ticks.rounding / interval + 0.5 * _RATE_TOLERANCE * steps
     excess = np.sign(excess) * np.maximum(np.abs(excess) - slack, 0.0)
     around = np.concatenate([[0.0], excess, [0.0]])
     made_up = np.minimum(around[:-2], 0.0) + np.minimum(around[2:], 0.0)
@@ -506,9 +489,9 @@ def _check_missing(
     numbers: Int[np.ndarray, "T"],
     times: Float[np.ndarray, "T"] | None,
 ) -> None:
-    """Refuse a jump that leaves almost nothing of a capture."""
+    """Refuse a gap that is many times longer than the capture."""
     there = len(numbers)
-    if num_frames - there <= _MOST_MISSING * there:
+    if num_frames - there <= _MAX_MISSING * there:
         return
     row = int(np.argmax(steps))
     at = "" if times is None else f", from {times[row]:g} s to {times[row + 1]:g} s"
@@ -519,11 +502,11 @@ def _check_missing(
 
 
 def _check_count(stated: StatedTimes, there: int, spanned: int, tell: Callable[[str], None]) -> None:
-    """Whether there are as many frames as stated, with those that are missing between others."""
+    """Compare the stated number of frames with the frames that are present and the frames they span."""
     text = stated.count.strip()
     if not text.isdecimal():
         return
-    count = int(text[:_MOST_DIGITS])
+    count = int(text[:_MAX_DIGITS])
     if count > spanned and stated.count_is_reliable:
         raise CaptureError(
             f"truncated: {stated.count_name} is {count}, and {spanned} frames are there; export the file "
@@ -537,8 +520,8 @@ def _missing_sentence(
     steps: Int[np.ndarray, "T-1"], numbers: NDArray[np.int64], stride: int, num_frames: int
 ) -> str:
     gaps = np.flatnonzero(steps > 1)
-    spans = [(numbers[row] + stride, numbers[row + 1] - stride) for row in gaps[:_SHOWN]]
+    spans = [(numbers[row] + stride, numbers[row + 1] - stride) for row in gaps[:_SHOWN_GAPS]]
     shown = ", ".join(f"{first}" if first == last else f"{first} to {last}" for first, last in spans)
-    more = f" and {len(gaps) - _SHOWN} more gaps" if len(gaps) > _SHOWN else ""
+    more = f" and {len(gaps) - _SHOWN_GAPS} more gaps" if len(gaps) > _SHOWN_GAPS else ""
     missing = int((steps - 1).sum())
     return f"{missing} of {num_frames} frames are missing ({shown}{more}); they are read without points"

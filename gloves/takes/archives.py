@@ -1,10 +1,9 @@
 """Takes as files: arrays and a JSON header in one .npz, written at once, or growing while recorded.
 
-What has been added to a growing archive is on disk half a second later, however the recording ends. It begins
-with a JSON header and the arrays that do not grow. Then come blocks, each with some frames, their number and
-a checksum; a block that was cut off is left out. `finish_archive` turns it into the usual .npz, block by
-block, so that its memory does not grow with the recording. Both forms list points as they came, so that their
-size goes with the number of points, and not with that of the fullest frame.
+A growing archive is on disk up to the last half second, however the recording ends. It begins with a JSON
+header and the arrays that do not grow. Blocks follow, each with some frames, their number and a checksum; a
+block that was cut off is ignored. `finish_archive` turns a growing archive into an .npz block by block, so
+that memory does not grow with the recording.
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ from handsim.files.outputs import atomic_write, make_folder_of
 from handsim.files.signals import signals_wait
 
 GROWING_SUFFIX: Final = ".part"
-"""Added to the name of the archive."""
+"""Suffix that is added to the name of the archive."""
 _MAGIC: Final = b"handsim recording 1\n"
 _SIZE: Final = struct.Struct("<I")
 _BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
 _MARK: Final = b"blk\n"
 _INTERVAL: Final = 0.5  # [s] between two blocks
-_LARGEST_HEADER: Final = 1 << 26  # bytes
-_FULL_FRAMES: Final = 1 << 16  # frames with which a block is written before its time,
-_FULL_POINTS: Final = 1 << 21  # and points; a block of half a second has far fewer
+_MAX_HEADER: Final = 1 << 26  # bytes
+_FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
+_FULL_POINTS: Final = 1 << 21  # points after which a block is written early
 
 
 def growing_path(archive: Path) -> Path:
-    """Where an archive grows until it is finished."""
+    """Path of the growing archive that will become `archive`."""
     return archive.with_name(archive.name + GROWING_SUFFIX)
 
 
@@ -62,14 +61,7 @@ def check_unused(path: Path) -> None:
 
 
 class GrowingArchive(Closing):
-    """Writes an archive while it grows; the end of a `with` block or `close` writes what still waits.
-
-    Args:
-        path: The file, which must not exist; `growing_path` names it.
-        header: The header, as JSON.
-        arrays: The arrays that do not grow, by name.
-        columns: Those that do, with numbers for all letters but T and P.
-    """
+    """Writes a new archive at `growing_path`, which grows by `columns` sized for all letters but T and P."""
 
     def __init__(
         self,
@@ -80,13 +72,13 @@ class GrowingArchive(Closing):
     ) -> None:
         self.path = path
         self._columns = (POINT_COUNTS, *columns)
-        self._waiting: list[list[bytes]] = []  # a frame's entries of each column
+        self._waiting: list[list[bytes]] = []  # each frame's entry of every column
         self._points = self._block = self._written = 0
         self._due = math.inf
         text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
         parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
-        if max(map(len, parts)) > _LARGEST_HEADER:  # it could not be read again
-            raise CaptureError(f"{path}: the settings take more than {_LARGEST_HEADER} bytes")
+        if max(map(len, parts)) > _MAX_HEADER:  # it could not be read again
+            raise CaptureError(f"{path}: the settings take more than {_MAX_HEADER} bytes")
         make_folder_of(path)
         try:
             self._file = open(path, "xb", buffering=0)
@@ -101,7 +93,7 @@ class GrowingArchive(Closing):
         return self._written + len(self._waiting)
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
-        """Add a frame; columns of points have an entry for each of its points."""
+        """Add a frame; a column of points needs an entry for each of `num_points` points."""
         rows: Mapping[str, Any] = {**values, POINT_COUNTS.name: num_points}
         packed = []
         for column in self._columns:
@@ -115,13 +107,13 @@ class GrowingArchive(Closing):
         self.flush_due()
 
     def flush_due(self) -> None:
-        """Write the frames that wait, if they have waited long enough."""
+        """Write the waiting frames if they are many, or half a second old."""
         is_full = len(self._waiting) >= _FULL_FRAMES or self._points >= _FULL_POINTS
         if is_full or time.monotonic() >= self._due:
             self.flush()
 
     def flush(self) -> None:
-        """Write the frames that wait."""
+        """Write the waiting frames as a block."""
         if not self._waiting:
             return
         with signals_wait():  # until the block is whole and counted
@@ -134,7 +126,7 @@ class GrowingArchive(Closing):
             self._block, self._written = self._block + 1, self._written + len(rows)
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
+        """Write the waiting frames, and close the file."""
         try:
             self.flush()
         finally:
@@ -149,14 +141,13 @@ class GrowingArchive(Closing):
 class _Block(NamedTuple):
     """A block of a file."""
 
-    at: int
-    """Where its columns begin [bytes]."""
+    at: int  # offset of its columns [bytes]
     frames: int
     points: int
 
 
 class GrownArchive:
-    """Reads an archive that grew, or still grows, up to its last whole block."""
+    """Reads a growing archive up to its last whole block."""
 
     def __init__(self, path: Path, *, check: bool = True) -> None:
         self.path = path
@@ -165,15 +156,12 @@ class GrownArchive:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise ValueError("not a recording")
             self.header: dict[str, Any] = json.loads(_take_part(file))
-            """The header, as JSON."""
             self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._end = file.tell()
             self._blocks = list(self._scan(file, check))
         self.num_lost_bytes = self._size - self._end
-        """Bytes after the last whole block, which are left out."""
         self.num_frames = sum(block.frames for block in self._blocks)
-        """Number of whole frames."""
 
     def read(self, step: int = 1) -> dict[str, NDArray[Any]]:
         """All arrays, with the frames of every `step`-th block."""
@@ -187,11 +175,11 @@ class GrownArchive:
         return self._joined(column, self._blocks[: int((before < most).sum())])
 
     def step_for(self, most: int) -> int:
-        """The `step` of `read` with which about `most` frames are read."""
+        """The `step` with which `read` returns about `most` frames."""
         return max(1, -(-self.num_frames // most))
 
     def members(self, told: Callable[[], None]) -> Iterator[Member]:
-        """Every array, read block by block; `told` is called after each block."""
+        """Every array, read block by block, with a call of `told` after each block."""
         yield from (Member.of(name, array) for name, array in self._arrays.items())
         num_points = sum(block.points for block in self._blocks)
         for column in self._columns:
@@ -224,13 +212,13 @@ class GrownArchive:
         return np.concatenate([none, *(self._column(column, block) for block in blocks)])
 
     def _parts(self, column: Column, told: Callable[[], None]) -> Iterator[NDArray[Any]]:
-        """A column, block by block."""
+        """Blocks of a column, with a call of `told` after each."""
         for block in self._blocks:
             yield self._column(column, block)
             told()
 
     def _column(self, column: Column, block: _Block) -> NDArray[Any]:
-        """A column of one block as it is in the file."""
+        """A column of one block."""
         at = block.at
         for other in self._columns:
             count = block.points if other.of_points else block.frames
@@ -244,7 +232,7 @@ class GrownArchive:
 
 
 def is_growing(path: Path) -> bool:
-    """Whether a file is an archive that grew and was not finished."""
+    """Whether a file is a growing archive."""
     try:
         with path.open("rb") as file:
             return file.read(len(_MAGIC)) == _MAGIC
@@ -255,7 +243,7 @@ def is_growing(path: Path) -> bool:
 def finish_archive(
     grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
 ) -> None:
-    """Write an archive that grew in its usual form, whole or not at all, and read it back."""
+    """Write a growing archive as an .npz, whole or not at all, and read it back as a check."""
     with atomic_write(path) as temporary:
         write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
         try:
@@ -266,7 +254,7 @@ def finish_archive(
 
 def _take_part(file: io.BufferedReader) -> bytes:
     (size,) = _SIZE.unpack(file.read(_SIZE.size).ljust(_SIZE.size, b"\xff"))
-    if size > _LARGEST_HEADER:
+    if size > _MAX_HEADER:
         raise ValueError("a header that is too large")
     content = file.read(size)
     if len(content) < size:
@@ -281,7 +269,7 @@ def _pack_array(array: NDArray[Any]) -> bytes:
 
 
 def _unpack_array(content: bytes) -> NDArray[Any]:
-    """An array of the .npy format, whose size is that of its bytes; raises a ValueError if it is not."""
+    """An array from bytes of the .npy format; a `ValueError` unless the sizes agree."""
     buffer = io.BytesIO(content)
     check_npy_header(buffer, len(content))
     buffer.seek(0)
@@ -296,7 +284,7 @@ def _column(stored: Mapping[str, Any]) -> Column:
     if (
         leading not in ("T", "P")
         or np.dtype(column.dtype).hasobject
-        or not 0 <= column.size <= _LARGEST_HEADER
+        or not 0 <= column.size <= _MAX_HEADER
         or min(column.entry, default=0) < 0
     ):
         raise ValueError("a column of no size")
@@ -306,11 +294,10 @@ def _column(stored: Mapping[str, Any]) -> Column:
 Content = TypeVar("Content")
 
 SCHEMA: Final = 4
-"""Version of the form of takes. Until 3 points were tables, until 2 simulated and tracked takes differed."""
+"""Version of the files of takes. Points were tables until 3; simulated and tracked takes differed until 2."""
 _READABLE: Final = (3, SCHEMA)
-"""Versions that are read."""
 _KINDS: Final = ("take", "tracked take")
-"""Kinds in headers: the first of takes, the other of takes as trackers wrote them before schema 3."""
+"""Kinds in headers; trackers wrote the second one before schema 3."""
 _DAMAGE: Final = (
     HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RuntimeError,
     SyntaxError,
@@ -323,7 +310,7 @@ class CutOffWarning(HandSimWarning):
 
 
 def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays and a header."""
+    """Write arrays and a header as an .npz, whole or not at all."""
     with atomic_write(path) as temporary:
         every = {"header": np.array(json.dumps(dict(header))), **arrays}
         write_npz(temporary, (Member.of(name, array) for name, array in every.items()))
@@ -332,10 +319,7 @@ def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np
 def read_archive(
     path: str | Path, unpack: Callable[[dict[str, Any], dict[str, np.ndarray]], Content]
 ) -> Content:
-    """Read what `write_archive` wrote, or what has been recorded of it until now.
-
-    `unpack` makes the content from header and arrays; an exception means that they are damaged.
-    """
+    """Read an archive, finished or growing; an exception of `unpack` means that it is damaged."""
     path = Path(path)
     header, arrays = _read(path)
     kind, schema = header.get("kind", _KINDS[0]), header.get("schema")
@@ -355,7 +339,7 @@ def read_archive(
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays."""
+    """Header and arrays of an archive."""
     check_regular(path, error=CaptureError)
     if is_growing(path):
         return _read_cut_off(path)
@@ -382,7 +366,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _read_cut_off(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a recording that was not finished."""
+    """Header and arrays of a growing archive."""
     try:
         grown = GrownArchive(path)
         arrays = grown.read()

@@ -27,16 +27,16 @@ from handsim.hand.shape import HAND_DTYPE, NUM_JOINTS, NUM_KEYPOINTS, NUM_QPOS
 
 
 class Status(IntEnum):
-    """How far the pose of a hand or a rigid body can be relied on; `str` gives its word."""
+    """State of the pose of a hand or a rigid body; `str` gives its word."""
 
     LOST = 0
     """There is no pose."""
     COASTING = 1
-    """Too few markers are visible: the pose is the predicted one; it is given for a few frames only."""
+    """Too few markers are visible; the pose is predicted, for a few frames only."""
     INITIALIZED = 2
     """The pose was initialized from the points, without history; its word is "found"."""
     TRACKED = 3
-    """The pose continues that of the frame before."""
+    """The pose was tracked from the previous frame."""
 
     def __str__(self) -> str:
         return "found" if self is Status.INITIALIZED else self.name.lower()
@@ -48,7 +48,6 @@ class Column(NamedTuple):
     name: str
     dtype: str
     shape: tuple[str | int, ...]
-    """Letters and numbers."""
 
     @property
     def of_points(self) -> bool:
@@ -57,12 +56,12 @@ class Column(NamedTuple):
 
     @property
     def entry(self) -> tuple[int, ...]:
-        """Shape of one entry of a frame, or of a point; all its letters must have been given numbers."""
+        """Shape of one entry of a frame or a point, after `sized`."""
         return tuple(int(size) for size in self.shape[1:])
 
     @property
     def missing(self) -> float:
-        """What stands for no entry: NaN among numbers, -1 among IDs and labels."""
+        """The value of a missing entry: NaN for numbers, -1 for IDs and labels."""
         return np.nan if np.dtype(self.dtype).kind == "f" else -1
 
     @property
@@ -71,7 +70,7 @@ class Column(NamedTuple):
         return np.dtype(self.dtype).itemsize * math.prod(self.entry)
 
     def sized(self, sizes: Mapping[str, int]) -> Column:
-        """The same with numbers in the place of letters."""
+        """The column with letters of its shape replaced by numbers."""
         return self._replace(shape=tuple(sizes.get(str(size), size) for size in self.shape))
 
 
@@ -84,46 +83,43 @@ FRAMES: Final = (
     Column("body_status", "|i1", ("T", "B")),
     Column("body_rms", "<f8", ("T", "B")),
 )
-"""The fields of a take with a row a frame."""
+"""Fields of a take with one row per frame."""
 POINTS: Final = (
     Column("points", "<f8", ("P", 3)),
     Column("ids", "<i4", ("P",)),
     Column("labels", "<i2", ("P",)),
     Column("confidence", "<f8", ("P",)),
 )
-"""What is kept of each point."""
+"""Arrays of a take with one entry per point."""
 POINT_COUNTS: Final = Column("point_counts", "<u4", ("T",))
-"""How many points each frame has: where its points begin in the arrays of points."""
+"""Number of points of each frame."""
 POINT_COLUMNS: Final = Column("point_columns", "<i4", ("P",))
-"""The column of a capture that each point is from; the points of a stream have none."""
+"""Column of each point in its capture; points of a stream have none."""
 NUMBERS: Final = Column("numbers", "<i8", ("T",))
-"""The numbers of streamed frames; a take of anything else has none."""
+"""Frame numbers of a stream; other takes have none."""
 SPREADS: Final = (
     Column("angle_spread", "<f4", ("T", "H", NUM_JOINTS)),
     Column("keypoint_spread", "<f4", ("T", "H", NUM_KEYPOINTS)),
 )
-"""Standard deviations of tracked poses; a truth, and a take of an older version, has none."""
+"""Standard deviations of tracked poses; simulated takes and takes of older versions have none."""
 OPTIONAL: Final = (NUMBERS, *SPREADS)
-"""Fields with a row a frame that a take may lack."""
+"""Fields with one row per frame that a take may lack."""
 KEYPOINTS: Final = Column("keypoints", "<f8", ("T", "H", NUM_KEYPOINTS, 3))
-"""Joint positions, for programs without a model of the hand: written, and not read, as poses give them."""
+"""Joint positions for programs without a model of the hand; `load_take` ignores them."""
 ATTACHMENT: Final = (
     Column("attachment_points", "<f8", ("M", 3)),
     Column("attachment_normals", "<f8", ("M", 3)),
     Column("attachment_bone_indices", "<i8", ("M", 4)),
     Column("attachment_bone_weights", "<f8", ("M", 4)),
 )
-"""The gloves on the hands, one after another."""
+"""Attachments of the gloves, one glove after another."""
 BODY_MARKERS: Final = Column("body_markers", "<f8", ("Q", 3))
-_HANDS: Final = "hands"
-WORN: Final = (*ATTACHMENT, BODY_MARKERS)
-"""What does not change from frame to frame, beside the `hands`, which are records."""
-STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *WORN)
-"""All that every file holds, beside the hands."""
+STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *ATTACHMENT, BODY_MARKERS)
+"""The arrays that every file holds, besides the records of the hands."""
 
 
 def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
-    """Values as an array of a column's type, of these sizes by letter."""
+    """Values as an array of a column's type, after a check of its shape (`sizes` by letter) and range."""
     array, dtype = np.asarray(values), np.dtype(column.dtype)
     expected = column.sized(sizes).shape
     if array.shape != expected:
@@ -144,17 +140,16 @@ def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArr
 
 def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -> None:
     """Raise a `ValueError` unless a file's arrays have the types and shapes of the table."""
-    columns = [*STORED, *(column for column in (*OPTIONAL, POINT_COLUMNS) if column.name in arrays)]
-    if arrays[_HANDS].dtype != HAND_DTYPE or arrays[_HANDS].shape != (sizes["H"],):
+    if arrays["hands"].dtype != HAND_DTYPE or arrays["hands"].shape != (sizes["H"],):
         raise ValueError("the hands are of another type")
-    for column in columns:
+    for column in (*STORED, *(one for one in (*OPTIONAL, POINT_COLUMNS) if one.name in arrays)):
         array = arrays[column.name]
         if array.dtype != column.dtype or array.shape != column.sized(sizes).shape:
             raise ValueError(f"{column.name} is of type {array.dtype} and shape {array.shape}")
 
 
 def spans(counts: Sequence[int]) -> tuple[range, ...]:
-    """The numbers of each of several groups, counted through all of them."""
+    """Index ranges of consecutive groups of these sizes."""
     bounds = np.cumsum([0, *counts]).tolist()
     return tuple(range(low, high) for low, high in itertools.pairwise(bounds))
 
@@ -203,14 +198,13 @@ class PointList:
         labels: Int[np.ndarray, "P"],
         confidence: Float[np.ndarray, "P"],
     ) -> Self:
-        """The points of a stream: those of a frame fill its first columns, as they arrived."""
-        return cls(
-            counts, points, ids, labels, confidence, _arrival_order(counts), int(counts.max(initial=0))
-        )
+        """The points of a stream, which fill the first columns of their frame in the order of arrival."""
+        order, num_columns = _arrival_order(counts), int(counts.max(initial=0))
+        return cls(counts, points, ids, labels, confidence, order, num_columns)
 
     @classmethod
     def of_tables(cls, points: ArrayLike, ids: ArrayLike, labels: ArrayLike, confidence: ArrayLike) -> Self:
-        """The points of tables (T, N, 3) and (T, N); there is none where its position is NaN.
+        """The points of tables (T, N, 3) and (T, N), without those whose position is NaN.
 
         Raises:
             ValueError: The tables do not fit together, or hold what they cannot.
@@ -229,7 +223,7 @@ class PointList:
 
     @cached_property
     def starts(self) -> Int[np.ndarray, "T+1"]:
-        """The first point of each frame, and the number of points."""
+        """Index of the first point of each frame, and the number of points."""
         return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
 
     @cached_property
@@ -245,10 +239,7 @@ class PointList:
 
     @cached_property
     def tables(self) -> dict[str, NDArray[Any]]:
-        """Tables (T, N, ...) of the points, IDs, labels and confidences; NaN or -1 where there is no point.
-
-        They cannot be written to.
-        """
+        """Read-only tables (T, N, ...) of points, IDs, labels and confidences; NaN or -1 without a point."""
         tables = {column.name: self.table(getattr(self, column.name), column.missing) for column in POINTS}
         for table in tables.values():
             table.flags.writeable = False
@@ -261,14 +252,14 @@ class PointList:
         return table
 
     def of(self, frame: int | np.integer[Any]) -> slice:
-        """Which points belong to a frame."""
+        """Slice of the points of a frame."""
         return slice(int(self.starts[frame]), int(self.starts[frame + 1]))
 
     def at(self, frame: int, column: int) -> int:
-        """The point of a frame in a column of the tables.
+        """Index of the point in a frame and a column of the tables.
 
         Raises:
-            IndexError: There is none.
+            IndexError: The column has no point in this frame.
         """
         part = self.of(frame)
         found: int = part.start + int(np.searchsorted(self.columns[part], column))
@@ -280,7 +271,7 @@ class PointList:
         """The points with these labels [m], in the order of the labels; NaN where there is none.
 
         Args:
-            of: Labels that follow one another.
+            of: A range of labels.
             frames: Increasing numbers of frames; all when None.
         """
         which = np.flatnonzero((self.labels >= of.start) & (self.labels < of.stop))
@@ -294,19 +285,19 @@ class PointList:
         return markers
 
     def cut(self, first: int, last: int) -> PointList:
-        """The points of the frames from `first` to `last`, the latter not included."""
+        """The points of the frames from `first` up to, not including, `last`."""
         part = slice(int(self.starts[first]), int(self.starts[last]))
         entries = {name: getattr(self, name)[part] for name in _PER_POINT}
         return dataclasses.replace(self, counts=self.counts[first:last], **entries)
 
     def without(self, gone: NDArray[np.bool_]) -> PointList:
-        """The points but for some (P,); the others keep their columns."""
+        """The points without those that are `gone` (P,); the others keep their columns."""
         counts = np.bincount(self.frames[~gone], minlength=len(self.counts))
         entries = {name: getattr(self, name)[~gone] for name in _PER_POINT}
         return dataclasses.replace(self, counts=counts, **entries)
 
     def stored(self) -> tuple[dict[str, NDArray[Any]], int | None]:
-        """The arrays of a file and the number of columns; points of a stream have no columns there."""
+        """The arrays of a file, and the number of columns, which is None for points of a stream."""
         arrays = {POINT_COUNTS.name: self.counts}
         arrays |= {column.name: getattr(self, column.name) for column in POINTS}
         if self.is_in_order:

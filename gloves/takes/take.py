@@ -31,7 +31,6 @@ from gloves.takes.points import (
     POINT_COLUMNS,
     POINT_COUNTS,
     POINTS,
-    SPREADS,
     Column,
     PointList,
     Status,
@@ -82,13 +81,13 @@ class MotionFormat(NamedTuple):
 
     write: Callable[[Path, Motion, UpAxis], None]
     without_pose: str
-    """What a hand without a pose is in it."""
+    """How a hand without a pose is written, in words."""
     steady: bool = False
-    """Whether its frames have no times of their own, and must come at a steady rate."""
+    """Whether frames are written without times, so that they must come at a steady rate."""
 
 
 def motion_format(path: Path) -> MotionFormat:
-    """The format that the end of a name says."""
+    """The format of a file, by the ending of its name."""
     for ending, form in MOTION_FORMATS.items():
         if path.name.lower().endswith(ending):
             return form
@@ -97,8 +96,7 @@ def motion_format(path: Path) -> MotionFormat:
 
 
 def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
-    """The keypoints of all hands as markers, in the take's axes, so that they lie among its markers."""
-    del up
+    """Write the keypoints of all hands as markers, in the take's own axes whatever `up` is."""
     positions, names = [], []
     for hand in motion.hands:
         keypoints = hand_keypoints(hand.model, hand.qpos)
@@ -118,22 +116,20 @@ MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".mot": MotionFormat(write_mot, "NaN"),
     OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
 }
-"""The formats, by the ends of names."""
-
-
+"""The formats, by the endings of file names."""
 SUFFIX: Final = ".truth.npz"
-"""How the names of simulated takes end that lie beside their captures."""
+"""Ending of the name of a simulated take that lies beside its capture."""
 STATUSES: Final = tuple(map(str, Status))
 """Words of the status numbers, as files hold them; only a lost hand has no pose."""
 LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
-"""Frames of a stream that its rate is measured on."""
-_LARGEST: Final = 1e9  # [m], of anything
-_LATEST: Final = 1e12  # [s], and the rate [Hz]; clocks of computers count 2e9 s
-_UNIT_LENGTH: Final = 1e-2  # by which the length of a quaternion may differ; our own files have 1e-6
+"""Number of frames of a stream that its rate is measured on."""
+_MAX_LENGTH: Final = 1e9  # [m]
+_MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
+_QUATERNION_TOLERANCE: Final = 1e-2  # of the unit length; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
-_MOST_LEARNED: Final = 2000  # frames that biases are learned from
-_FEWEST_LEARNED: Final = 30  # frames with a marker from which its bias is learned
+_MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
+_MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +156,7 @@ class RigidBody:
 
     @property
     def shape(self) -> RigidObject | None:
-        """Its surface, if it is an object that comes with handsim; of others only markers are known."""
+        """Its surface if it is an object that comes with handsim, else None."""
         return named_object(self.name) if self.name in object_names() else None
 
 
@@ -168,20 +164,21 @@ class RigidBody:
 class Take:
     """Hands in motion and labeled points: T frames, H hands, N columns of points, B rigid bodies.
 
-    A label counts through the markers of the hands, in their order, then those of the bodies; -1 is a point
-    of none of them (a ghost), or no point at all. `of_truth`, `of_poses` and `of_frames` make takes of less.
+    Labels number the markers of all hands, in the order of `hands`, then those of the bodies. The label -1
+    marks a ghost (a point of no marker), or no point at all. `of_truth`, `of_poses` and `of_frames` build
+    takes from fewer arrays.
 
-    The points are kept in `point_list`. `points`, `ids`, `labels` and `confidence` are tables of them, made
-    when they are first asked for; the tables may be given in the place of the list, or to replace some of its
-    entries (`dataclasses.replace(take, labels=...)`).
+    The points are kept in `point_list`. `points`, `ids`, `labels` and `confidence` are tables of them, built
+    on first use; these tables may be given instead of the list, or to replace some of its entries
+    (`dataclasses.replace(take, labels=...)`).
 
     Raises:
-        ArgumentError: The arrays do not fit together, or hold what they cannot; a method is asked for a hand
+        ArgumentError: The arrays do not fit together, or a value is out of range; a method is given a hand
             that is not in the take.
     """
 
     rate: float
-    """Frames per second [Hz]; of a stream, the usual one."""
+    """Frames per second [Hz]; for a stream, the median rate."""
     times: Float[np.ndarray, "T"]
     """Time of each frame [s], increasing."""
     hands: tuple[GloveFit, ...]
@@ -203,13 +200,13 @@ class Take:
     body_rms: Float[np.ndarray, "T B"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     settings: dict[str, Any]
-    """Settings that made it, as JSON; of a stream, also how many frames are missing and were left out."""
+    """Settings that made it, as JSON; for a stream, also the numbers of missing and of left-out frames."""
     numbers: Int[np.ndarray, "T"] | None = None
     """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
     angle_spread: Float[np.ndarray, "T H 20"] | None = None
-    """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if it is not known."""
+    """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if unknown."""
     keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
-    """Standard deviation of each keypoint in each direction [m]; NaN and None as of the angles."""
+    """Standard deviation of each keypoint per axis [m]; NaN where a hand has no pose, None if unknown."""
 
     def __init__(
         self,
@@ -299,8 +296,8 @@ class Take:
 
         Args:
             hands: The hands with their gloves as worn.
-            qpos: Their poses; NaN where one is not there.
-            points: What was seen of them, in the world [m].
+            qpos: Their poses; NaN where a hand has none.
+            points: The observed points in the world [m].
             ids: The system's ID of each point.
             labels: True label of each point, -1 for a ghost.
             rate: Frames per second [Hz].
@@ -347,11 +344,11 @@ class Take:
         body_poses: Float[np.ndarray, "T B 7"] | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> Self:
-        """A take of poses alone, of which nothing was seen.
+        """A take of poses alone, without points.
 
         Args:
             hands: The hands with their gloves as worn.
-            qpos: Their poses; NaN where one is not there.
+            qpos: Their poses; NaN where a hand has none.
             rate: Frames per second [Hz].
             times: Time of each frame [s]; at the steady rate from 0 when not given.
             bodies: Rigid bodies.
@@ -381,12 +378,12 @@ class Take:
         """A take of frames that were tracked one by one.
 
         Args:
-            frames: By the names of a take's arrays (`gloves.takes.points.FRAMES` and `numbers`), the entries
-                of each frame; those of points for the points that it has.
+            frames: The entries of each frame in a take's arrays, by name (`FRAMES`, `POINTS` and `numbers` of
+                `gloves.takes.points`).
             hands: The hands.
             bodies: The rigid bodies.
-            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
-                rate is the median one.
+            capture: The capture of these frames, whose columns and rate are kept; None for a stream, which
+                gets its median rate.
             settings: What made it, as JSON.
 
         Raises:
@@ -419,7 +416,7 @@ class Take:
 
     @property
     def made_by_tracker(self) -> bool:
-        """Whether a tracker made it, whose labels may be wrong; its settings are among those of the take."""
+        """Whether a tracker made the take, so that labels may be wrong."""
         return "tracker" in self.settings
 
     @property
@@ -439,9 +436,8 @@ class Take:
         return dict(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
 
     def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
-        """In which frames a hand's pose follows from the points; it coasts or is lost in the others."""
-        tracked: NDArray[np.bool_] = self.status[:, self.hand_index(side)] >= INITIALIZED
-        return tracked
+        """Frames in which a hand's pose follows from the points; in the others it coasts or is lost."""
+        return np.asarray(self.status[:, self.hand_index(side)] >= INITIALIZED)
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -474,20 +470,25 @@ class Take:
         """The markers of a hand or a body that were seen [m], NaN for the others.
 
         Args:
-            of: A hand's side, a body's name, or any labels that follow one another.
+            of: A hand's side, a body's name, or a range of labels.
         """
-        return self.point_list.labeled(of if isinstance(of, range) else self._labels_of(of))
+        if isinstance(of, range):
+            return self.point_list.labeled(of)
+        names = [*self.sides, *(body.name for body in self.bodies)]
+        check_choice(of, names, noun="hand or body")
+        counts = [hand.layout.num_markers for hand in self.hands]
+        labels = spans([*counts, *(len(body.marker_names) for body in self.bodies)])
+        return self.point_list.labeled(labels[names.index(of)])
 
     def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
-        """Which markers of a hand were not seen, in frames with a pose, from which they can be filled in."""
-        seen = np.isfinite(self.observed(side)[..., 0])
-        filled: NDArray[np.bool_] = ~seen & (self.status[:, self.hand_index(side)] != LOST)[:, None]
-        return filled
+        """Markers of a hand that were not seen in a frame with a pose, which `markers` fills in."""
+        missing = np.isnan(self.observed(side)[..., 0])
+        return np.asarray(missing & (self.status[:, self.hand_index(side)] != LOST)[:, None])
 
     def markers(self, side: Side) -> Float[np.ndarray, "T M 3"]:
-        """The markers of a hand [m] as seen, or from the pose where they were not; NaN where it has no pose.
+        """The markers of a hand [m]: seen, or else computed from the pose; NaN where the hand has no pose.
 
-        Gloves slip: a marker that is filled in is shifted by its `marker_bias`.
+        Gloves slip: a marker that is computed from the pose is shifted by its `marker_bias`.
         """
         number, markers = self.hand_index(side), self.observed(side)
         there = self.status[:, number] != LOST
@@ -500,7 +501,7 @@ class Take:
     def pose_markers(
         self, side: Side, frames: Int[np.ndarray, "F"] | None = None
     ) -> Float[np.ndarray, "F M 3"]:
-        """Where a hand's pose has its markers [m], shifted by their `marker_bias`; NaN where it has no pose.
+        """A hand's markers computed from its pose [m], shifted by `marker_bias`; NaN without a pose.
 
         Args:
             side: The hand.
@@ -520,41 +521,40 @@ class Take:
         return markers
 
     def marker_bias(self, side: Side) -> Float[np.ndarray, "M 3"]:
-        """How far each marker of a hand sits from where its glove has it, in the frame of its bone [m].
+        """Median offset of each marker of a hand from its place on the glove, in the frame of its bone [m].
 
         It is learned from the frames whose pose was fitted to points; 0 where these are few. A tracker
-        fits poses to markers that are shifted by this; so must be what stands between its poses.
+        fits poses to markers with these offsets, so markers computed from its poses need them too.
         """
         number = self.hand_index(side)
         worn, qpos = self.hands[number], self.qpos[:, number]
         fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
-        fits = fits[:: -(-len(fits) // _MOST_LEARNED) or 1]
+        fits = fits[:: -(-len(fits) // _MAX_BIAS_FRAMES) or 1]
         bias = np.zeros((worn.layout.num_markers, 3))
-        if len(fits) < _FEWEST_LEARNED:
+        if len(fits) < _MIN_BIAS_FRAMES:
             return bias
         seen = self.point_list.labeled(self.hand_labels[number], fits)
         rotations = worn.model.forward_kinematics(qpos[fits])[:, worn.attachment.main_bones, :3, :3]
         local = np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos[fits])[0] - seen)
-        enough = np.isfinite(local[..., 0]).sum(axis=0) >= _FEWEST_LEARNED
+        enough = np.isfinite(local[..., 0]).sum(axis=0) >= _MIN_BIAS_FRAMES
         bias[enough] = np.nanmedian(local[:, enough], axis=0)
         return bias
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
-        """Which markers of all hands have a point in each frame."""
-        present: NDArray[np.bool_] = np.isfinite(self.observed(range(self.hand_labels[-1].stop))[..., 0])
-        return present
+        """Whether each marker of all hands has a point in each frame."""
+        return np.asarray(np.isfinite(self.observed(range(self.hand_labels[-1].stop))[..., 0]))
 
     def keypoints(self) -> Float[np.ndarray, "T H 21 3"]:
-        """The wrist, the joints and the tips of the hands in the world [m]; NaN where one has no pose.
+        """Wrists, joints and fingertips in the world [m], named as in `handsim.hand.model.KEYPOINT_NAMES`.
 
-        Their names are `handsim.hand.model.KEYPOINT_NAMES`.
+        They are NaN where a hand has no pose.
         """
         return keypoints_of(self.hands, self.qpos)
 
     def motion(self, side: Side) -> HandMotion:
-        """The motion of a hand without gaps: where it is lost, linear from the pose before to the pose after.
+        """The motion of a hand, with linear interpolation over the frames where it is lost.
 
-        It keeps its first pose before it and its last pose after it; `status` tells which frames are filled.
+        Before the first pose and after the last one the hand rests; `status` tells which frames are filled.
 
         Raises:
             ArgumentError: The hand is not in the take, or has no pose in any frame.
@@ -565,10 +565,10 @@ class Take:
         return bridge_gaps(self.times, qpos, self.rate)
 
     def poses_alone(self, rate: float | None = None) -> Take:
-        """The hands and bodies that have a pose in some frame, without points; at another rate if given.
+        """The hands and bodies that have a pose in some frame, without points, resampled if a rate is given.
 
-        Between two frames positions and angles are linear, and rotations take the shortest way. There is no
-        pose where a frame beside it has none, or where these are more than a tenth of a second apart.
+        Positions and angles are interpolated linearly, rotations along the shortest way. There is no pose
+        between two frames of which one has none, or which are more than a tenth of a second apart.
 
         Args:
             rate: Frames per second [Hz].
@@ -605,11 +605,11 @@ class Take:
         return Capture(names, self.points, self.rate)
 
     def labeled_capture(self, *, sides: bool = True) -> Capture:
-        """The points with labels, for `write_capture`: one column per marker, then those of the other points.
+        """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
         Args:
-            sides: Whether columns have names with their hand, `right:ThumbTip`; without it they are those of
-                one hand, `ThumbTip`, and no frame may hold two.
+            sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
+                `ThumbTip`, and no frame may hold two hands.
 
         Raises:
             CaptureError: There are no points.
@@ -623,7 +623,7 @@ class Take:
         return labeled_columns(frames, rows, names, self.rate)
 
     def without_body(self) -> Take:
-        """The take without its bodies and their points, which many optical systems track themselves."""
+        """The take without rigid bodies and their points; many optical systems track bodies themselves."""
         return dataclasses.replace(
             self,
             point_list=self.point_list.without(self.point_list.labels >= self.hand_labels[-1].stop),
@@ -634,10 +634,10 @@ class Take:
         )
 
     def cut(self, first: int, last: int) -> Take:
-        """The frames from `first` to `last`, the latter not included; times go on where they are.
+        """The frames from `first` up to, not including, `last`, with their times.
 
         Raises:
-            ArgumentError: They are no part of the take.
+            ArgumentError: The take does not have these frames.
         """
         if not 0 <= first < last <= self.num_frames:
             raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
@@ -645,7 +645,7 @@ class Take:
         return dataclasses.replace(self, **parts, point_list=self.point_list.cut(first, last))
 
     def export(self, path: str | Path, *, rate: float | None = None, up: UpAxis = "z") -> None:
-        """Write the motion for other programs, in the format that the name's ending says.
+        """Write the motion for other programs, in a format by the ending of the file name.
 
         Args:
             path: A .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint angles and
@@ -654,7 +654,7 @@ class Take:
             up: The axis of the take's world that points up.
 
         Raises:
-            ArgumentError: The ending is another, no hand has a pose, or the rate cannot be.
+            ArgumentError: The ending is unknown, no hand has a pose, or the rate is out of range.
             HandSimError: A package that the format needs is not installed.
             OSError: The file cannot be written.
         """
@@ -667,38 +667,30 @@ class Take:
         form.write(path, posed_motion(motion), up)
 
     def save(self, path: str | Path) -> None:
-        """Write the take (.npz), whole or not at all; `load_take` gives the same numbers again.
+        """Write the take as an .npz file, whole or not at all, which `load_take` reads.
 
         The file also holds `keypoints`, for programs that have no model of the hand.
 
         Raises:
-            ArgumentError: The ending is another.
+            ArgumentError: The name does not end in .npz.
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
         check_ending(Path(path), ".npz", option="path")
-        arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
         points, num_columns = self.point_list.stored()
-        arrays |= points
+        arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())} | points
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
         header["num_columns"] = num_columns
         write_archive(Path(path), header, arrays)
 
     def _known(self) -> tuple[Column, ...]:
-        """The optional columns that it has."""
+        """The optional columns of this take."""
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
-
-    def _labels_of(self, name: str) -> range:
-        """The labels of a hand's markers, or of a body's."""
-        names = [*self.sides, *(body.name for body in self.bodies)]
-        check_choice(name, names, noun="hand or body")
-        counts = [hand.layout.num_markers for hand in self.hands]
-        return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
 
 
 def posed_motion(take: Take) -> Motion:
-    """The hands and bodies of a take, each with a pose in one frame at least, as writers take them."""
+    """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     hands = [PosedHand.of(hand.model, take.qpos[:, n]) for n, hand in enumerate(take.hands)]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     return Motion(take.rate, take.times, hands, bodies)
@@ -717,8 +709,8 @@ def load_take(path: str | Path) -> Take:
         Times (T,) [s], poses (T, H, 27) [m, rad], points (T, N, 3) [m] and their labels (T, N).
 
     Raises:
-        ArgumentError: It is no path.
-        CaptureError: No such file, of another kind or schema, or damaged.
+        ArgumentError: `path` is not a path.
+        CaptureError: The file is missing, damaged, or of another kind or schema.
     """
     check_type("path", path, (str, Path), "the path of a take")
     return read_archive(path, unpack_take)
@@ -733,7 +725,7 @@ def label_names(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> tuple
 def keypoints_of(
     hands: Sequence[GloveFit], qpos: Float[np.ndarray, "T H 27"]
 ) -> Float[np.ndarray, "T H 21 3"]:
-    """Keypoints in the world [m] of some poses of each hand; NaN where these are."""
+    """Keypoints in the world [m] of poses of each hand; NaN where a pose is NaN."""
     keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS, 3), np.nan)
     for index, hand in enumerate(hands):
         there = np.isfinite(qpos[:, index, 0])
@@ -742,14 +734,14 @@ def keypoints_of(
 
 
 def usual_rate(times: Float[np.ndarray, "T"]) -> float:
-    """Frames per second of a stream: the median one of its first quarter of an hour."""
+    """Median rate of the first frames of a stream [Hz]."""
     return 1.0 / float(np.median(np.diff(times[:RATED_FRAMES])))
 
 
 def take_header(
     hands: Sequence[GloveFit], bodies: Sequence[RigidBody], rate: float | None, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The header of a file, as JSON; without a rate that of a recording, whose rate is its usual one."""
+    """The header of a file, as JSON; a growing recording has no rate yet."""
     return {
         "kind": "take",
         "schema": SCHEMA,
@@ -764,10 +756,9 @@ def take_header(
 
 
 def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that are no motion: hands, gloves and the bodies' markers."""
-    arrays: dict[str, NDArray[Any]] = {
-        "hands": np.array([pack_hand(hand.shape) for hand in hands], dtype=HAND_DTYPE)
-    }
+    """The arrays of a file that have no frames: hands, gloves and the bodies' markers."""
+    packed = [pack_hand(hand.shape) for hand in hands]
+    arrays: dict[str, NDArray[Any]] = {"hands": np.array(packed, dtype=HAND_DTYPE)}
     for column in ATTACHMENT:
         field = column.name.removeprefix("attachment_")
         parts = [getattr(hand.attachment, field) for hand in hands]
@@ -777,13 +768,16 @@ def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[
 
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take:
-    """A take from the header and the arrays of a file; any exception means that they are damaged."""
+    """Build a take from the header and the arrays of a file; any exception means that the file is damaged."""
     if tuple(header["statuses"]) != STATUSES:
         raise ValueError("other statuses")
     layouts = [stored_layout(layout) for layout in header["layouts"]]
     names = [(stored["name"], names_of(stored["marker_names"])) for stored in header["bodies"]]
     counts = [layout.num_markers for layout in layouts], [len(markers) for _, markers in names]
-    _list_points(header, arrays)
+    if POINT_COUNTS.name not in arrays:  # until schema 3 points were tables
+        tables = {column.name: arrays[column.name] for column in POINTS}
+        listed, header["num_columns"] = PointList.of_tables(**tables).stored()
+        arrays.update(listed)
     sizes = {"T": len(arrays["times"]), "P": len(arrays["ids"]), "H": len(layouts), "B": len(names)}
     check_stored(arrays, sizes | {"M": sum(counts[0]), "Q": sum(counts[1])})
     hands = []
@@ -794,50 +788,38 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         RigidBody(*name, arrays[BODY_MARKERS.name][span.start : span.stop])
         for name, span in zip(names, spans(counts[1]), strict=True)
     )
+    counted, entries = arrays[POINT_COUNTS.name], {column.name: arrays[column.name] for column in POINTS}
+    if header.get("num_columns") is None:  # a stream
+        points = PointList.in_order(counted, **entries)
+    else:
+        columns, num_columns = arrays[POINT_COLUMNS.name], int(header["num_columns"])
+        points = PointList(counted, **entries, columns=columns, num_columns=num_columns)
     return Take(
         rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
         hands=hands,
         bodies=bodies,
         settings=settings_of(header),
-        point_list=_stored_points(header, arrays),
+        point_list=points,
         **{column.name: arrays[column.name] for column in FRAMES},
         **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
 
 
-def _list_points(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Replace the tables of points that files had until schema 3 by a list of points."""
-    if POINT_COUNTS.name not in arrays:
-        tables = {column.name: arrays[column.name] for column in POINTS}
-        points, header["num_columns"] = PointList.of_tables(**tables).stored()
-        arrays.update(points)
-
-
-def _stored_points(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> PointList:
-    """The points of a file, whose arrays have been checked."""
-    counts, entries = arrays[POINT_COUNTS.name], {column.name: arrays[column.name] for column in POINTS}
-    num_columns = header.get("num_columns")  # which a stream does not have
-    if num_columns is None:
-        return PointList.in_order(counts, **entries)
-    columns = arrays[POINT_COLUMNS.name]
-    return PointList(counts, **entries, columns=columns, num_columns=int(num_columns))
-
-
 def _with_tables(points: PointList | None, tables: Mapping[str, ArrayLike | None]) -> PointList:
-    """A list of points with the entries of some tables (T, N, ...), or one made of all tables."""
+    """The list of points after some of its tables (T, N, ...) are replaced, or a list of all tables."""
     given = {name: table for name, table in tables.items() if table is not None}
-    if not given and points is not None:
-        return points
-    return PointList.of_tables(**{**(points.tables if points is not None else {}), **given})
+    if points is None:
+        return PointList.of_tables(**given)
+    return PointList.of_tables(**{**points.tables, **given}) if given else points
 
 
 def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:
-    """Tracked where there is a pose, else lost."""
+    """Status of true poses: tracked where there is a pose, else lost."""
     return np.where(np.isfinite(poses[..., 0]), TRACKED, LOST).astype(np.int8)
 
 
 def _check(take: Take) -> None:
-    """Whether the parts of a take fit together; a `ValueError` says what does not."""
+    """Raise a `ValueError` unless the arrays of a take fit together and are within their ranges."""
     frames = take.num_frames
     if not frames or not take.hands or len(set(take.sides)) < len(take.hands):
         raise ValueError(
@@ -846,37 +828,27 @@ def _check(take: Take) -> None:
     if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
         raise ValueError("the rate is not positive, or times do not increase")
     for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
-        if (
-            not _within(status, 0, len(STATUSES) - 1)
-            or (np.isnan(poses) != (status == LOST)[..., None]).any()
-        ):
+        is_lost = (status == LOST)[..., None]
+        if not _within(status, 0, len(STATUSES) - 1) or (np.isnan(poses) != is_lost).any():
             raise ValueError("a status is unknown, or does not fit its pose")
+        _check_range(poses, -_MAX_LENGTH, _MAX_LENGTH)
+        if (np.abs(np.linalg.norm(poses[..., 3:7], axis=-1) - 1.0) > _QUATERNION_TOLERANCE).any():
+            raise ValueError("an orientation is not a quaternion of unit length")
     points = take.point_list
     if len(points.counts) != frames:
         raise ValueError(f"points of {len(points.counts)} frames, expected {frames}")
-    for values in (take.qpos, take.body_poses, *(body.positions for body in take.bodies)):
-        _check_range(values, -_LARGEST, _LARGEST)
-    for values in (take.rms, take.body_rms):
-        _check_range(values, 0.0, _LARGEST)
-    _check_values(take)
-    if points.points.size and not -_LARGEST <= points.points.min() <= points.points.max() <= _LARGEST:
-        raise ValueError(f"a position is not from {-_LARGEST:g} to {_LARGEST:g}")
+    for body in take.bodies:
+        _check_range(body.positions, -_MAX_LENGTH, _MAX_LENGTH)
+    for distances in (take.rms, take.body_rms, take.angle_spread, take.keypoint_spread):
+        if distances is not None:
+            _check_range(distances, 0.0, _MAX_LENGTH)
+    _check_range(take.times, -_MAX_TIME, _MAX_TIME)
+    _check_range(np.array(take.rate), 1.0 / _MAX_TIME, _MAX_TIME)
+    if not _within(points.points, -_MAX_LENGTH, _MAX_LENGTH):
+        raise ValueError(f"a position is not from {-_MAX_LENGTH:g} to {_MAX_LENGTH:g}")
     _check_range(points.confidence, 0.0, 1.0)
-    for column in SPREADS:
-        if getattr(take, column.name) is not None:
-            _check_range(getattr(take, column.name), 0.0, _LARGEST)
     if not _within(points.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
-
-
-def _check_values(take: Take) -> None:
-    """Raise a `ValueError` for numbers that nothing can be computed with."""
-    _check_range(take.times, -_LATEST, _LATEST)
-    _check_range(np.array(take.rate), 1.0 / _LATEST, _LATEST)
-    for poses in (take.qpos, take.body_poses):
-        lengths = np.linalg.norm(poses[..., 3:7], axis=-1)
-        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
-            raise ValueError("an orientation is not a quaternion of unit length")
 
 
 def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:

@@ -13,7 +13,7 @@ from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.app.output import place_of
 from handsim.app.workers import chosen_workers
 from handsim.hand.shape import SIDES
-from handsim.space.rig import HAND_REACH, ROOM_CENTER, as_rig, distances_to_volume
+from handsim.space.rig import HAND_REACH, ROOM_CENTER, distances_to_volume, load_rig
 from train.data.shards import Dataset
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.generation import make_dataset
@@ -54,7 +54,7 @@ def _report(settings: GenerateSettings, out: Path) -> Path:
         kind: SimulatedKind = (
             "hand-hand" if len(load_layout(settings.glove).sides) == len(SIDES) else "single-hand"
         )
-        rig = as_rig(settings.rig)
+        rig = load_rig(settings.rig)
         if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
             # A small rig stands where the hands of a simulated capture would move.
             return write_dataset_page(out / REPORT, Dataset(out))

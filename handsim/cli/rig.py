@@ -24,7 +24,6 @@ from handsim.space.rig import (
     CameraRig,
     list_rigs,
     load_rig,
-    named_rig,
     rig_description,
 )
 from handsim.space.rig_formats import import_cameras
@@ -67,7 +66,7 @@ _Sides = tuple[float, float, float]
 
 def list_shipped() -> None:
     """List the camera rigs that come with handsim: how many cameras, their pictures, and what they are."""
-    rigs = [(name, named_rig(name)) for name in list_rigs()]
+    rigs = [(name, load_rig(name)) for name in list_rigs()]
     rows = [(name, str(len(rig.cameras)), rig.pictures(), rig_description(name)) for name, rig in rigs]
     print_table([("name", "cameras", "pictures", "description"), *rows], left=4, wraps=True)
     print_line("One of your own: handsim rig new FILE.toml, then handsim rig score FILE.toml.")

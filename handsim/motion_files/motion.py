@@ -1,22 +1,20 @@
-"""What the formats of motion share, and joints of hands as tables, as BVH and as OpenXR's joints.
+"""Motions of hands and things for writers, and joints of hands as tables, as BVH and as OpenXR's joints.
 
-A table .csv or .parquet has a row per frame and hand, a column per number, its unit in its name. Where a hand
-has no pose, its row is there and its numbers are missing: empty in a .csv, null in .parquet. OpenSim's .mot
-has a row per frame, angles in degrees and NaN without a pose.
+A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name.
+Numbers of a hand without a pose are empty in a .csv and null in a .parquet. OpenSim's .mot has a row per
+frame, angles in degrees, and NaN without a pose.
 
 BVH has no unit and no comments, so the root is named `world_cm`: lengths are centimeters, which animation
-programs expect, with y up. Below it stand the palm of each hand and the things, which have positions; every
-other joint has rotations alone. All rotations zero is the flat hand. BVH cannot leave a frame out: a hand
+programs expect, with y up. Its children are the palms of the hands and the things, which have positions; all
+other joints have rotations alone. In the flat hand all rotations are zero. BVH cannot omit a frame, so a hand
 without a pose keeps its last one.
 
-A joint of OpenXR's hand tracking (XR_EXT_hand_tracking) is the near end of the bone that it is named after;
-its -z axis points along that bone to the fingertip, its +y axis out of the back (nail) side, so +x points to
-the right of a hand that lies on its palm. Our bones have x along, z out of the back: OpenXR's x, y and z are
+A joint of OpenXR's hand tracking (XR_EXT_hand_tracking) is the near end of the bone with its name. Its -z
+axis points along that bone to the fingertip, its +y axis out of the back (nail) side: OpenXR's x, y and z are
 our -y, z and -x. Tips have the axes of their last bone. The near ends of the four finger metacarpals, which
-do not move in our hand, are put at 38 percent of the way from the wrist to the knuckle (the carpus of
-Buryanov and Kotiuk); the palm joint is the middle of the middle metacarpal. The world has y up, as OpenXR's
-reference spaces have. Quaternions are xyzw, as in XrQuaternionf. A hand without a pose in a frame is null
-there, as `isActive` would be false.
+do not move in our hand, lie at 38 percent of the way from the wrist to the knuckle (the carpus of Buryanov
+and Kotiuk); the palm joint is the middle of the middle metacarpal. The world has y up, like OpenXR's
+reference spaces, and quaternions are xyzw. A hand without a pose is null.
 """
 
 from __future__ import annotations
@@ -52,12 +50,12 @@ CHILDREN: Final = tuple(
     tuple(number for number, bone in enumerate(BONES) if bone.parent == parent)
     for parent in range(len(BONES))
 )
-"""Indices of the bones that begin at the end of each bone."""
+"""Indices of the children of each bone."""
 _PARENTS: Final = np.array([bone.parent for bone in BONES])
 
 
 class Material(NamedTuple):
-    """What a surface looks like in files with materials."""
+    """The material of a surface."""
 
     name: str
     color: tuple[float, float, float]
@@ -74,9 +72,9 @@ class PosedHand(NamedTuple):
 
     model: HandModel
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose; there is one at least."""
+    """Frames with a pose, at least one."""
     qpos: Float[np.ndarray, "T 27"]
-    """The poses [m, rad]; without one the last pose, and before the first one that."""
+    """Poses [m, rad]; missing ones repeat the last pose, or else the first."""
 
     @property
     def side(self) -> Side:
@@ -95,11 +93,11 @@ class PosedBody(NamedTuple):
 
     name: str
     shape: RigidObject | None
-    """Its surface; None where only its poses are known."""
+    """The surface, None if unknown."""
     present: Bool[np.ndarray, "T"]
-    """The frames with a pose; there is one at least."""
+    """Frames with a pose, at least one."""
     T_world_body: Float[np.ndarray, "T 4 4"]
-    """The poses [m]; without one the last pose, and before the first one that."""
+    """Poses [m]; missing ones repeat the last pose, or else the first."""
 
     @classmethod
     def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
@@ -112,7 +110,7 @@ class Motion(NamedTuple):
     """Hands and rigid bodies, frame by frame."""
 
     rate: float
-    """Frames per second [Hz]; of a stream, the usual one."""
+    """Frames per second [Hz]; for a stream, the median rate."""
     times: Float[np.ndarray, "T"]
     """Time of each frame [s], increasing."""
     hands: Sequence[PosedHand]
@@ -121,37 +119,36 @@ class Motion(NamedTuple):
     @property
     def seconds(self) -> Float[np.ndarray, "T"]:
         """Time since the first frame [s]."""
-        seconds: NDArray[np.float64] = self.times - self.times[0]
-        return seconds
+        return np.asarray(self.times - self.times[0])
 
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
-    """Turns the world into axes with y up, as glTF, BVH and OpenXR have them; x stays."""
+    """Rotation of the world to axes with y up (glTF, BVH, OpenXR), about x."""
     if up == "y":
         return np.eye(3)
     return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
-    """The first frame, and every frame from which on something appears or disappears."""
+    """The first frame, and every frame in which `present` changes."""
     return np.flatnonzero(np.diff(present, prepend=not present[0]))
 
 
 def _held(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Rows, with the last row that is present in the place of each that is not."""
+    """Rows, with each missing row replaced by the last present one, or else by the first."""
     last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
     return values[np.where(last < 0, np.argmax(present), last)]
 
 
 def local_rotations(rotations: Float[np.ndarray, "T L 3 3"]) -> Float[np.ndarray, "T L 3 3"]:
-    """Each bone's orientation in its parent's frame; the palm's stays as it is."""
+    """Each bone's orientation in its parent's frame, and the palm's in the world."""
     local: NDArray[np.float64] = np.swapaxes(rotations[:, _PARENTS], -1, -2) @ rotations
     local[:, PALM] = rotations[:, PALM]
     return local
 
 
 def smooth_quaternions(rotations: Float[np.ndarray, "T *batch 3 3"]) -> Float[np.ndarray, "T *batch 4"]:
-    """Unit wxyz quaternions of rotations over time, with the signs of which neighbors are near."""
+    """Unit wxyz quaternions of rotations over time, without sign flips."""
     quaternions = rotation_quaternions(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 4)
     dots = (quaternions[1:] * quaternions[:-1]).sum(axis=-1, keepdims=True)
     signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0), axis=0)
@@ -159,20 +156,20 @@ def smooth_quaternions(rotations: Float[np.ndarray, "T *batch 3 3"]) -> Float[np
     return quaternions
 
 
-_SHARP: Final = np.cos(np.deg2rad(40.0))
+_SMOOTH_EDGE: Final = np.cos(np.deg2rad(40.0))
 
 
 def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
-    """Outward unit normal at each corner of a face: of the faces there that meet at less than 40 degrees."""
+    """Outward unit normal at each corner of a face, over adjacent faces within 40 degrees of it."""
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     areas = np.cross(second - first, third - first)
     units = _unit(areas)
     count = faces.size
     at = sparse.csr_array((np.ones(count), (np.arange(count), faces.ravel())), shape=(count, len(vertices)))
     one, other = (at @ at.T).nonzero()  # pairs of corners at one vertex
-    near = (units[one // 3] * units[other // 3]).sum(axis=1) > _SHARP
+    near = (units[one // 3] * units[other // 3]).sum(axis=1) > _SMOOTH_EDGE
     near |= one == other  # a face without an area too
     sums = np.zeros((count, 3))
     np.add.at(sums, one[near], areas[other[near] // 3])
@@ -209,14 +206,14 @@ NUMBERS: Final[tuple[str, ...]] = (
     *_QPOS,
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
-"""Columns after `frame`, `time_s` and `hand`: the world's positions and the wrist's quaternion, angles."""
+"""Columns after `frame`, `time_s` and `hand`, with positions in the world."""
 
 
 class JointTable(NamedTuple):
-    """The poses of a table."""
+    """Poses read from a table."""
 
     sides: tuple[Side, ...]
-    """Whose they are, in the order in which the table names the hands first."""
+    """Sides of the hands, in the order of their first rows."""
     times: Float[np.ndarray, "T"]
     """Time of each frame [s]."""
     qpos: Float[np.ndarray, "T H 27"]
@@ -224,7 +221,7 @@ class JointTable(NamedTuple):
 
 
 def read_joint_csv(path: Path) -> JointTable:
-    """The poses in a .csv of `write_joint_csv`, or another with its columns of frame, time, hand and qpos."""
+    """Read a .csv with the columns frame, time, hand and qpos of `write_joint_csv`."""
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:
@@ -246,7 +243,7 @@ def read_joint_csv(path: Path) -> JointTable:
 
 
 def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
-    """Rows of the columns `_FIRST` and `_QPOS` with the numbers of their lines, by frame and hand."""
+    """Poses by frame and hand, from the columns `_FIRST` and `_QPOS` of numbered lines."""
     frames: dict[str, int] = {}
     sides: dict[str, int] = {}
     for number, (frame, _, side, *_) in rows:
@@ -271,7 +268,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as text, UTF-8, with nine digits, in the take's axes whatever `up` is."""
+    """Write the table as text with nine digits, in the take's axes whatever `up` is."""
     hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
     row_format = ",%.9g" * len(NUMBERS)
@@ -336,7 +333,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
-    """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
+    """Wrist position [m], its angles and the joint angles [deg]; NaN without a pose."""
     qpos = hand.qpos
     turns = np.unwrap(body_fixed_angles(quaternion_matrix(qpos[:, 3:7])), axis=0)
     angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
@@ -352,7 +349,7 @@ _POSITIONS: Final = "Xposition Yposition Zposition"
 
 
 def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write hands and things, of a motion at a steady rate; an `OSError` if the file cannot be written."""
+    """Write hands and things of a motion at a steady rate."""
     turn = file_axes(up)
     columns = [np.zeros((len(motion.times), 6))]
     lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
@@ -376,7 +373,7 @@ def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.n
     """Position of the palm [cm] and rotations of all bones [deg] from the flat hand, in the file's order."""
     qpos = hand.qpos
     rest = hand.model.rest_transforms[:, :3, :3]
-    # In BVH all joints have the same axes at rest, here the file's.
+    # in BVH all joints have the axes of the file at rest
     rotations = turn @ hand.model.forward_kinematics(qpos)[..., :3, :3] @ np.swapaxes(rest, -1, -2) @ turn.T
     local = local_rotations(rotations)
     position = _CENTIMETERS * qpos[:, :3] @ turn.T
@@ -384,19 +381,19 @@ def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.n
 
 
 def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
-    """Angles (T, 3) about z, y and x [deg], without jumps from frame to frame."""
+    """Unwrapped angles (T, 3) about z, y and x [deg]."""
     return np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
 
 
 def _order(bone: int) -> Iterator[int]:
-    """Bones in the order of the file: each before its children."""
+    """Bones in the order of the file, each before its children."""
     yield bone
     for child in CHILDREN[bone]:
         yield from _order(child)
 
 
 def _bone_lines(model: HandModel, side: str, bone: int, lay: Float[np.ndarray, "3 3"]) -> list[str]:
-    """A bone and its children; `lay` takes the flat hand from the wrist's frame [m] to the file's [cm]."""
+    """A bone and its children; `lay` maps the wrist's frame [m] to the file's [cm]."""
     rest = model.rest_transforms
     offset = np.zeros(3) if bone == PALM else rest[bone, :3, 3] - rest[BONES[bone].parent, :3, 3]
     lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(_joint(lay @ offset, moves=bone == PALM))]
@@ -448,7 +445,7 @@ _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the joints of all hands as JSON, by custom to a name that ends in `.openxr.json`."""
+    """Write the joints of all hands as JSON."""
     tracks = motion.hands
     header = {
         "format": "XR_EXT_hand_tracking joints by handsim",
@@ -495,7 +492,7 @@ def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.n
 
 
 def joint_radii(model: HandModel) -> Float[np.ndarray, "26"]:
-    """Distance from each joint to the skin [m]: of the digits their girths', elsewhere half the palm."""
+    """Radius of the hand at each joint [m]; in the palm, half its thickness."""
     shape, palm = model.shape, 0.5 * model.shape.palm_thickness
     fingers = [radius for row in shape.radii[1:].tolist() for radius in (palm, *row)]
     return np.array([palm, palm, *shape.radii[0].tolist(), *fingers])

@@ -27,18 +27,17 @@ PINHOLE: Final = 0
 """The kind of a pinhole in `Lens.row`; a Brown lens is 1."""
 _FISHEYE: Final = 2
 _STEP: Final = 1e-5  # [focal lengths] of the central differences of a Jacobian
-_NODES: Final = 1024  # of the table that starts the search
+_NODES: Final = 1024  # of the table of first guesses
 _STEPS: Final = 12  # of Newton's method; three are enough away from a fold
-_SETTLED: Final = 1e-12
-_WIDEST: Final = 1e3  # [focal lengths] that a picture without a fold may extend to: 89.94 degrees
+_CONVERGED: Final = 1e-12  # [focal lengths] largest change of the last step
+_MAX_TANGENT: Final = 1e3  # of rays that a Brown lens without a fold sees: 89.94 degrees
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
     """A lens and its coefficients.
 
-    Where a lens's formula folds back, as with strong barrel distortion, it is not valid: rays beyond the fold
-    have no image point.
+    Strong barrel distortion folds the picture back at some angle; rays beyond this fold have no image point.
 
     Raises:
         ArgumentError: The kind is unknown, or the number of coefficients is wrong, or one is not finite.
@@ -65,13 +64,10 @@ class Lens:
         Returns:
             NaN for directions that the lens does not see: behind a pinhole or Brown lens, and beyond a fold.
         """
-        return self._image_points(directions, self.row)
+        return _distorted_points(self.row, directions)
 
     def jacobian(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 2"]:
-        """How far image points move per tangent of their rays: derivatives of `distort` by x/z and y/z.
-
-        The identity for a pinhole; NaN where the lens does not see.
-        """
+        """Derivatives of `distort` by x/z and y/z; NaN where the lens does not see."""
         rays = np.ascontiguousarray(directions, dtype=np.float64)
         jacobians = np.empty((*rays.shape[:-1], 2, 2))
         _distort_jacobians(self.row, rays.reshape(-1, 3), jacobians.reshape(-1, 4))
@@ -79,17 +75,11 @@ class Lens:
 
     @property
     def row(self) -> Float[np.ndarray, "7"]:
-        """The lens as compiled functions take it: its kind, five coefficients and the radius of its fold."""
+        """The lens for compiled functions: its kind, five coefficients and the radius of its fold."""
         row = np.zeros(7)
         row[0], row[6] = list(_COEFFICIENTS).index(self.kind), self._fold_radius()
         row[1 : 1 + len(self.coefficients)] = self.coefficients
         return row
-
-    def _image_points(self, directions: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-        rays = np.ascontiguousarray(directions, dtype=np.float64)
-        points = np.empty((*rays.shape[:-1], 2))
-        _distort_rays(row, rays.reshape(-1, 3), points.reshape(-1, 2))
-        return points
 
     def undistort(self, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions of the rays of image points, inverse of `distort`; NaN where there is no ray."""
@@ -114,14 +104,14 @@ class Lens:
 
     def _fold_radius(self) -> float:
         """Largest r before the lens folds back: angle [rad] of a fisheye, tangent of a Brown lens."""
-        return _fold_radius(self._radial, np.pi if self.kind == "fisheye" else _WIDEST)
+        return _fold_radius(self._radial, np.pi if self.kind == "fisheye" else _MAX_TANGENT)
 
     def _distorted(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance from the principal point of rays at r."""
         return r * _polynomial(self._radial, r * r)
 
     def _undistorted(self, across: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `_distorted` up to the fold: from a table, then by Newton's method; NaN beyond."""
+        """The inverse of `_distorted` by Newton's method, starting from a table; NaN beyond the fold."""
         most = self._fold_radius()
         finite = across[np.isfinite(across)]
         longest = min(most, 1.0)
@@ -134,7 +124,7 @@ class Lens:
             rate = np.maximum(_polynomial(derivative, r * r), 1e-9)
             step = (self._distorted(r) - across) / rate
             r = np.clip(r - step, 0.0, longest)
-            if np.nanmax(np.abs(step), initial=0.0) < _SETTLED:
+            if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED:
                 break
         return np.where(across <= self._distorted(np.array(longest)), r, np.nan)
 
@@ -142,10 +132,10 @@ class Lens:
         """Image points (*batch, 2) of tangents, beyond the fold too."""
         row = self.row
         row[6] = np.inf
-        return self._image_points(np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1), row)
+        return _distorted_points(row, np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1))
 
     def _undistort_brown(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `_brown`: its radial part, then Newton's method in the plane; NaN where it fails."""
+        """The inverse of `_brown` by Newton's method, starting from its radial part; NaN where it fails."""
         across = np.hypot(points[..., 0], points[..., 1])
         _, _, p1, p2, _ = self.coefficients
         if p1 == 0.0 and p2 == 0.0:
@@ -158,7 +148,7 @@ class Lens:
         for _ in range(_STEPS):
             step = self._newton_step(flat, points)
             flat = flat - step
-            if np.nanmax(np.abs(step), initial=0.0) < _SETTLED:
+            if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED:
                 break
         square = (flat**2).sum(axis=-1)
         residual = np.abs(self._brown(flat) - points).max(axis=-1)
@@ -184,7 +174,7 @@ class Lens:
 
 @kernel
 def distort_ray(lens: Any, x: float, y: float, z: float) -> tuple[float, float]:
-    """The image point of a ray in the axes of the camera [focal lengths]; NaN if the lens sees it not."""
+    """The image point of a ray in the axes of the camera [focal lengths]; NaN if the lens does not see it."""
     if lens[0] == _FISHEYE:
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
@@ -229,6 +219,14 @@ def distort_jacobian(lens: Any, x: float, y: float, z: float) -> tuple[float, fl
     )
 
 
+def _distorted_points(row: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Image points of rays by a row of `Lens.row` [focal lengths]."""
+    rays = np.ascontiguousarray(directions, dtype=np.float64)
+    points = np.empty((*rays.shape[:-1], 2))
+    _distort_rays(row, rays.reshape(-1, 3), points.reshape(-1, 2))
+    return points
+
+
 @kernel
 def _distort_rays(lens: Any, rays: Any, points: Any) -> None:
     for n in range(len(rays)):
@@ -254,23 +252,22 @@ def _fold_radius(radial: tuple[float, ...], most: float) -> float:
     """First r at which r (1 + c0 r^2 + c1 r^4 + ...) stops growing, at most `most`."""
     derivative = [(2 * n + 3) * k for n, k in enumerate(radial)]
     while derivative and abs(derivative[-1]) * most ** (2 * len(derivative)) < 1e-9:
-        derivative.pop()  # they change nothing, and roots of tiny leading terms overflow
+        derivative.pop()  # roots of tiny leading terms overflow
     roots = np.roots([*reversed(derivative), 1.0])
     folds = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1.0)) & (roots.real > 0.0)]
     return min(float(np.sqrt(folds.min())), most) if len(folds) else most
 
 
-_LARGEST: Final = 8192  # [px]
-_NEAREST: Final = 1e-6  # [m] ahead of a camera, from which on it sees
+_MAX_SIZE: Final = 8192  # [px]
+_NEAREST: Final = 1e-6  # [m] least depth of visible points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A calibrated camera, OpenCV axes: x right, y down, z into the picture.
 
-    Pixel coordinates go right and down from the picture's corner, so that the first pixel's center is at
-    (0.5, 0.5); OpenCV's and MuJoCo's own counts begin half a pixel later. Cameras are equal where all their
-    numbers are.
+    Pixel coordinates start at the picture's corner, so the center of the first pixel is at (0.5, 0.5); those
+    of OpenCV and MuJoCo start at this center. Cameras are equal if all their numbers are equal.
 
     Raises:
         ArgumentError: The size is out of range, `K` is not a camera matrix, or the pose is not rigid.
@@ -316,12 +313,12 @@ class Camera:
 
     @property
     def focal_length(self) -> float:
-        """Their geometric mean [px]."""
+        """Geometric mean of the focal lengths [px]."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     @property
     def angles(self) -> tuple[float, float]:
-        """Opening angles across the picture's width and height, without the lens [rad]."""
+        """Fields of view across the picture's width and height, without the lens [rad]."""
         (width, height), (fx, fy), (cx, cy) = self.size, self.focal_lengths, self.K[:2, 2]
         across = np.arctan2(cx, fx) + np.arctan2(width - cx, fx)
         return float(across), float(np.arctan2(cy, fy) + np.arctan2(height - cy, fy))
@@ -342,13 +339,13 @@ class Camera:
         return local
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of world points [m], inside the picture or not [px]; NaN for what the lens cannot see."""
+        """Pixels of world points [m], inside the picture or not [px]; NaN where the lens does not see."""
         normalized = self.lens.distort(self.local(points))
         pixels: NDArray[np.float64] = normalized * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         return pixels
 
     def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Unit directions in the camera's axes of pixels [px]; NaN for those that no ray meets."""
+        """Unit directions of pixels [px] in the camera's axes; NaN for pixels without a ray."""
         return self.lens.undistort((pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]])
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
@@ -377,10 +374,10 @@ def _checked_size(name: str, size: object) -> tuple[int, int]:
     sides = np.asarray(size)
     if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
         raise ArgumentError(f"camera '{name}': size is {size}, expected width and height in whole pixels")
-    if not ((sides >= 1) & (sides <= _LARGEST)).all():
+    if not ((sides >= 1) & (sides <= _MAX_SIZE)).all():
         raise ArgumentError(
             f"camera '{name}' has pictures of {sides[0]} x {sides[1]} pixels, "
-            f"expected 1 to {_LARGEST} each way"
+            f"expected 1 to {_MAX_SIZE} each way"
         )
     return int(sides[0]), int(sides[1])
 
@@ -402,7 +399,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
     """`T_world_camera` of a camera at a position (3,) [m] that looks at a target (3,) [m], upright (world z).
 
     Raises:
-        ArgumentError: One of them is no point, or both are one.
+        ArgumentError: One of them is not a point, or they are equal.
     """
     position, target = check_array("position", position, (3,)), check_array("target", target, (3,))
     distance = np.linalg.norm(target - position)
@@ -419,7 +416,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
 
 
 def focal_of_angle(length: float, angle: float) -> float:
-    """The focal length [px] at which so many pixels span this angle [rad]."""
+    """The focal length [px] at which `length` pixels span an angle [rad]."""
     return float(length / 2 / np.tan(angle / 2))
 
 
@@ -430,20 +427,19 @@ def camera_from_record(record: Mapping[str, Any]) -> Camera:
 
 
 class CameraArrays(NamedTuple):
-    """C cameras as compiled functions take them."""
+    """C cameras for compiled functions."""
 
     T_world_camera: Float[np.ndarray, "C 4 4"]
-    """[m]"""
     intrinsics: Float[np.ndarray, "C 4"]
     """Focal lengths along x and y and the principal point [px]."""
     sizes: Float[np.ndarray, "C 2"]
     """Width and height [px]."""
     lenses: Float[np.ndarray, "C 7"]
-    """`Lens.row` of each."""
+    """`Lens.row` of each camera."""
 
 
 def camera_arrays(cameras: Sequence[Camera]) -> CameraArrays:
-    """The numbers of one camera or more."""
+    """The arrays of some cameras."""
     return CameraArrays(
         np.stack([one.T_world_camera for one in cameras]),
         np.stack([one.K[[0, 1, 0, 1], [0, 1, 2, 2]] for one in cameras]),
@@ -455,7 +451,7 @@ def camera_arrays(cameras: Sequence[Camera]) -> CameraArrays:
 def points_in_view(
     cameras: CameraArrays, points: Float[np.ndarray, "*batch 3"]
 ) -> Bool[np.ndarray, "*batch C"]:
-    """Which cameras have each world point [m] in front of them and inside their pictures."""
+    """Whether each world point [m] is in front of each camera and inside its picture."""
     flat = np.ascontiguousarray(points, dtype=np.float64)
     seen = np.empty((*flat.shape[:-1], len(cameras.sizes)), dtype=np.bool_)
     _points_in_view(cameras, flat.reshape(-1, 3), seen.reshape(-1, len(cameras.sizes)))
@@ -464,9 +460,9 @@ def points_in_view(
 
 @kernel(inline=True)
 def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
-    """Whether a camera has the point (x, y, z) [m], in its axes, in its picture."""
+    """Whether a point (x, y, z) [m] in a camera's axes is inside its picture."""
     u, v = x / z, y / z
-    if lens[0] != PINHOLE:  # the call costs more than all the rest
+    if lens[0] != PINHOLE:  # this call is slow
         u, v = distort_ray(lens, x, y, z)
     u, v = u * inner[0] + inner[2], v * inner[1] + inner[3]
     inside = (u >= 0.0) & (u < size[0]) & (v >= 0.0) & (v < size[1])  # never so for NaN

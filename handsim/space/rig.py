@@ -1,7 +1,7 @@
 """Camera rigs, by name, from a file or as objects, and the TOML file of cameras.
 
-The file is one of a rig that sees markers, or of any cameras that pictures are drawn for. What stands at its
-top holds for every camera whose own table says nothing else (docs/rigs.md).
+A file lists the cameras of a rig that sees markers, or cameras that pictures are drawn for. Keys at its top
+hold for every camera whose own table does not replace them (docs/rigs.md).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice, check_type
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.inputs import (
     check_keys,
@@ -50,20 +50,20 @@ _SIZES: Final = ("size", "resolution")
 _FOCALS: Final = ("focal", "K", "field_of_view", "horizontal_field_of_view")
 _LENS: Final = ("lens", "coefficients")
 _PICTURE: Final = (*_SIZES, *_FOCALS, "center", *_LENS)
-"""Keys that say what a camera's picture is: at the top for all cameras, or a camera's own."""
+"""Keys of a camera's picture: at the top for all cameras, or in a camera's own table."""
 _PLACE: Final = ("position", "target", "T_world_camera")
 _TOP: Final = ("name", "description", *_PICTURE, "camera")
 _CAMERA: Final = ("name", *_PICTURE, *_PLACE)
-_USUAL: Final = 1280  # [px], where a file says nothing
-_WIDEST: Final = 170.0  # [deg]
-_MOST: Final = 256  # cameras
-_FARTHEST: Final = 50.0  # [m]
-_APART: Final = 1e-3  # [m] of a camera and its target
+_DEFAULT_RESOLUTION: Final = 1280  # [px]
+_MAX_FIELD_OF_VIEW: Final = 170.0  # [deg]
+_MAX_FILE_CAMERAS: Final = 256
+_MAX_DISTANCE: Final = 50.0  # [m] from the origin
+_CLOSEST: Final = 1e-3  # [m] from a camera to its target, or to another camera
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 class RigFile(NamedTuple):
-    """What a file says; `CameraRig` checks whether its cameras can be a rig."""
+    """The content of a file, before `CameraRig` checks whether its cameras can be a rig."""
 
     name: str
     description: str
@@ -81,8 +81,8 @@ def read_rig_file(path: Path) -> RigFile:
 
 def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """The cameras of a file, after a check of their number, their names and their distances."""
-    if not 1 <= len(cameras) <= _MOST:
-        raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MOST}")
+    if not 1 <= len(cameras) <= _MAX_FILE_CAMERAS:
+        raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MAX_FILE_CAMERAS}")
     check_names(str(path), cameras)
     for camera in cameras:
         try:
@@ -107,15 +107,15 @@ def check_names(owner: str, cameras: Sequence[Camera]) -> None:
 def check_near(owner: str, camera: Camera) -> None:
     """Refuse a camera beyond 50 m."""
     distance = float(np.linalg.norm(camera.T_world_camera[:3, 3]))
-    if distance > _FARTHEST:
+    if distance > _MAX_DISTANCE:
         raise RigError(
-            f"{owner} stands {distance:.4g} m from the origin, expected at most {_FARTHEST:g} m; "
+            f"{owner} stands {distance:.4g} m from the origin, expected at most {_MAX_DISTANCE:g} m; "
             "are these millimeters? Positions are in meters"
         )
 
 
 def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
-    """The lines of a file, whose numbers are exact; pictures that all cameras share stand at the top."""
+    """The lines of a file, with exact numbers; picture keys that all cameras share stand at the top."""
     pictures = [list(_picture_lines(one)) for one in cameras]
     shared = all(one == pictures[0] for one in pictures)
     lines = [f"name = {quoted(name)}", *(pictures[0] if shared else ())]
@@ -153,18 +153,21 @@ def _parse(table: Mapping[str, Any], stem: str) -> RigFile:
 
 
 def _camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Camera:
-    """A camera, with what its own table says in place of the like at the top."""
+    """A camera, whose own keys replace those at the top."""
     owner = f"camera {number}"
     check_keys(own, owner, _CAMERA, optional=_CAMERA)
     pose = _pose(own, owner)
     given = {key: value for key, value in top.items() if not _replaced(key, own)} | dict(own)
     size = _size(given, f"{owner}: ")
-    K, lens = _matrix(given, size, owner), _lens(given, owner)
+    K = _matrix(given, size, owner)
+    kind = text_of(given, "lens", f"{owner}: ", default="pinhole")
+    coefficients = number_list(f"{owner}: coefficients", given.get("coefficients", []))
+    lens = Lens(cast("LensKind", kind), coefficients)  # which refuses unknown kinds
     return Camera(text_of(own, "name", f"{owner}: ", default=f"camera{number}"), size, K, pose, lens)
 
 
 def _replaced(key: str, own: Mapping[str, Any]) -> bool:
-    """Whether a camera's own keys stand in place of one at the top."""
+    """Whether a camera's own keys replace a key at the top."""
     if key == "center":
         return any(name in own for name in (*_SIZES, "K", "center"))
     return any(key in alike and name in own for alike in (_SIZES, _FOCALS, _LENS) for name in alike)
@@ -175,7 +178,7 @@ def _size(given: Mapping[str, Any], prefix: str) -> tuple[int, int]:
     if "size" in given and "resolution" in given:
         raise RigError(f"{prefix}size and resolution are given, expected one of them")
     if "size" not in given:
-        resolution = given.get("resolution", _USUAL)
+        resolution = given.get("resolution", _DEFAULT_RESOLUTION)
         if isinstance(resolution, bool) or not isinstance(resolution, int):
             raise RigError(f"{prefix}resolution is {shown(resolution)}, expected a whole number of pixels")
         return resolution, resolution
@@ -203,8 +206,8 @@ def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDAr
         focal = np.broadcast_to(focal, 2)
     else:
         degrees = number_of(given, key, prefix)
-        if not 1.0 <= degrees <= _WIDEST:
-            raise RigError(f"{prefix}{key} is {degrees:g} degrees, expected 1 to {_WIDEST:g}")
+        if not 1.0 <= degrees <= _MAX_FIELD_OF_VIEW:
+            raise RigError(f"{prefix}{key} is {degrees:g} degrees, expected 1 to {_MAX_FIELD_OF_VIEW:g}")
         length = min(size) if key == "field_of_view" else size[0]
         focal = np.full(2, focal_of_angle(length, np.deg2rad(degrees)))
     expected = "the principal point [cx, cy] in pixels"
@@ -213,14 +216,8 @@ def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDAr
     return camera_matrix(*focal, *center)
 
 
-def _lens(given: Mapping[str, Any], owner: str) -> Lens:
-    kind = text_of(given, "lens", f"{owner}: ", default="pinhole")
-    coefficients = number_list(f"{owner}: coefficients", given.get("coefficients", []))
-    return Lens(cast("LensKind", kind), coefficients)  # which refuses unknown kinds
-
-
 def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
-    """Where a camera is."""
+    """T_world_camera of a camera's table."""
     place = {key: table[key] for key in _PLACE if key in table}
     if set(place) == {"T_world_camera"}:
         return numbers(
@@ -233,7 +230,7 @@ def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
         numbers(f"{owner}: {key}", place[key], (3,), "three numbers [x, y, z] in meters")
         for key in ("position", "target")
     )
-    if np.linalg.norm(target - position) < _APART:
+    if np.linalg.norm(target - position) < _CLOSEST:
         raise RigError(f"{owner} looks at its own position; expected a target in front of it")
     return look_at(position, target)
 
@@ -244,7 +241,7 @@ MAX_CAMERAS: Final = 32
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
 HAND_REACH: Final = 0.25
-"""No hand reaches further from its wrist [m]; cameras stand at least this far from the wrists' volume."""
+"""Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"
 
 
@@ -255,7 +252,7 @@ class CameraRig:
     Messages count cameras from 1, in the order given. Rigs are equal where their names and cameras are.
 
     Raises:
-        ArgumentError: What is given are no cameras.
+        ArgumentError: `cameras` is not a sequence of cameras.
         RigError: Too few or too many cameras, two of one name or at one position, or one beyond 50 m.
     """
 
@@ -278,7 +275,14 @@ class CameraRig:
         check_names(f"rig '{self.name}'", self.cameras)
         for number, camera in enumerate(self.cameras, 1):
             check_near(f"camera {number} of rig '{self.name}'", camera)
-        _check_apart(self.name, self.positions)
+        gaps = np.linalg.norm(self.positions[:, None] - self.positions, axis=-1)
+        gaps[np.tril_indices(len(gaps))] = np.inf
+        first, second = np.unravel_index(gaps.argmin(), gaps.shape)
+        if gaps[first, second] < _CLOSEST:
+            raise RigError(
+                f"cameras {first + 1} and {second + 1} of rig '{self.name}' stand at one position, "
+                "expected different ones"
+            )
 
     @functools.cached_property
     def arrays(self) -> CameraArrays:
@@ -322,7 +326,7 @@ class CameraRig:
         return f"{' and '.join(sizes)} pixels, {degrees} degrees"
 
     def record(self) -> dict[str, Any]:
-        """The rig as a JSON record, which `as_rig` reads."""
+        """The rig as a JSON record, which `load_rig` reads."""
         return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
 
     def save(self, path: str | Path) -> None:
@@ -345,70 +349,51 @@ def list_rigs() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
-def named_rig(name: str) -> CameraRig:
-    """A rig that comes with the package: `figure5` (sixteen cameras, as in the paper), `eight` or `six`."""
-    return _read(_shipped(name))
-
-
 def rig_description(name: str) -> str:
-    """What a rig that comes with the package is, in one sentence."""
-    return read_rig_file(_shipped(name)).description
+    """One sentence on a rig that comes with the package."""
+    return read_rig_file(_SHIPPED / f"{name}.toml").description
 
 
-def load_rig(rig: CameraRig | str | Path) -> CameraRig:
+def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
     """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
 
     Args:
-        rig: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path; a rig is given back.
+        rig: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, a path, or the record of a rig
+            (`CameraRig.record`); a rig is given back.
 
     Returns:
         The rig, each camera with its pose [m], its intrinsics [px] and its lens.
 
     Raises:
         ArgumentError: It is nothing of these.
-        RigError: No such rig or file, or the file does not describe one; the sentence names the file.
+        RigError: No such rig or file, or the file or record does not describe one; the sentence names the
+            file.
     """
     if isinstance(rig, CameraRig):
         return rig
-    check_type("rig", rig, (str, Path), "a CameraRig, or the name or path of one", list_rigs())
-    if str(rig) in list_rigs():
-        return named_rig(str(rig))
-    path = Path(rig)
+    expected = "a CameraRig, or the name or path of one"
+    check_type("rig", rig, (str, Path, Mapping), expected, list_rigs())
+    if isinstance(rig, Mapping):
+        try:
+            return CameraRig(rig["name"], [camera_from_record(one) for one in rig["cameras"]])
+        except (KeyError, TypeError) as error:
+            raise RigError(
+                f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"
+            ) from error
+    path = _SHIPPED / f"{rig}.toml" if str(rig) in list_rigs() else Path(rig)
     if path.suffix.lower() != ".toml":
         unknown = choices(str(rig), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")
-    return _read(path)
-
-
-def as_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
-    """The rig of whatever stands for one: as `load_rig`, and the record of one (`CameraRig.record`)."""
-    if not isinstance(rig, Mapping):
-        return load_rig(rig)
-    try:
-        return CameraRig(rig["name"], [camera_from_record(one) for one in rig["cameras"]])
-    except (KeyError, TypeError) as error:
-        raise RigError(
-            f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"
-        ) from error
-
-
-def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[str, Any]:
-    """What stands for a rig in settings: its name if it comes with the package, else its cameras."""
-    found = as_rig(rig)
-    return found.name if found.name in list_rigs() and found == named_rig(found.name) else found.record()
-
-
-def _shipped(name: str) -> Path:
-    check_choice(name, list_rigs(), noun="camera rig")
-    return _SHIPPED / f"{name}.toml"
-
-
-def _read(path: Path) -> CameraRig:
     read = read_rig_file(path)
     try:
         return CameraRig(read.name, read.cameras)
     except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
+
+
+def rig_setting(rig: CameraRig) -> str | dict[str, Any]:
+    """The rig in saved settings: its name if it comes with the package, else its record."""
+    return rig.name if rig.name in list_rigs() and rig == load_rig(rig.name) else rig.record()
 
 
 def check_outside(
@@ -442,15 +427,4 @@ def check_outside_volume(rig: CameraRig, center: Float[np.ndarray, "3"], half_si
         raise ArgumentError(
             f"camera {distances.argmin() + 1} of rig '{rig.name}' is {distances.min():.2g} m from the space "
             f"that wrists move in, expected at least {HAND_REACH:g} m"
-        )
-
-
-def _check_apart(name: str, positions: NDArray[np.float64]) -> None:
-    gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    gaps[np.tril_indices(len(gaps))] = np.inf
-    first, second = np.unravel_index(gaps.argmin(), gaps.shape)
-    if gaps[first, second] < _APART:
-        raise RigError(
-            f"cameras {first + 1} and {second + 1} of rig '{name}' stand at one position, "
-            "expected different ones"
         )

@@ -1,22 +1,22 @@
 """Calibrations of cameras as other programs write them: Vicon, Qualisys, Motive, COLMAP and OpenCV.
 
-Vicon's `.xcp` is what Nexus, Shogun, Tracker and Blade keep beside a capture. A `KeyFrame` has the position
-[mm] and the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down,
-z ahead. Radial coefficients straighten measured points: a point at r pixels from the principal point belongs
-at r (1 + k1 r^2 + k2 r^4 + k3 r^6).
+Vicon Nexus, Shogun, Tracker and Blade keep an `.xcp` beside a capture. A `KeyFrame` has the position [mm] and
+the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down, z ahead.
+Radial coefficients undistort points: a point at r pixels from the principal point belongs at
+r (1 + k1 r^2 + k2 r^4 + k3 r^6).
 
-Qualisys' calibration is exported by QTM as XML or text, and sent by its real-time server. `transform` has the
+QTM exports Qualisys' calibration as XML or text, and its real-time server sends it. `transform` has the
 position [mm] and a matrix whose rows are the camera's axes in the world: x right, y up, z backward.
-`intrinsic` counts in 64ths of a pixel of the sensor, v down; its distortion is OpenCV's.
+`intrinsic` is in 64ths of a pixel of the sensor, v down; its distortion is OpenCV's.
 
 OptiTrack Motive's `.mcal`, of Motive 3.2 and newer, is in UTF-16. `Extrinsic` has the position [m] and, row
 by row, the matrix whose columns are the camera's axes in the world: x right, y up, z backward. Motive's world
-has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; that of `Intrinsic` is Motive's own.
+has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; the one of `Intrinsic` is Motive's own.
 
 COLMAP's reconstructions are read as text: `cameras.txt` with the lenses, `images.txt` with the poses.
 
-OpenCV's files are YAML or JSON, of one camera, the two of a stereo pair, or many. Our own few lines read
-them: they are flat tables of numbers, and OpenCV's parser may never come back from a damaged one.
+OpenCV's files are YAML or JSON of one camera, a stereo pair, or many. They are flat tables of numbers, which
+are parsed here because OpenCV's parser may never return from a damaged file.
 """
 
 from __future__ import annotations
@@ -44,25 +44,24 @@ from handsim.space.camera import Camera, Lens, camera_matrix
 from handsim.space.rig import checked_cameras, read_rig_file
 from handsim.space.transforms import quaternion_matrix, vector_quaternions
 
-_LARGEST: Final = 1e9  # in any unit
-_SKEWED: Final = 1e-3  # of a rotation in a file of few digits
+_MAX_VALUE: Final = 1e9  # of a number in any unit
+_ROTATION_TOLERANCE: Final = 1e-3  # deviation of a rounded matrix from a rotation
 _NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
-_LONGEST_NAME: Final = 56
+_MAX_NAME: Final = 56  # characters
 
 
 class LabCamera(NamedTuple):
-    """A camera of a calibration."""
+    """A camera, with its pose in the calibration's world [m]."""
 
     camera: Camera
-    """With its size and lens [px] and its pose in the calibration's world [m]."""
     video: bool = False
     """Whether it takes pictures and sees no markers."""
     y_up: bool = False
-    """Whether y points up in the calibration's world; else it is z, or the file does not say."""
+    """Whether the file states that y points up in its world."""
 
 
 class Skipped(NamedTuple):
-    """A camera that a calibration names but does not place."""
+    """A camera without a pose in the calibration, and the reason."""
 
     name: str
     why: str
@@ -73,24 +72,24 @@ def _warn(sentence: str) -> None:
 
 
 class _Element(NamedTuple):
-    """An element of XML with the words that messages call its camera."""
+    """An element of XML, and the name of its camera in messages."""
 
     element: ET.Element
     owner: str
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """The numbers of an attribute, separated by spaces."""
+        """Space-separated numbers of an attribute."""
         text = self.element.get(key)
         if text is None:
             raise RigError(f"{self.owner} lacks {key}")
         values = _words_numbers(text.split())
-        if len(values) != count or not all(abs(value) < _LARGEST for value in values):  # never so for NaN
+        if len(values) != count or not all(abs(value) < _MAX_VALUE for value in values):  # never so for NaN
             expected = "a finite number" if count == 1 else f"{count} finite numbers"
             raise RigError(f"{self.owner}: {key} is {shown(text)}, expected {expected}")
         return values
 
     def number(self, key: str, default: float | None = None) -> float:
-        """The number of an attribute; `default`, unless None, where it is missing."""
+        """The number of an attribute, or `default` (unless None) if it is missing."""
         return self.numbers(key, 1)[0] if default is None or key in self.element.attrib else default
 
     def child(self, tag: str) -> _Element:
@@ -102,7 +101,7 @@ class _Element(NamedTuple):
 
 
 def _words_numbers(words: list[str]) -> tuple[float, ...]:
-    """Words as numbers; none where a word is not one."""
+    """Words as numbers; empty if a word is not a number."""
     try:
         return tuple(float(word) for word in words)
     except ValueError:
@@ -126,10 +125,10 @@ def checked_matrix(owner: str, focal: Sequence[float], center: Sequence[float]) 
 
 
 def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
-    """The rotation (3, 3) that a matrix of few digits stands for."""
+    """The rotation (3, 3) nearest to a rounded one."""
     left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     rotation: NDArray[np.float64] = left @ right
-    if np.abs(stretch - 1.0).max() > _SKEWED or np.linalg.det(rotation) < 0.0:
+    if np.abs(stretch - 1.0).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise RigError(f"{owner} is not a rotation matrix")
     return rotation
 
@@ -149,27 +148,27 @@ def brown_lens(*coefficients: float) -> Lens:
 
 
 def camera_names(given: Sequence[str]) -> list[str]:
-    """Names of cameras with nothing but letters, digits, - and _, each once."""
+    """Unique names of cameras, with letters, digits, - and _ only."""
     names: list[str] = []
     for number, text in enumerate(given, 1):
-        plain = _NAMELESS.sub("_", text).strip("_")[:_LONGEST_NAME] or f"camera{number}"
+        plain = _NAMELESS.sub("_", text).strip("_")[:_MAX_NAME] or f"camera{number}"
         names.append(plain if plain not in names else f"{plain}_{number}")
     return names
 
 
-_MOST_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
-_MOST_ELEMENTS: Final = 200_000
-_DEEPEST: Final = 64
+_MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
+_MAX_ELEMENTS: Final = 200_000
+_MAX_DEPTH: Final = 64
 _DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
 
 
 class _Refused(Exception):
-    """What the parser must not go on with."""
+    """The parser met something that no calibration has."""
 
 
 def read_xml(path: Path) -> ET.Element:
     """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
-    text = _decoded(path, read_bytes(path, error=RigError, most=_MOST_BYTES))
+    text = _decoded(path, read_bytes(path, error=RigError, most=_MAX_XML_BYTES))
     try:
         return _parsed(text)
     except _Refused as error:
@@ -180,7 +179,7 @@ def read_xml(path: Path) -> ET.Element:
 
 
 def _decoded(path: Path, data: bytes) -> str:
-    """The text without its declaration, whose encoding some programs state wrongly."""
+    """The text without its XML declaration, in which some programs state a wrong encoding."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
     else:
@@ -201,9 +200,9 @@ def _parsed(text: str) -> ET.Element:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal elements, depth
         elements, depth = elements + 1, depth + 1
-        if elements > _MOST_ELEMENTS or depth > _DEEPEST:
+        if elements > _MAX_ELEMENTS or depth > _MAX_DEPTH:
             raise _Refused(
-                f"the XML has more than {_MOST_ELEMENTS} elements or is nested deeper than {_DEEPEST}, "
+                f"the XML has more than {_MAX_ELEMENTS} elements or is nested deeper than {_MAX_DEPTH}, "
                 "expected the calibration of a camera system"
             )
         builder.start(tag, attributes)
@@ -224,10 +223,10 @@ def _parsed(text: str) -> ET.Element:
 
 
 _MILLIMETER: Final = 1e-3
-_STRONGEST: Final = 0.5  # of a corner's distance; no lens moves it farther
-_SAMPLES: Final = 256
+_MAX_DISTORTION: Final = 0.5  # shift of a picture's corner, as a share of its distance from the center
+_SAMPLES: Final = 256  # radii that a lens is fitted at
 _VIDEO: Final = ("vue", "videoinputdevice")
-_PARTS: Final = 64.0  # Qualisys' counts of a pixel
+_SUBPIXELS: Final = 64.0  # Qualisys' units per pixel
 _TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
 _MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
 _COLOR: Final = "30"  # `ImagerIndex` of Motive's color cameras
@@ -259,14 +258,14 @@ def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
 
 
 def _vicon_lens(frame: _Element, size: tuple[int, int], K: NDArray[np.float64]) -> Lens:
-    """Our lens bends where Vicon's straightens; the inverse is fitted over the picture."""
+    """Fit the inverse of Vicon's lens over the picture: ours distorts points, Vicon's undistorts them."""
     straighten = _vicon_coefficients(frame)
     if not any(straighten):
         return Lens()
     corner = float(np.hypot(*np.maximum(K[:2, 2], size - K[:2, 2])))  # [px]
     measured = np.linspace(0.0, corner, _SAMPLES + 1)[1:]
     factor = 1.0 + sum(k * measured ** (2 * n) for n, k in enumerate(straighten, 1))
-    if not np.abs(factor - 1.0).max() < _STRONGEST:
+    if not np.abs(factor - 1.0).max() < _MAX_DISTORTION:
         _warn(f"{frame.owner}: its lens would move a corner by more than half its distance; it is left out")
         return Lens()
     straight = measured * factor / K[0, 0]  # [focal lengths]
@@ -277,7 +276,7 @@ def _vicon_lens(frame: _Element, size: tuple[int, int], K: NDArray[np.float64]) 
 
 
 def _vicon_coefficients(frame: _Element) -> tuple[float, ...]:
-    """k1, k2, ... [1/px^2, 1/px^4, ...]; of the newer form they follow a name and a center."""
+    """k1, k2, ... [1/px^2, 1/px^4, ...]; in VICON_RADIAL2 they follow a name and a center."""
     words = (frame.element.get("VICON_RADIAL2") or "").split()
     if words and len(words) != 6:
         raise RigError(
@@ -305,7 +304,7 @@ def _qualisys_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
             f"{camera.owner}: <{area.element.tag}> is empty, expected left < right and top < bottom"
         )
     size = picture_size(camera.owner, right - left + 1, bottom - top + 1)
-    scale = 1.0 / (_PARTS * _binning(camera, view, inner))
+    scale = 1.0 / (_SUBPIXELS * _binning(camera, view, inner))
     u, v = (inner.number(f"centerPoint{axis}") * scale for axis in "UV")
     fx, fy = (inner.number(f"focalLength{axis}") * scale for axis in "UV")
     K = checked_matrix(camera.owner, (fx, fy), (u - left, v - top))
@@ -319,13 +318,13 @@ def _qualisys_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
 
 
 def _binning(camera: _Element, view: str, inner: _Element) -> int:
-    """How many pixels of the sensor, each way, are one of the picture."""
+    """Sensor pixels per picture pixel, each way."""
     if camera.element.find(f"{view}_max") is None:
         return 1
     whole = camera.child(f"{view}_max")
     width = whole.number("right") - whole.number("left") + 1
     span = inner.number("sensorMaxU", 0.0) - inner.number("sensorMinU", 0.0)
-    return max(1, round(span / _PARTS / width)) if width > 0 else 1
+    return max(1, round(span / _SUBPIXELS / width)) if width > 0 else 1
 
 
 def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
@@ -355,7 +354,7 @@ def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
 
 CAMERAS: Final = "cameras.txt"
 IMAGES: Final = "images.txt"
-_MOST_BYTES_COLMAP: Final = 1 << 28  # images.txt lists all points of each image
+_MAX_COLMAP_BYTES: Final = 1 << 28  # images.txt lists all points of each image
 _MODELS: Final = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -367,25 +366,23 @@ _MODELS: Final = {
     "RADIAL_FISHEYE": 5,
     "OPENCV_FISHEYE": 8,
 }
-"""Models that we read, and their numbers of parameters."""
+"""Known camera models, and their numbers of parameters."""
 _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
-    """A camera for each image of a reconstruction in meters, called after it."""
+    """A camera for each image of a reconstruction in meters, with the name of the image."""
     folder = path if path.is_dir() else path.parent
     lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
     lines = _colmap_lines(folder / IMAGES, keep_empty=True)
-    cameras = [
-        _colmap_image(folder / IMAGES, line, lenses) for line in lines[::2]
-    ]  # points are on the others
-    return checked_cameras(folder / IMAGES, cameras)
+    images = lines[::2]  # lines of points lie between
+    return checked_cameras(folder / IMAGES, [_colmap_image(folder / IMAGES, line, lenses) for line in images])
 
 
 def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
-    """Lines without comments; an image without points has an empty one."""
+    """Lines without comments; an image without points has an empty line of points."""
     try:
-        text = read_bytes(path, error=RigError, most=_MOST_BYTES_COLMAP).decode("utf-8-sig")
+        text = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RigError(
             f"{path}: not COLMAP's text: it is not UTF-8; colmap model_converter writes it"
@@ -433,7 +430,7 @@ def _bent_lens(model: str, bent: list[float]) -> Lens:
 
 
 def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
-    """`IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose of the world as the camera sees it."""
+    """`IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, with the pose of the world in the camera's frame."""
     words = line.split(maxsplit=9)
     if len(words) != 10:
         raise RigError(
@@ -465,11 +462,10 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
     return values
 
 
-_MOST_BYTES_OPENCV: Final = 1 << 24
-_MOST_NUMBERS: Final = 16
-"""Of a value that is used; corners of boards may be thousands."""
-_CENTER: Final = 0.5  # OpenCV counts pixels from the first one's center, we from the picture's corner
-_LONGEST_BASELINE: Final = 5.0  # [m]
+_MAX_OPENCV_BYTES: Final = 1 << 24
+_MAX_NUMBERS: Final = 16  # of a value; longer lists, such as corners of a board, are ignored
+_CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
+_MAX_BASELINE: Final = 5.0  # [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
 _LIST: Final = re.compile(r"[\[\],\s]+")
@@ -481,16 +477,12 @@ _SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
 _FISHEYE: Final = ("fisheye_model", "fisheye")
 _R: Final = ("R", "Rot", "rvec", "rotation")
 _T: Final = ("T", "t", "tvec", "translation")
-_PAIRS: Final = {
-    "intrinsics": "extrinsics",
-    "extrinsics": "intrinsics",
-    "intri": "extri",
-    "extri": "intri",
-}
+_PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
+_OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
 _OF_ONE: Final = (*_K, *_D, *_WIDTH, "W", *_HEIGHT, "H", *_SIZE, *_FISHEYE, *_R, *_T)
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
-_MOST_SECTIONS: Final = 256
+_MAX_CAMERAS: Final = 256
 
 Values = dict[str, tuple[float, ...] | str]
 Sections = dict[str, Values]
@@ -498,37 +490,31 @@ Sections = dict[str, Values]
 
 
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
-    """The camera of a calibration, both of a stereo pair, or all of a file (docs/rendering.md has the names).
-
-    The file is a `.yml`, `.yaml` or `.json`. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
-    sample writes them, and of `intri.yml` and `extri.yml`, it is either; the other is read too.
-    """
+    """All cameras of a `.yml`, `.yaml` or `.json` (names: docs/rendering.md), or of such a pair of files."""
     values, sections = _read(path)
-    other = path.with_stem(_PAIRS.get(path.stem, path.stem))
+    other = path.with_stem(_OTHERS.get(path.stem, path.stem))
     if other != path and other.is_file():
         more, others = _read(other)
         values, sections = more | values, others | sections
     try:
-        cameras = _cameras(values, sections or _numbered_sections(values))
+        sections = sections or _numbered_sections(values)
+        if sections:
+            cameras = _many(values, sections)
+        elif _find(values, _numbered(_K, 1)) is not None:
+            cameras = _stereo(values)
+        elif _find(values, ("P1",)) is not None:
+            cameras = _rectified(values)
+        else:
+            cameras = [_camera(values, "camera", _K, _D, _pose(values))]
     except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
     return checked_cameras(path, cameras)
 
 
-def _cameras(values: Values, sections: Sections) -> list[Camera]:
-    if sections:
-        return _many(values, sections)
-    if _find(values, _numbered(_K, 1)) is not None:
-        return _stereo(values)
-    if _find(values, ("P1",)) is not None:
-        return _rectified(values)
-    return [_camera(values, "camera", _K, _D, _pose(values))]
-
-
 def _many(values: Values, sections: Sections) -> list[Camera]:
-    """Cameras in one world; what is stated once, as the size of the pictures, holds for all."""
-    if len(sections) > _MOST_SECTIONS:
-        raise RigError(f"{len(sections)} cameras, expected at most {_MOST_SECTIONS}")
+    """Cameras in one world; a size of the pictures outside their sections holds for all."""
+    if len(sections) > _MAX_CAMERAS:
+        raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
     common = {key: value for key, value in values.items() if key in (*_WIDTH, *_HEIGHT, *_SIZE)}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
@@ -542,7 +528,7 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
 
 
 def _numbered_sections(values: Values) -> Sections:
-    """Of K_1, dist_1, R_1, T_1, K_2, ...: a table for each camera that has a translation of its own."""
+    """A table for each camera with a translation among K_1, dist_1, R_1, T_1, K_2, ..."""
     found: Sections = {}
     for key, separator in itertools.product(list(values), ("_", "")):
         base = next((one for one in _K if key.startswith(one + separator) and key != one + separator), None)
@@ -566,7 +552,7 @@ def _camera(
 
 
 def _stereo(values: Values) -> list[Camera]:
-    """R and T take the first camera's coordinates to the second's."""
+    """A stereo pair, whose R and T map coordinates of the first camera to the second."""
     first, shift = _own_pose(values), np.array(_value_numbers(values, "T", (3,)))
     _check_baseline(shift)
     second = first @ np.linalg.inv(rigid(_rotation(values, "R"), shift))
@@ -629,7 +615,7 @@ def _size(values: Values) -> tuple[int, int]:
 
 
 def _pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`, or the inverse of the extrinsics R and T; without them the camera is the world."""
+    """`T_world_camera`, or the inverse of R and T; without them the identity."""
     R, T = _find(values, _R), _find(values, _T)
     if "T_world_camera" not in values and (R is not None or T is not None):
         outer = rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
@@ -638,12 +624,12 @@ def _pose(values: Values) -> NDArray[np.float64]:
 
 
 def _own_pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`; without it the camera is the world."""
+    """`T_world_camera`, or the identity."""
     return _matrix(values, ("T_world_camera",), (4, 4)) if "T_world_camera" in values else np.eye(4)
 
 
 def _rotation(values: Values, key: str) -> NDArray[np.float64]:
-    """A rotation matrix, or a rotation vector [rad]."""
+    """The rotation of a matrix or of a rotation vector [rad]."""
     given = np.array(_value_numbers(values, key, None))
     if given.size == 3:
         turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
@@ -655,9 +641,9 @@ def _rotation(values: Values, key: str) -> NDArray[np.float64]:
 
 def _check_baseline(vector: NDArray[np.float64]) -> None:
     length = float(np.linalg.norm(vector))
-    if length > _LONGEST_BASELINE:
+    if length > _MAX_BASELINE:
         raise RigError(
-            f"the cameras are {length:.4g} m apart, expected at most {_LONGEST_BASELINE:g} m; are these "
+            f"the cameras are {length:.4g} m apart, expected at most {_MAX_BASELINE:g} m; are these "
             "millimeters, or squares of the board? Positions are in meters"
         )
 
@@ -682,7 +668,7 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
         raise RigError(f"no '{key}'")
     given = values[key]
     if isinstance(given, str) or not np.isfinite(given).all():
-        raise RigError(f"{key} is no list of at most {_MOST_NUMBERS} finite numbers")
+        raise RigError(f"{key} is no list of at most {_MAX_NUMBERS} finite numbers")
     if shape is not None and len(given) != np.prod(shape):
         expected = " x ".join(map(str, shape))
         raise RigError(f"{key} has {len(given)} numbers, expected {expected}")
@@ -690,7 +676,7 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
 
 
 def _read(path: Path) -> tuple[Values, Sections]:
-    data = read_bytes(path, error=RigError, most=_MOST_BYTES_OPENCV)
+    data = read_bytes(path, error=RigError, most=_MAX_OPENCV_BYTES)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -705,7 +691,8 @@ def _read(path: Path) -> tuple[Values, Sections]:
         raise RigError(f"{path}: not a calibration: it is no JSON") from error
     if not isinstance(content, dict):
         raise RigError(f"{path}: not a calibration: its JSON is no table")
-    return _json_values(content), dict(_json_sections(content))
+    values = {str(key): _json_value(value) for key, value in content.items()}
+    return values, dict(_json_sections(content))
 
 
 def _yaml_tables(text: str) -> tuple[Values, Sections]:
@@ -722,7 +709,7 @@ def _yaml_tables(text: str) -> tuple[Values, Sections]:
 
 
 def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
-    """Each key at the left margin, and what follows it."""
+    """Each key at the left margin, and the text after it."""
     starts = list(_ENTRY.finditer(text))
     ends = [start.start() for start in starts[1:]]
     for start, end in itertools.zip_longest(starts, ends):
@@ -730,24 +717,20 @@ def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _yaml_value(body: str) -> tuple[float, ...] | str:
-    """A number, a list of numbers, a matrix; anything else as text."""
+    """The numbers of a number, list or matrix; anything else as text."""
     body = body.strip()
     data = _DATA.search(body)
-    words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
+    words = [word for word in _LIST.split(data[1] if data else body, _MAX_NUMBERS + 2) if word]
     return _few_numbers(words) or body.strip("\"' ")
 
 
 def _few_numbers(words: list[str]) -> tuple[float, ...]:
-    """Words as numbers; none where a word is not one, or there are too many."""
-    return _words_numbers(words) if len(words) <= _MOST_NUMBERS else ()
-
-
-def _json_values(table: Mapping[str, object]) -> Values:
-    return {str(key): _json_value(value) for key, value in table.items()}
+    """Words as numbers; empty if a word is not a number, or if there are too many."""
+    return _words_numbers(words) if len(words) <= _MAX_NUMBERS else ()
 
 
 def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
-    """Tables of cameras at the top level, or in a table or list `cameras`."""
+    """The tables of cameras, at the top level or in a table or list `cameras`."""
     cameras = content.get("cameras", content)
     if isinstance(cameras, list):
         named = [
@@ -757,9 +740,9 @@ def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]
         ]
     else:
         named = list(cameras.items()) if isinstance(cameras, dict) else []
-    for name, one in named[: _MOST_SECTIONS + 1]:
+    for name, one in named[: _MAX_CAMERAS + 1]:
         if isinstance(one, dict) and _find(one, _K) is not None:
-            yield name, _json_values(one)
+            yield name, {str(key): _json_value(value) for key, value in one.items()}
 
 
 def _json_value(value: object) -> tuple[float, ...] | str:
@@ -767,10 +750,10 @@ def _json_value(value: object) -> tuple[float, ...] | str:
         value = value.get("data")
     words: list[str] = []
     waiting = [value]
-    while waiting and len(words) <= _MOST_NUMBERS:
+    while waiting and len(words) <= _MAX_NUMBERS:
         first = waiting.pop(0)
         if isinstance(first, list):
-            waiting[:0] = first[: _MOST_NUMBERS + 1]
+            waiting[:0] = first[: _MAX_NUMBERS + 1]
         else:
             words.append(str(float(first) if isinstance(first, bool) else first))
     return _few_numbers(words) or str(value)[:80]
@@ -778,8 +761,8 @@ def _json_value(value: object) -> tuple[float, ...] | str:
 
 Up = Literal["y", "z"]
 _Y_TO_Z: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
-"""A turn about x that makes y up into z up."""
-_LEVEL: Final = 0.3  # least share of the cameras' tops, on average, along the axis that points up
+"""Rotation about x from a world with y up to one with z up."""
+_MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")
 _READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
@@ -787,7 +770,7 @@ _READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Ski
     "calibration": ("camera", _qualisys_camera),
     "calibrationProfile": ("Camera", _motive_camera),
 }
-"""Of the element that a calibration begins with: those of its cameras, and what reads one."""
+"""The tag of the cameras and the reader of one, by the root's tag."""
 _CLOSED: Final = {
     ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
     "from there as .mcal",
@@ -810,7 +793,7 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
     axis = up or ("y" if all(one.y_up for one in seeing) else "z")
     turn = _Y_TO_Z if axis == "y" else np.eye(4)
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
-    if -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _LEVEL:
+    if -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _MIN_UPRIGHT:
         _warn(
             f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
             "another axis up? --up says which"
@@ -819,14 +802,14 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
-    """The cameras of a file as `load_cameras` gives them, with what the file says of each."""
+    """The cameras of a file, by its ending, with their kinds."""
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml":
-        return _plain(checked_cameras(path, read_rig_file(path).cameras))
+        return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))
     if ending in _OPENCV:
-        return _plain(read_opencv_cameras(path))
+        return tuple(map(LabCamera, read_opencv_cameras(path)))
     if path.is_dir() or path.name in (CAMERAS, IMAGES):
-        return _plain(read_colmap_cameras(path))
+        return tuple(map(LabCamera, read_colmap_cameras(path)))
     if ending in _CLOSED:
         raise RigError(f"{path}: {_CLOSED[ending]}")
     if ending in _XML:
@@ -836,10 +819,6 @@ def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
         f"{path}: unknown kind of camera file, expected .toml, Vicon's .xcp, Qualisys' .xml or .txt, "
         f"Motive's .mcal, OpenCV's .yml or .json, or COLMAP's {CAMERAS} and {IMAGES}{hint}"
     )
-
-
-def _plain(cameras: Sequence[Camera]) -> tuple[LabCamera, ...]:
-    return tuple(LabCamera(camera) for camera in cameras)
 
 
 def _of_xml(path: Path) -> tuple[LabCamera, ...]:

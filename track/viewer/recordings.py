@@ -20,7 +20,7 @@ from gloves.takes.take import STATUSES, RigidBody, Take, label_names
 from handsim.callbacks import Progress, no_progress
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
-from handsim.space.rig import CameraRig, as_rig, list_rigs
+from handsim.space.rig import CameraRig, list_rigs, load_rig
 from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
 from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
@@ -160,7 +160,7 @@ def _curves(take: Take) -> tuple[Curve, ...]:
 
 def rig_of_settings(rig: object) -> CameraRig | None:
     """The rig that settings name or hold; None for a path, which is not followed."""
-    return as_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
+    return load_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
 
 
 class LiveRecording(Recording):

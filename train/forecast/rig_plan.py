@@ -25,7 +25,7 @@ from handsim.space.rig import (
     HAND_REACH,
     MAX_CAMERAS,
     CameraRig,
-    as_rig,
+    load_rig,
 )
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
 from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
@@ -98,7 +98,7 @@ def plan_rig(
     """
     chosen = PlanRigSettings.of(settings, options)
     layout, seed = load_layout(chosen.glove), chosen.seed
-    kept = None if chosen.keep is None else as_rig(chosen.keep)
+    kept = None if chosen.keep is None else load_rig(chosen.keep)
     old = () if kept is None else tuple(kept.cameras)
     check_count("cameras", cameras, len(old) + 1 if old else FEWEST_CAMERAS, MAX_CAMERAS)
     lengths = check_array("room", room, (3,))

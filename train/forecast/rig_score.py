@@ -31,7 +31,7 @@ from handsim.pages import (
     picture,
     write_sections,
 )
-from handsim.space.rig import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, as_rig
+from handsim.space.rig import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, load_rig
 from train.forecast.rig_forecast import (
     HALF_SIDE,
     OPTICS,
@@ -158,7 +158,7 @@ def score_rig(
         CaptureError: The take cannot be read, or its hands are never there together.
         LayoutError, RigError: The glove or the rig is unknown.
     """
-    cameras, chosen = as_rig(rig), ScoreRigSettings.of(settings, options)
+    cameras, chosen = load_rig(rig), ScoreRigSettings.of(settings, options)
     glove, take, sides = chosen.glove, chosen.take, np.array(chosen.volume, dtype=np.float64)
     on_step("simulating hands")
     if take is None:

@@ -31,7 +31,7 @@ from handsim.errors import WeightsError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import atomic_write, save_json, written_together
 from handsim.hand.shape import SIDES
-from handsim.space.rig import CameraRig, as_rig
+from handsim.space.rig import CameraRig, load_rig
 from train.data.batches import Cloud, draw_batch
 from train.data.shards import row_dtype
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
@@ -215,7 +215,7 @@ def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
     """Digest of all that decides a labeler."""
     decides = {
         "layout": dataclasses.asdict(layout),
-        "rig": as_rig(rig).record(),
+        "rig": load_rig(rig).record(),
         "weights": checksum(SHIPPED / WEIGHTS),
         "version": __version__,
     }
@@ -265,7 +265,7 @@ def fine_tuned_labeler(
     """A labeler for any layout that has learned more of this one, as a rig sees it, from so many clouds."""
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler.at_once(layout, seed=seed)
-    source = FrameSource(GenerateSettings(), layout, as_rig(rig))
+    source = FrameSource(GenerateSettings(), layout, load_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
     for first in range(0, len(rows), _POSES_EACH):
         models = sample_hands(source.settings.population, rng=rng)

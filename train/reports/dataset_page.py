@@ -14,7 +14,7 @@ from gloves.captures.capture import run_lengths
 from handsim.errors import DatasetError
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
 from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
-from handsim.space.rig import as_rig
+from handsim.space.rig import load_rig
 from train.data.shards import Dataset, hands_name
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     manifest = dataset.manifest
     least = manifest.min_cameras
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
-    shares = camera_shares(rows, len(as_rig(manifest.config["rig"]).positions))
+    shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
     text = (
         f"A marker has a point when the rays of at least {least} cameras meet; other hands, "
         "held objects, merged blobs and lost pictures are included."

@@ -26,7 +26,7 @@ from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
-from handsim.space.rig import ROOM_CENTER, as_rig, check_outside_volume, rig_setting
+from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
 from poses.shapes import PoseSampler, load_sampler
 from train.data.shards import (
     CONFIG,
@@ -108,7 +108,7 @@ def make_dataset(
 
 def _resolved(settings: GenerateSettings) -> FrameSource:
     """The settings with the glove, rig and sampler that they name, tried before anything is written."""
-    layout, rig = load_layout(settings.glove), as_rig(settings.rig)
+    layout, rig = load_layout(settings.glove), load_rig(settings.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), settings.volume)
     if settings.min_cameras > len(rig.positions):
         raise DatasetError(

@@ -19,7 +19,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import Side
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.rig import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
+from handsim.space.rig import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MOST_OTHERS,
@@ -107,7 +107,7 @@ def simulate_take(
         PoseError: None of the people drawn can do what this kind of capture asks for.
     """
     given = SimulateSettings.of(settings, options if kind is None else {"kind": kind, **options})
-    rig, layout = as_rig(given.rig), load_layout(given.glove)
+    rig, layout = load_rig(given.rig), load_layout(given.glove)
     given = dataclasses.replace(given, hands=_worn_hands(given, layout))
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     draw = TWINS[given.kind].draw if given.kind in TWINS else 0
@@ -133,7 +133,7 @@ def simulate_calibration(
     """What cameras see of a certain user who makes a calibration capture with one hand or both."""
     config = config or CalibrationTakeConfig()
     scene = sample_calibration_scene(hands, config, rng=rng)
-    rig = as_rig(config.rig)
+    rig = load_rig(config.rig)
     settings = {"kind": "calibration", **config.record(), "rig": rig_setting(rig)}
     return record_take(scene, rig, RoomConfig(), settings, rng=rng)
 

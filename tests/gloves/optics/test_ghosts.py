@@ -17,7 +17,7 @@ from gloves.optics.ghosts import (
     sample_ghosts,
     sample_strays,
 )
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
 
@@ -43,7 +43,7 @@ def test_reflection_is_its_own_inverse_and_keeps_distances(seed):
 def test_without_sources_there_are_no_ghosts(rng):
     config = GhostConfig(mirror_rate=0.0, stray_rate=0.0)
     ghosts = sample_ghosts(
-        hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
+        hand_sized_cloud(rng), load_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
     )
     assert ghosts.shape == (200, MAX_GHOSTS, 3)
     assert np.isnan(ghosts).all()
@@ -51,7 +51,7 @@ def test_without_sources_there_are_no_ghosts(rng):
 
 def test_mirror_ghosts_lie_behind_the_surface_and_need_cameras(rng):
     config = GhostConfig(mirror_rate=1.0, stray_rate=0.0, reflectance=1.0)
-    markers, rig = hand_sized_cloud(rng), named_rig("figure5")
+    markers, rig = hand_sized_cloud(rng), load_rig("figure5")
     ghosts = sample_ghosts(markers, rig, *NOTHING, config, min_cameras=2, rng=rng)
     there = np.isfinite(ghosts[..., 0])
     assert there.any()
@@ -64,12 +64,12 @@ def test_mirror_ghosts_lie_behind_the_surface_and_need_cameras(rng):
 def test_strays_follow_their_rate(rng):
     config = dataclasses.replace(GhostConfig(), mirror_rate=0.0, stray_rate=0.5)
     ghosts = sample_ghosts(
-        hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
+        hand_sized_cloud(rng), load_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
     )
     assert 0.35 < np.isfinite(ghosts[..., 0]).sum(axis=1).mean() < 0.65
 
 
-RIG = named_rig("figure5")
+RIG = load_rig("figure5")
 PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
 MIRRORS_NOTHING = np.zeros((1, 0, 2, 3)), np.zeros(0)
 

@@ -12,11 +12,11 @@ from gloves import OpticsConfig
 from gloves.optics.reconstruction import number_runs, pack_columns, reconstruct
 from handsim import CameraRig, look_at
 from handsim.errors import ArgumentError
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from tests.rigs import square_rig
 
 STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
-RIG = named_rig("figure5")
+RIG = load_rig("figure5")
 MIDDLE = np.array([0.0, 0.0, 1.1])
 
 

@@ -26,7 +26,7 @@ from gloves.optics.visibility import (
 )
 from handsim import CameraRig, HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, RigError
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
 from tests.rigs import mixed_rig
@@ -47,7 +47,7 @@ def scene(request, rng):
 
 def test_every_ray_agrees_with_mujoco(scene):
     model, qpos, markers, _, segments = scene
-    cameras = named_rig("figure5").positions
+    cameras = load_rig("figure5").positions
     free = free_rays(markers, cameras, segments, model.capsules.radii)
     assert 0.2 < free.mean() < 0.95, "the test needs rays of both kinds"
     data = mujoco.MjData(model.mj_model)
@@ -68,7 +68,7 @@ def test_every_ray_agrees_with_mujoco(scene):
 
 def test_a_camera_sees_alike_whatever_others_there_are(scene):
     model, _, markers, normals, segments = scene
-    rig = named_rig("figure5")
+    rig = load_rig("figure5")
     few = CameraRig("few", [rig.cameras[number] for number in (3, 7, 11)])
     everyone = visible_cameras(markers, normals, rig, segments, model.capsules.radii)
     np.testing.assert_array_equal(
@@ -78,7 +78,7 @@ def test_a_camera_sees_alike_whatever_others_there_are(scene):
 
 def test_markers_that_face_away_or_lie_outside_the_view_are_not_seen(scene):
     model, _, markers, normals, segments = scene
-    rig = named_rig("figure5")
+    rig = load_rig("figure5")
     far = np.zeros((len(segments), 0, 2, 3))
     seen = visible_cameras(markers, normals, rig, far, np.zeros(0))
     behind = visible_cameras(markers, -normals, rig, far, np.zeros(0))
@@ -105,9 +105,9 @@ def test_packing_round_trip(rng):
 
 def test_bad_rigs_are_told():
     with pytest.raises(RigError, match="rig 'lonely' has 1 cameras, expected 2 to 32"):
-        CameraRig("lonely", named_rig("six").cameras[:1])
+        CameraRig("lonely", load_rig("six").cameras[:1])
     with pytest.raises(ArgumentError, match="unknown camera rig 'figure6'"):
-        named_rig("figure6")
+        load_rig("figure6")
 
 
 FRAMES = 40
@@ -133,7 +133,7 @@ def scene_of_mesh_sight(request, rng):
         quaternion=random_quaternions(FRAMES, rng=rng),
     )
     markers, _ = attach_markers(load_layout("dense19"), model).markers(model, model.forward_kinematics(qpos))
-    return model, qpos, model.skin(qpos), markers, named_rig("figure5").positions
+    return model, qpos, model.skin(qpos), markers, load_rig("figure5").positions
 
 
 @pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
@@ -219,7 +219,7 @@ def test_a_rigid_body_is_its_mesh_carried_along(rng):
     tree = MeshTree(body.vertices, body.faces)
     poses = poses_of(30, rng)
     points = poses[:, None, :3, 3] + rng.normal(0.0, 0.06, size=(30, 12, 3))
-    cameras = named_rig("figure5").positions
+    cameras = load_rig("figure5").positions
     wanted = every(points, cameras)
     moved = np.einsum("tij,vj->tvi", poses[:, :3, :3], body.vertices) + poses[:, None, :3, 3]
     as_body = clear_of_body(tree, poses, points, cameras, wanted)

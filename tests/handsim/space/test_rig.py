@@ -16,11 +16,9 @@ from handsim import CameraRig, HandModel, Population, join_qpos, load_rig, look_
 from handsim.errors import ArgumentError, RigError
 from handsim.space.rig import (
     HAND_REACH,
-    as_rig,
     check_outside,
     check_outside_volume,
     list_rigs,
-    named_rig,
     rig_setting,
 )
 from handsim.space.rig_formats import load_cameras
@@ -37,15 +35,15 @@ SECOND = "[[camera]]\nposition = [-1.0, 0.5, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
 
 
 def test_shipped_rigs_hold_what_their_names_say():
-    counts = {name: len(named_rig(name).positions) for name in list_rigs()}
+    counts = {name: len(load_rig(name).positions) for name in list_rigs()}
     assert counts == {"eight": 8, "figure5": 16, "six": 6}
     for name in list_rigs():
-        assert named_rig(name).name == name
-        assert {one.size for one in named_rig(name).cameras} == {(1280, 1280)}
+        assert load_rig(name).name == name
+        assert {one.size for one in load_rig(name).cameras} == {(1280, 1280)}
 
 
 def test_figure5_stays_where_training_sets_were_made_with_it():
-    saved, rig = json.loads((GOLDEN / "figure5.json").read_text()), named_rig("figure5")
+    saved, rig = json.loads((GOLDEN / "figure5.json").read_text()), load_rig("figure5")
     angle = saved["field_of_view"]  # of the round cone that its square pictures hold
     assert {one.focal_lengths for one in rig.cameras} == {(640 / np.tan(angle / 2),) * 2}
     np.testing.assert_array_equal(rig.positions, np.array(saved["T_world_camera"])[:, :3, 3])
@@ -55,7 +53,7 @@ def test_figure5_stays_where_training_sets_were_made_with_it():
 
 @pytest.mark.parametrize("name", list_rigs())
 def test_every_place_of_the_volume_is_in_three_views(name, rng):
-    rig = named_rig(name)
+    rig = load_rig(name)
     check_outside_volume(rig, CENTER, 0.3)
     seen = rig.in_view(CENTER + rng.uniform(-0.3, 0.3, size=(5000, 3))).sum(axis=-1)
     assert (seen >= 3).all()
@@ -72,7 +70,7 @@ def test_a_file_of_ones_own(tmp_path):
     path.write_text(TOP + FIRST + SECOND)
     np.testing.assert_allclose(load_rig(str(path)).T_world_camera, rig.T_world_camera, atol=1e-15)
     assert load_rig(path).cameras[0].size == (1280, 1280)
-    assert load_rig("six") == named_rig("six")
+    assert load_rig("six") == load_rig("six")
 
 
 def test_whatever_stands_for_a_rig_gives_it(tmp_path):
@@ -81,16 +79,16 @@ def test_whatever_stands_for_a_rig_gives_it(tmp_path):
     rig.save(path)
     record = json.loads(json.dumps(rig.record()))
     for source in (rig, path, str(path), record):
-        assert as_rig(source) == rig and rig_setting(source) == record
-    for source in ("six", named_rig("six"), named_rig("six").record()):
-        assert as_rig(source) == named_rig("six") and rig_setting(source) == "six"
+        assert load_rig(source) == rig
+    for source in ("six", load_rig("six"), load_rig("six").record()):
+        assert load_rig(source) == load_rig("six")
     assert load_rig(rig) is rig
     other = CameraRig("six", rig.cameras)  # a shipped name, but other cameras
-    assert as_rig(rig_setting(other)) == other
+    assert load_rig(rig_setting(other)) == other
     with pytest.raises(ArgumentError, match="rig is 3, expected a CameraRig, or the name or path of one"):
-        as_rig(3)
+        load_rig(3)
     with pytest.raises(RigError, match="a damaged record of a rig"):
-        as_rig({"name": "six"})
+        load_rig({"name": "six"})
 
 
 @pytest.mark.parametrize("given", [[np.eye(4)] * 2, "ab", 3])
@@ -284,7 +282,7 @@ def test_binary_files_are_told(tmp_path):
 
 
 def test_cameras_in_the_hand_are_refused():
-    rig, model = named_rig("six"), HandModel.named("M")
+    rig, model = load_rig("six"), HandModel.named("M")
     far = model.skin(join_qpos(np.zeros((3, 20)), position=CENTER))
     check_outside(rig, far)
     check_outside(rig, np.full((4, 3), np.nan))
@@ -301,7 +299,7 @@ def test_cameras_in_the_hand_are_refused():
 
 
 def test_cameras_in_the_volume_are_refused():
-    rig = named_rig("six")
+    rig = load_rig("six")
     check_outside_volume(rig, CENTER, 0.6)
     with error_names(ArgumentError, "camera 5 of rig 'six' is 0.14 m | wrists | at least 0.25 m"):
         check_outside_volume(rig, CENTER + [0.0, 0.44, 0.0], 0.5)

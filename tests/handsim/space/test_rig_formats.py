@@ -476,7 +476,7 @@ def test_hostile_xml(tmp_path, content, message):
 def test_a_giant_file(tmp_path):
     path = tmp_path / "lab.xcp"
     with path.open("wb") as file:
-        file.truncate(rig_formats._MOST_BYTES + 1)
+        file.truncate(rig_formats._MAX_XML_BYTES + 1)
     with pytest.raises(RigError, match="bytes long, expected at most"):
         read_xml(path)
 

@@ -10,7 +10,7 @@ import pytest
 
 from handsim import Camera, HandSimError, look_at
 from handsim.space.camera import preset
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from render import Backgrounds, RenderConfig, RenderedFrame, ViewConfig, draw
 from render.frames import Geometry
 from render.scenery.backgrounds import (
@@ -253,7 +253,7 @@ def test_a_rig_sees_photographs_on_the_walls(tmp_path) -> None:
     file = tmp_path / "stripes.png"
     assert cv2.imwrite(str(file), picture)
     photo = dataclasses.replace(background("photo"), photo=str(file))
-    rig = named_rig("six")
+    rig = load_rig("six")
     box = enclose(np.concatenate([rig.positions, MIDDLE[None]]), 0)
     seen = draw_surroundings(photo, box, preset("vga").at(rig.T_world_camera[0]))
     assert seen.rgb.min() < 60 and seen.rgb.max() > 200 and (seen.depth > 0.5).all()

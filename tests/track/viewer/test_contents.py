@@ -12,7 +12,7 @@ from gloves import Capture, write_capture
 from gloves.layout import starter_layout
 from handsim import HandModel, HandSimError
 from handsim.errors import ArgumentError, CaptureError
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from tests.rigs import mixed_rig
 from track import User
 from track.viewer.contents import ACCEPTED, open_content
@@ -110,7 +110,7 @@ def test_names_that_systems_give_to_unnamed_points_are_no_labels(capture):
 
 def test_a_training_set_shows_its_rows_and_who_sees_them(training_set):
     dataset = Dataset(training_set)
-    recording, rig = DatasetRecording(dataset), named_rig("figure5")
+    recording, rig = DatasetRecording(dataset), load_rig("figure5")
     for index in (39, 0, 17):
         row, frame = dataset.rows()[index], recording.frame(index)
         observed = np.isfinite(row["observed"][:, 0])
@@ -134,7 +134,7 @@ def test_a_rig_of_a_take_is_shown_if_it_is_shipped_or_in_the_take(simulated):
 
 
 def test_places_are_counted_by_the_cameras_that_see_them():
-    rig = named_rig("six")
+    rig = load_rig("six")
     places, counts = camera_counts(rig)
     assert counts.min() == 2 and counts.max() <= 6 and len(places) > 50
     np.testing.assert_array_equal(rig.in_view(places).sum(axis=1), counts)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gloves import load_layout
-from handsim.space.rig import ROOM_CENTER, named_rig
+from handsim.space.rig import ROOM_CENTER, load_rig
 from train.forecast.rig_forecast import light, sample_work
 from train.simulation.room import RoomConfig
 
@@ -22,4 +22,4 @@ def work():
 
 @pytest.fixture(scope="session")
 def six_lit(work):
-    return light(work, named_rig("six"), RoomConfig(), rng=np.random.default_rng(1))
+    return light(work, load_rig("six"), RoomConfig(), rng=np.random.default_rng(1))

@@ -11,7 +11,7 @@ from gloves.optics.reconstruction import reconstruct
 from handsim import look_at
 from handsim.errors import CaptureError
 from handsim.hand.model import BodyMotion
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train import simulate_take
@@ -31,7 +31,7 @@ from train.simulation.scenes import MovingObject, SceneMotion
 
 
 def test_shares_are_those_of_the_lines_of_sight(six_lit):
-    found = forecast(six_lit, named_rig("six"))
+    found = forecast(six_lit, load_rig("six"))
     views = np.concatenate([one.seen.sum(axis=-1).ravel() for one in six_lit])
     assert found.marker_frames == len(views) == 5 * 120 * 16
     assert found.seen_by_two == pytest.approx((views >= 2).mean())
@@ -43,7 +43,7 @@ def test_shares_are_those_of_the_lines_of_sight(six_lit):
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand", "hand-controller"])
 def test_the_forecast_is_what_simulated_takes_of_this_kind_have(kind):
     """Gaps and ghosts too, with the losses and reflections that takes have by default."""
-    rig, rng = named_rig("six"), np.random.default_rng(0)
+    rig, rng = load_rig("six"), np.random.default_rng(0)
     takes = [simulate_take(kind, glove="tips8", rig=rig, num_frames=240, seed=seed) for seed in range(4)]
     scenes = [SceneMotion(one.moving_hands(), moving_thing(one), one.rate) for one in takes]
     found = forecast(light_work({kind: scenes}, rig, rng=rng)[kind], rig)
@@ -64,7 +64,7 @@ def moving_thing(take):
 
 
 def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
-    rig = named_rig("figure5")
+    rig = load_rig("figure5")
     few = light(work[:2], rig, RoomConfig(), rng=np.random.default_rng(2))
     losses = camera_losses(few, rig)
     whole = forecast(few, rig)
@@ -74,14 +74,12 @@ def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
         assert loss.needed == pytest.approx((views[:, number] & (others < 2)).mean())
         assert loss.without.seen_by_two <= whole.seen_by_two
     six = camera_losses(
-        light(work[:2], named_rig("six"), RoomConfig(), rng=np.random.default_rng(2)), named_rig("six")
+        light(work[:2], load_rig("six"), RoomConfig(), rng=np.random.default_rng(2)), load_rig("six")
     )
     assert min(one.needed for one in six) > max(one.needed for one in losses)
 
 
-@pytest.mark.parametrize(
-    "rig", [named_rig("six"), named_rig("figure5"), mixed_rig()], ids=lambda rig: rig.name
-)
+@pytest.mark.parametrize("rig", [load_rig("six"), load_rig("figure5"), mixed_rig()], ids=lambda rig: rig.name)
 def test_the_covariance_is_that_of_reconstructed_points(rig):
     """Also of cameras with lenses, whose noise is one of real pixels."""
     frames = 20_000

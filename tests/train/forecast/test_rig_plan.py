@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from handsim import CameraRig
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from train import plan_rig
 from train.forecast.rig_forecast import light
 from train.forecast.rig_plan import Planning, places, view_candidates
@@ -23,7 +23,7 @@ from train.simulation.room import RoomConfig
 @pytest.fixture(scope="module")
 def candidates(work):
     """Ten of the sixteen cameras of `figure5`, as candidates."""
-    ten = [named_rig("figure5").cameras[number] for number in (0, 2, 4, 6, 8, 10, 11, 13, 14, 15)]
+    ten = [load_rig("figure5").cameras[number] for number in (0, 2, 4, 6, 8, 10, 11, 13, 14, 15)]
     return ten, view_candidates([one.faster(4) for one in work], ten, rng=np.random.default_rng(0))
 
 
@@ -88,7 +88,7 @@ def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
 
 @pytest.mark.slow
 def test_a_plan_beats_cameras_in_a_row():
-    old = CameraRig("row", named_rig("figure5").cameras[:2])
+    old = CameraRig("row", load_rig("figure5").cameras[:2])
     wide = pinhole("wide", (1664, 1088), 1188.0)
     found = plan_rig(
         4, (2.4, 1.8, 2.2), mounts=("truss",), camera=wide, keep=old, glove="tips8", name="new"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from handsim import look_at
-from handsim.space.rig import ROOM_CENTER, list_rigs, named_rig
+from handsim.space.rig import ROOM_CENTER, list_rigs, load_rig
 from tests.rigs import square_rig
 from train import CameraLoss
 from train.forecast.rig_score import (
@@ -26,7 +26,7 @@ from train.forecast.rig_score import (
 @pytest.fixture(scope="module")
 def score(work):
     middle, sides = np.array(ROOM_CENTER), np.full(3, 0.6)
-    return score_work(named_rig("six"), {"all kinds": work}, middle, sides, told="a <test>")
+    return score_work(load_rig("six"), {"all kinds": work}, middle, sides, told="a <test>")
 
 
 def with_missing(one, missing, **more):
@@ -99,7 +99,7 @@ def test_the_page_has_tables_and_pictures_and_the_record_every_figure(score, tmp
 
 def test_the_middle_is_seen_and_far_away_is_not(work):
     sides = np.array([6.0, 0.4, 0.4])
-    found = map_volume(work, named_rig("figure5"), np.array(ROOM_CENTER), sides, rng=np.random.default_rng(0))
+    found = map_volume(work, load_rig("figure5"), np.array(ROOM_CENTER), sides, rng=np.random.default_rng(0))
     assert len(found.points) == GRID**3
     middle, ends = np.abs(found.points[:, 0]) < 0.1, np.abs(found.points[:, 0]) > 2.9
     assert found.seen_by_two[middle].mean() > 0.95 > found.seen_by_three[ends].mean()
@@ -113,12 +113,12 @@ def test_the_middle_is_seen_and_far_away_is_not(work):
 
 @pytest.mark.parametrize("name", list_rigs())
 def test_shipped_rigs_look_at_the_hands_and_have_no_faults(name):
-    assert working_point(named_rig(name)) == pytest.approx([0.0, 0.0, 1.1], abs=1e-6)
-    assert faults(named_rig(name)) == []
+    assert working_point(load_rig(name)) == pytest.approx([0.0, 0.0, 1.1], abs=1e-6)
+    assert faults(load_rig(name)) == []
 
 
 def with_cameras(change, name="six"):
-    rig = named_rig(name)
+    rig = load_rig(name)
     poses = rig.T_world_camera.copy()
     change(poses)
     return square_rig(rig.name, poses)

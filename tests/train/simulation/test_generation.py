@@ -19,7 +19,7 @@ from handsim import HandModel, Population, join_qpos
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
-from handsim.space.rig import as_rig
+from handsim.space.rig import load_rig
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for
@@ -237,7 +237,7 @@ def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     config = GenerateSettings(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
     make_dataset(config, tmp_path / "set", workers=1)
     dataset = Dataset(tmp_path / "set")
-    assert as_rig(dataset.manifest.config["rig"]) == rig
+    assert load_rig(dataset.manifest.config["rig"]) == rig
     assert DatasetRecording(dataset).rig == rig
     write_dataset_page(dataset.path / REPORT, dataset)
     rig.save(tmp_path / "mixed.toml")  # the same cameras, whatever names them

@@ -17,7 +17,7 @@ from handsim import HandModel, RigidObject, look_at
 from handsim.errors import ArgumentError
 from handsim.hand.model import BodyMotion
 from handsim.space.objects import named_object
-from handsim.space.rig import named_rig
+from handsim.space.rig import load_rig
 from poses import sample_motion
 from tests.rigs import square_rig
 from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources
@@ -25,7 +25,7 @@ from train.simulation.scenes import MovingObject, SceneMotion
 
 RATE = 120.0
 FRAMES = 120
-RIG = named_rig("figure5")
+RIG = load_rig("figure5")
 CLEAN = RoomConfig(OpticsConfig(blob_loss=0.0, dropout=0.0), StrayConfig(number=0.0))
 
 

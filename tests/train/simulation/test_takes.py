@@ -14,7 +14,7 @@ from gloves.captures.capture import count_gaps
 from handsim import HandModel, HandSimError
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
-from handsim.space.rig import ROOM_CENTER, as_rig, named_rig
+from handsim.space.rig import ROOM_CENTER, load_rig
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
@@ -118,10 +118,10 @@ def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
         take = simulate_take(num_frames=40, rig=given)
         take.save(tmp_path / "take.truth.npz")
         takes.append(load_take(tmp_path / "take.truth.npz"))
-        assert as_rig(takes[-1].settings["rig"]) == rig
+        assert load_rig(takes[-1].settings["rig"]) == rig
     np.testing.assert_array_equal(takes[0].points, takes[1].points)
     assert takes[0].markers_present().mean() > 0.4
-    six = simulate_take(num_frames=40, rig=named_rig("six"))
+    six = simulate_take(num_frames=40, rig=load_rig("six"))
     assert six.settings["rig"] == "six"
     np.testing.assert_array_equal(six.points, simulate_take(num_frames=40, rig="six").points)
     with pytest.raises(ArgumentError, match="rig is 3, expected a CameraRig, or the name or path of one"):
