@@ -16,18 +16,7 @@ from track import track_capture
 from train import Dataset, simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
-SMALL = [
-    "--samples",
-    "80000",
-    "--batch",
-    "128",
-    "--network.width",
-    "32",
-    "--network.gates",
-    "8",
-    "--network.depth",
-    "3",
-]
+SMALL = "--samples 80000 --batch 128 --network.width 32 --network.gates 8 --network.depth 3".split()
 
 
 @pytest.fixture(scope="module")

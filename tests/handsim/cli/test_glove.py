@@ -117,17 +117,11 @@ def test_a_score_is_printed_and_drawn(mine, capsys):
 def test_an_improved_layout_is_written(mine, tmp_path, capsys):
     out = tmp_path / "better.toml"
     command = [
-        "glove",
-        "improve",
+        *"glove improve".split(),
         str(mine),
         "--out",
         str(out),
-        "--minutes",
-        "0",
-        "--markers",
-        "7",
-        "--captures",
-        "0",
+        *"--minutes 0 --markers 7 --captures 0".split(),
     ]
     assert main(command) == 0
     assert load_layout(out).num_markers == 7

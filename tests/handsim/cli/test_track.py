@@ -189,15 +189,9 @@ def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
     assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
     assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
     asked = [
-        "--size",
-        "L",
-        "--hands",
-        "right",
-        "--body",
+        *"--size L --hands right --body".split(),
         str(wand),
-        "--body",
-        "mug",
-        "--labelled",
+        *"--body mug --labelled".split(),
         str(labeled),
     ]  # the earlier spelling holds
     assert main(["track", str(capture), "--out", str(out), *asked]) == 0

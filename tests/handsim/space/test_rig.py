@@ -14,13 +14,7 @@ from hypothesis import strategies as st
 
 from handsim import CameraRig, HandModel, Population, join_qpos, load_rig, look_at, sample_shape
 from handsim.errors import ArgumentError, RigError
-from handsim.space.rig import (
-    HAND_REACH,
-    check_outside,
-    check_outside_volume,
-    list_rigs,
-    rig_setting,
-)
+from handsim.space.rig import HAND_REACH, check_outside, check_outside_volume, list_rigs, rig_setting
 from handsim.space.rig_formats import load_cameras
 from tests.rigs import mixed_rig, square_rig
 from tests.sentences import error_names
