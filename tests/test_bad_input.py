@@ -10,11 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves import Capture, load_layout, write_capture
+from gloves import Capture, Take, load_layout, write_capture
+from gloves.fit import nominal_fit
+from gloves.layout import starter_layout
 from gloves.takes.archives import write_archive
+from handsim import join_qpos
 from handsim.app import messages
 from handsim.cli.main import main
 from tests.sentences import assert_names
+from track import User
 from train import simulate_take
 
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -80,6 +84,10 @@ def files(tmp_path_factory):
     take = simulate_take(num_frames=2)
     take.save(made / "good.truth.npz")
     dataclasses.replace(take, settings={"tracker": {}}).save(made / "tracked.npz")
+    left = nominal_fit(load_layout("dense19"), "M", "left")
+    Take.of_poses([left], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(made / "left.npz")
+    User((left,)).save(made / "user.json")
+    (made / "mine.toml").write_text(starter_layout())
     (made / "photos").mkdir()
     (made / "photos" / "broken.jpg").write_text("no picture")
     load_layout("dense19").save(made / "copy.toml")
@@ -181,6 +189,44 @@ CASES = {
     "rig import good.trc --out out.toml": "good.trc | .toml | .xcp | .mcal | cameras.txt",
     "rig import lab.xcp --out out.json": "--out is out.json | .toml",
     "train . --out out": "manifest.json | . holds none",
+    "glove new mine.txt": "mine.txt | ends in .toml",
+    "glove check gone.toml": "gone.toml | cannot be read",
+    "glove score mine.toml --motion dance": "'dance' | poses, twins or a take",
+    "glove score mine.toml --captures -1": "captures is -1 | 0 or more",
+    "glove score mine.toml --frames 1": "frames is 1 | at least 100",
+    "glove score mine.toml --out page.pdf": "--out is page.pdf | .html",
+    "glove improve mine.toml --out mine.toml": "is the input",
+    "glove improve mine.toml --out new.toml --markers 3": "markers is 3 | 5 to 60",
+    "glove improve mine.toml --out new.toml --keep Tail": "to be kept are Tail",
+    "hand --out hand.txt": ".xml, .urdf, .osim, .glb",
+    "hand --mesh hand.fbx": ".glb, .obj, .ply, .stl",
+    "hand --glove dense18": "'dense18' | 'dense19'",
+    "hand --size S --shape user.json": "--size S | --shape user.json | one of them",
+    "hand --take left.npz --side right": "'right' | left",
+    "hand --shape user.json --glove dense19": "--glove dense19 | --shape user.json",
+    "hand --out hand.urdf --actuators": "--out | .xml",
+    "hand --out hand.osim --actuators": "--out | .xml",
+    "hand --out hand.urdf --glove dense19": "--out | .xml or .osim",
+    "hand --out hand.glb --mesh hand.glb": "two files",
+    "hand --shape nobody.json": "nobody.json | cannot be read",
+    "rig check mine.txt": "or the path of a .toml file",
+    "rig check seven": "or the path of a .toml file",
+    "rig score six --out page.pdf": "--out is page.pdf | .html",
+    "rig score six --frames 1": "frames is 1 | at least 60",
+    "rig score six --volume 1 0 1": "volume is 0 | above 0",
+    "rig score six --center nan 0 1": "center is nan | from -50 to 50",
+    "rig score six --center 0 0 1100": "center is 1100 | from -50 to 50",
+    "rig score six --seed -1": "seed is -1 | 0 or more",
+    "rig score six --json figures.html": "--json is figures.html | .json",
+    "rig plan --cameras 1 --room 4 4 3 --out new.toml": "cameras is 1 | 2 to 32",
+    "rig plan --cameras 6 --room 4 4 3 --keep six --out new.toml": "cameras is 6 | 7 to 32",
+    "rig plan --cameras 6 --room 4 0 3 --out new.toml": "room is 4 x 0 x 3 m | three lengths",
+    "rig plan --cameras 6 --room 4 4 3 --field-of-view 180 --out new.toml": "field_of_view is 180 | 1 to 170",
+    "rig plan --cameras 6 --room 0.8 0.8 1.5 --mounts walls --volume 2 2 3 --out new.toml": "larger room",
+    "simulate --num-frames 432000 --out take.tsv": ".trc, .c3d",
+    "simulate --num-frames 432000 --out take.npz": ".trc, .c3d",
+    "simulate --num-frames 432000 --out take": ".trc, .c3d",
+    "simulate --num-frames 1000000000 --out out.c3d": "1000000000 frames need 20 TB | shorter captures",
 }
 
 

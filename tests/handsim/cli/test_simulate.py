@@ -101,16 +101,6 @@ def test_the_optics_are_options_of_the_command(tmp_path, capsys):
     assert said.count("\n") == 1 and "noise is -1, expected a number of at least 0" in said
 
 
-@pytest.mark.parametrize("name", ["take.tsv", "take.npz", "take"])
-def test_another_suffix_is_refused_before_the_work(name, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    # An hour of frames would take minutes.
-    assert main(["simulate", "--num-frames", "432000", "--out", name]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and ".trc, .c3d" in said
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
     with pytest.raises(SystemExit) as caught:
         main(["simulate", "--kind", "hand-foot", "--out", str(tmp_path / "take.c3d")])
@@ -160,10 +150,3 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said
-
-
-def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):
-    assert main(["simulate", "--num-frames", "1000000000", "--out", str(tmp_path / "take.c3d")]) == 1
-    said = capsys.readouterr().err
-    assert "1000000000 frames need 20 TB of memory" in said and "shorter captures" in said
-    assert list(tmp_path.iterdir()) == []
