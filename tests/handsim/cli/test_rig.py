@@ -75,18 +75,6 @@ def test_an_imported_rig_with_another_axis_up(tmp_path, capsys):
     np.testing.assert_allclose(load_rig(out).positions, [[0, 1, 3], [4, 2, -1]])
 
 
-def test_wrong_names_of_files_to_import(tmp_path, capsys):
-    file = written(tmp_path)["vicon"]
-    assert main(["rig", "import", str(file), "--out", str(tmp_path / "rig.json")]) == 1
-    assert "expected a file name that ends in .toml" in capsys.readouterr().err
-    assert main(["rig", "import", str(tmp_path / "lab.cal"), "--out", str(tmp_path / "rig.toml")]) == 1
-    assert "Motive's .cal is a closed format; load it in Motive 3.2" in capsys.readouterr().err
-    (tmp_path / "rig.toml").write_text("mine")
-    assert main(["rig", "import", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "rig.toml")]) == 1
-    assert "is the input" in capsys.readouterr().err
-    assert (tmp_path / "rig.toml").read_text() == "mine"
-
-
 def test_a_score_is_printed_drawn_and_written(tmp_path, capsys):
     page, figures = tmp_path / "six.html", tmp_path / "six.json"
     options = ["--glove", "tips8", "--frames", "60", "--out", str(page), "--json", str(figures)]
