@@ -256,6 +256,13 @@ CASES = {
     "replay good.trc --port 70000": "port is 70000 | 0 to 65535",
     "replay good.trc --host 192.0.2.1": "cannot be listened at on 192.0.2.1",
     "rig import one_camera.toml --out one_camera.toml": "is the input",
+    "track good.trc --out take.npz --send http://localhost:1": "'http://localhost:1' | osc://",
+    "evaluate good.truth.npz --occlude 3": "leave out the corruption | --occlude",
+    "evaluate good.truth.npz --ghosts 1": "leave out the corruption | --occlude",
+    "evaluate good.truth.npz --every 2": "leave out the corruption | --occlude",
+    "evaluate good.trc --every 0": "every is 0 | at least 1",
+    "evaluate good.truth.npz good.trc": ".npz",
+    "simulate --optics.noise -1 --out out.c3d": "noise is -1 | at least 0",
 }
 
 
