@@ -325,7 +325,9 @@ def test_links_that_lead_nowhere_are_named(tmp_path, monkeypatch, capsys):
     (tmp_path / "two").symlink_to("one")
     (tmp_path / "gone").symlink_to("nothing")
     for name, link in (("self.c3d", "self.c3d"), ("one/a.c3d", "one"), ("./two", "two")):
-        with error_names(ArgumentError, f"{name} cannot be written: | {link} is a link that leads to itself"):
+        with error_names(
+            ArgumentError, f"{Path(name)} cannot be written: | {link} is a link that leads to itself"
+        ):
             check_outputs([], [tmp_path / name])
     with pytest.raises(ArgumentError, match=r"gone is a link to a folder that is not there"):
         check_outputs([], [tmp_path / "gone" / "a.c3d"])
