@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,9 @@ from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
 from handsim.settings import Limits, Settings
-from train.data.shards import MappedRows
+
+if TYPE_CHECKING:
+    from train.data.shards import MappedRows
 
 _MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 
