@@ -76,7 +76,7 @@ def test_a_capture_without_a_hand_is_told(take, tmp_path, capsys, rng):
 def test_ctrl_c_in_compiled_code_is_no_mistake_of_ours(take, tmp_path, capsys, monkeypatch):
     """Compiled code that is interrupted returns a SystemError."""
     wrapped: list[SystemError] = []
-    compiled = pose_solver.fit_frames
+    compiled = pose_solver._fit_frames
 
     def interrupted(*args: object) -> object:
         signal.setitimer(signal.ITIMER_REAL, 1e-4)
@@ -86,7 +86,7 @@ def test_ctrl_c_in_compiled_code_is_no_mistake_of_ours(take, tmp_path, capsys, m
             wrapped.append(error)
             raise
 
-    monkeypatch.setattr(pose_solver, "fit_frames", interrupted)
+    monkeypatch.setattr(pose_solver, "_fit_frames", interrupted)
     write_capture(tmp_path / "in.c3d", take.capture())
     before = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
