@@ -122,15 +122,7 @@ def fit_size(
     *,
     is_quick: bool = False,
 ) -> SizeFit | None:
-    """The size and proportions of the hands in some frames.
-
-    Args:
-        frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
-        is_quick: Whether hands are looked for as adults' and by the weaker evidence alone.
-
-    Returns:
-        The hands, both of one shape; None if no hand is found that shows most of its markers.
-    """
+    """The size and proportions of the hands in some frames."""
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
@@ -279,11 +271,7 @@ class _Search:
         return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
 
     def measures(self, length: float) -> tuple[float, float]:
-        """Length and breadth [m].
-
-        Args:
-            length: The likeliest of hands of the usual breadth [m].
-        """
+        """Length and breadth [m]."""
         usual = usual_breadth(length)
         low, high = (factor * usual for factor in _BREADTHS)
         breadth = _least(lambda tried: self._cost(length, tried), low, high)
@@ -374,12 +362,6 @@ def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
     """Refuse points that fit hands at another scale, which distances between neighbors tell.
 
     `check_hands` finds that too, after all else that may be wrong.
-
-    Args:
-        frames: Frames of unlabeled points [m], as `sample_frames` gives.
-
-    Raises:
-        ArgumentError: The points fit hands at another scale alone.
     """
     some = _compared(frames)
     if not some:
@@ -406,16 +388,6 @@ def check_hands(
 
     That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
     the working folder.
-
-    Args:
-        frames: Frames of unlabeled points [m], as `sample_frames` gives.
-        options: Those by which the user can name what fits better.
-
-    Raises:
-        ArgumentError: The points fit hands at another scale alone.
-
-    Warns:
-        HandSimWarning: They fit another hand or glove clearly better.
     """
     some = _compared(frames)
     if not some:

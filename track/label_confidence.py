@@ -168,19 +168,10 @@ def _surroundings(
     beside: float,
     far: float,
 ) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "3 U"]]:
-    """What is around the points without a label.
+    """Surroundings of the points without a label.
 
-    Args:
-        points: Points of all frames [m].
-        labels: Their labels, -1 for none.
-        starts: First point of each frame, and the number of points.
-        expected: Markers of the poses [m], NaN where a hand has none.
-        beside: Distance [m] within which points are counted.
-        far: Distance [m] in the place of one from what is not there.
-
-    Returns:
-        The nearest marker without a point; its distance and that of the nearest other point [m], and the
-        number of points without a label beside it.
+    These are the nearest marker without a point, its distance and that of the nearest other point [m], and
+    the number of points without a label nearby.
     """
     count = (labels < 0).sum()
     marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), far)
@@ -217,16 +208,7 @@ def _follow(
     link: float,
     exchange: float,
 ) -> Int[np.ndarray, "P"]:
-    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged.
-
-    Args:
-        points: Points of all frames [m].
-        ids: The system's IDs, -1 for none.
-        starts: First point of each frame, and the number of points.
-        centers: Middle of each hand's markers [m]; the points around it move with it.
-        link: Step [m] to a point of the next frame at most, where IDs do not last.
-        exchange: Step [m] at least of points whose IDs were exchanged.
-    """
+    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged."""
     lives, number = np.full(len(points), -1), 0
     for frame in range(len(starts) - 1):
         first, last = starts[frame], starts[frame + 1]
@@ -269,14 +251,7 @@ def _undo_exchanges(
     source: Int[np.ndarray, "N"],
     exchange: float,
 ) -> None:
-    """Exchange the sources of two points that both jump, if each is where the other one was predicted.
-
-    Args:
-        predicted: The points of the frame before where they are predicted [m].
-        points: Points of the frame [m].
-        source: Which of `predicted` each is, -1 for none; overwritten.
-        exchange: Least jump [m].
-    """
+    """Exchange the sources of two points that both jump, if each is where the other one was predicted."""
     for j in range(len(source)):
         for m in range(j):
             one, other = source[j], source[m]
@@ -312,10 +287,6 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
     """Probability that each point's label is right; of a point without one, that it is no marker.
 
     Confidences of rigid bodies' points stay, and all those of a take without poses.
-
-    Args:
-        take: A take of hands.
-        evidence: What `evidence_of` makes of it, where that is known already.
     """
     confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():

@@ -187,16 +187,7 @@ class BodyTracker:
         self._reset()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
-        """Track the body in the next frame; any content of a stream ends in a status.
-
-        Args:
-            points: All points of the frame [m], in any order, with those of hands and ghosts. Points with
-                coordinates that are not finite are ignored.
-            ids: The system's ID of each point, negative where it gives none.
-
-        Raises:
-            ArgumentError: `points` and `ids` do not fit together.
-        """
+        """Track the body in the next frame; any content of a stream ends in a status."""
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
         if points.shape != (len(ids), 3):
@@ -411,12 +402,7 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
 
 
 def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
-    """Bodies that are tracked together, or one.
-
-    Raises:
-        ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
-        BodyError: A file cannot be loaded.
-    """
+    """Bodies that are tracked together, or one."""
     if isinstance(names_or_paths, AnyBody):
         names_or_paths = (names_or_paths,)
     check_type("bodies", names_or_paths, Iterable, _EXPECTED)
@@ -477,14 +463,6 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
 
     A first template is taken from one frame and tracked through all frames. Then each marker moves to its
     median over the frames.
-
-    Args:
-        capture: A capture of the body in motion; gaps and a few false points are allowed. Marker names are
-            not used.
-
-    Raises:
-        ArgumentError: The capture is not in meters.
-        CalibrationError: Most of the points are not of one rigid body, or the body cannot be tracked.
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])

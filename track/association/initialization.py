@@ -124,12 +124,7 @@ class HandInitializer:
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
     def initialize(self, points: Float[np.ndarray, "N 3"], hands: Sequence[int]) -> list[InitializedHand]:
-        """Look for some of the hands.
-
-        Args:
-            points: Points without a label [m].
-            hands: Indices of the hands that are looked for.
-        """
+        """Look for some of the hands."""
         search = self._searches.pop(tuple(hands), _Search())
         self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
@@ -490,11 +485,7 @@ def _clouds(
 
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
-    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first.
-
-    Args:
-        distance: Longest step [m].
-    """
+    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
     number = _single_linkage(points, distance)
     groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
     return sorted(groups, key=len, reverse=True)

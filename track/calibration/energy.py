@@ -363,13 +363,7 @@ class Problem:
     def apply_step(
         self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
     ) -> Estimate:
-        """The estimate after a step, with new coordinates of its markers on the new hand's skin.
-
-        Args:
-            estimate: The estimate before the step.
-            pose_step: Change of each pose [m, rad], in tangent coordinates of qpos; clipped at 0.5.
-            shared_step: Change of the parameters, then of each marker's rest position [m].
-        """
+        """The estimate after a step, with new coordinates of its markers on the new hand's skin."""
         parameters = estimate.parameters + shared_step[:NUM_PARAMETERS]
         shape = shape_at(self.shape, parameters)
         skin = build_skin(shape)
@@ -412,12 +406,7 @@ def find_touches(
     complete: Bool[np.ndarray, "T 5"],
     rate: float,
 ) -> list[tuple[int, str]]:
-    """Frames and fingers of possible touches.
-
-    Args:
-        model: A right hand.
-        complete: Whether all markers of a digit were seen.
-    """
+    """Frames and fingers of possible touches."""
     by_finger = [thumb_contact(model, angles, finger) for finger in FINGERS]
     gaps = np.stack([-contact.overlap for contact in by_finger], axis=1)
     window = max(1, round(_SPEED_WINDOW * rate))
@@ -461,12 +450,7 @@ def _speed(
 def initialize_contacts(
     model: HandModel, touches: list[tuple[int, str]], T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Contacts of touches, their points first where the two last bones come nearest.
-
-    Args:
-        model: A right hand.
-        touches: Frame and finger of each.
-    """
+    """Contacts of touches, their points first where the two last bones come nearest."""
     points = np.empty((2, len(touches), 3))
     for number, (_, finger) in enumerate(touches):
         ends = _nearest_skin_points(model, T_world_bone[number], finger)
@@ -504,10 +488,6 @@ def slide_contacts(
 
     Each point moves to the point of its skin nearest to a target inside the other pad. A target on the other
     skin would fail where the skins overlap.
-
-    Args:
-        model: A right hand.
-        T_world_bone: Its bones in the frame of each contact.
     """
     skin = build_skin(model.shape)
     sides = [contacts.thumb_coordinates, contacts.finger_coordinates]
@@ -525,13 +505,7 @@ def slide_contacts(
 def contact_geometry(
     contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> ContactGeometry:
-    """How the pads lie to each other.
-
-    Args:
-        corners: Triangles of the thumb's points, then of the fingers' (2 K).
-        model: A right hand.
-        T_world_bone: Its bones in the frame of each contact (K, L, 4, 4).
-    """
+    """How the pads lie to each other."""
     count = len(contacts.frames)
     points, normals = [], []
     for part, coordinates in enumerate((contacts.thumb_coordinates, contacts.finger_coordinates)):
@@ -636,12 +610,7 @@ def contact_gap(estimate: Estimate, fit: Fit) -> float:
 
 
 def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
-    """The right hand of an estimate in its glove.
-
-    Args:
-        right: A right hand in the same glove.
-        estimate: Shape and markers.
-    """
+    """The right hand of an estimate in its glove."""
     shape = shape_at(problem.shape, estimate.parameters)
     return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
@@ -651,9 +620,8 @@ def eliminate_poses(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Schur complement of the poses, with `damping` times the diagonal of their blocks added to it.
 
-    Returns:
-        The reduced system with its gradient as the last column (S, S + 1), and the poses' blocks solved for
-        the shared unknowns and the gradient (F, 26, S + 1).
+    Returns the reduced system with its gradient as last column (S, S + 1), and the poses' blocks solved for
+    the shared unknowns and the gradient (F, 26, S + 1).
     """
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])

@@ -195,20 +195,7 @@ def calibrate_hand(
     *,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Fit a hand and its glove to one user's labeled markers.
-
-    Args:
-        markers: The markers of one hand in the glove's order [m]; NaN where missing. Of joints that do not
-            move and tips that do not touch, what is usual among people stays.
-        start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
-
-    Returns:
-        The calibrated hand in its glove, residuals [m] before and after, and standard errors [m].
-
-    Raises:
-        CalibrationError: Too few frames have enough markers.
-        ArgumentError: `markers` do not fit the glove, or `rate` is not positive.
-    """
+    """Fit a hand and its glove to one user's labeled markers."""
     mirror = MIRROR if start.side == "left" else np.eye(3)
     markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)

@@ -168,19 +168,7 @@ class PoseSolver:
         prior: AnglePrior | None = None,
         iterations: int | None = None,
     ) -> PoseFit:
-        """Poses whose markers are nearest to labeled ones, each frame by itself.
-
-        Args:
-            targets: Labeled markers in the glove's order [m]; NaN where missing.
-            initial: Poses to start from; a hand put together from a few shapes when not given, and where that
-                does not end within 0.5 mm RMS, each of those shapes, of which the best is kept.
-            prior: Distribution of the hinges.
-            iterations: Steps at most from each start; 30 when not given.
-
-        Raises:
-            ArgumentError: `targets`, `initial` or `prior` do not fit the glove or each other, or a frame has
-                fewer than 4 markers.
-        """
+        """Poses whose markers are nearest to labeled ones, each frame by itself."""
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
         frames, markers = len(targets), len(self.hand.digits)
@@ -214,17 +202,7 @@ class PoseSolver:
         wrist: Float[np.ndarray, "7"],
         wrist_spread: tuple[float, float],
     ) -> PoseFit:
-        """`solve` for one frame from a near start, without checks of the arguments: for loops in real time.
-
-        Args:
-            target: Labeled markers [m], at least four; NaN where missing.
-            start: A pose near the solution.
-            angles: Mean of the hinges [rad], see `AnglePrior`.
-            spread: Standard deviation of the hinges [rad].
-            wrist: Predicted position [m] and orientation (wxyz) of the wrist: a prior where the palm lacks a
-                marker or has under three.
-            wrist_spread: Standard deviations of that position [m] and orientation [rad].
-        """
+        """`solve` for one frame from a near start in real time; positions in [m], angles and spreads in [rad]."""
         wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
         prior = _PosePrior(angles[None], spread[None] ** -2.0, wrist_prior)
         return self._run(target[None], start[None], prior, _MOST_STEPS, _ACCURATE)[1]
@@ -293,20 +271,7 @@ def _fit_frames(
     Float[np.ndarray, "T M 3"],
     Int[np.ndarray, "T"],
 ]:
-    """Solve frames one by one.
-
-    Args:
-        shapes: Shapes to start from where there are no initial poses.
-        on_part: Markers on each digit, and on the palm (last).
-        targets: Labeled markers [m]; NaN where missing.
-        initial: Poses to start from, one row per frame or none.
-        robust_scale: See `PoseEnergy`.
-        iterations: Steps at most from each start.
-        small_gain: See `levenberg_marquardt`.
-
-    Returns:
-        Index of the first frame that cannot be solved (or -1), and the arrays of a `PoseFit`.
-    """
+    """Solve frames one by one; the first number is the frame that cannot be solved, or -1."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
