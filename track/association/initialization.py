@@ -129,7 +129,10 @@ class HandInitializer:
         self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
         cut = False
-        for group in self._groups(points, hands):
+        least = min((self._least(index) for index in hands), default=0)
+        for group in linked_groups(np.ascontiguousarray(points), self._link_distance):
+            if not least <= len(group) <= MOST_POINTS:
+                continue
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
             here: list[InitializedHand] = []
@@ -188,12 +191,6 @@ class HandInitializer:
         variance = variance if spread is None else spread**2
         peak = peak_log_odds(np.array([variance]), self._config.stray_density)
         return float(count * peak[0] - 0.5 * (square / variance + taken))
-
-    def _groups(self, points: NDArray[np.float64], hands: Sequence[int]) -> list[NDArray[np.int64]]:
-        """Points that are linked and enough for a hand, the largest group first."""
-        least = min((self._least(index) for index in hands), default=0)
-        groups = linked_groups(np.ascontiguousarray(points), self._link_distance)
-        return [group for group in groups if least <= len(group) <= MOST_POINTS]
 
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
