@@ -22,12 +22,12 @@ from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 
-_MOST_FITTINGS: Final = 20
+_MAX_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
-_LARGEST: Final = 100.0  # [m], of a direction and a bone's number too; far more than any hand has
+_MAX_NUMBER: Final = 100.0  # of positions [m], directions and indices of bones
 _SUM_TOLERANCE: Final = 1e-6
-_UNIT_LENGTH: Final = 1e-3  # by which the length of a normal may differ
-_SLACK: Final = 1e-9  # of barycentric weights: a ray through an edge meets a face
+_NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
+_SLACK: Final = 1e-9  # of barycentric weights, so that a ray through an edge meets a face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,7 @@ class Attachment:
     """Markers of one glove on one hand: rest positions and the weights of the skin under them.
 
     Raises:
-        ArgumentError: An array does not fit the layout, or holds what it cannot.
+        ArgumentError: An array does not fit the layout, or a value is out of range.
     """
 
     layout: MarkerLayout
@@ -46,7 +46,7 @@ class Attachment:
     bone_indices: Int[np.ndarray, "M 4"]
     """The bones that carry each marker."""
     bone_weights: Float[np.ndarray, "M 4"]
-    """Their shares, summing to one."""
+    """Shares of these bones, summing to one."""
 
     def __post_init__(self) -> None:
         for name, width in _WIDTHS.items():
@@ -55,10 +55,12 @@ class Attachment:
                 raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
             if not np.isfinite(getattr(self, name)).all():
                 raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
-            if np.abs(getattr(self, name)).max(initial=0) > _LARGEST:
-                raise ArgumentError(f"{name} holds numbers beyond {_LARGEST:g}, expected markers on a hand")
+            if np.abs(getattr(self, name)).max(initial=0) > _MAX_NUMBER:
+                raise ArgumentError(
+                    f"{name} holds numbers beyond {_MAX_NUMBER:g}, expected markers on a hand"
+                )
         lengths = np.linalg.norm(self.normals, axis=1)
-        if (np.abs(lengths - 1.0) > _UNIT_LENGTH).any():
+        if (np.abs(lengths - 1.0) > _NORMAL_TOLERANCE).any():
             raise ArgumentError("normals are not of unit length, expected the outward directions of markers")
         bones, shares = self.bone_indices, self.bone_weights
         if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
@@ -136,9 +138,9 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
 def vary_layout(
     layout: MarkerLayout, *, along: float, around: float, rng: np.random.Generator
 ) -> MarkerLayout:
-    """The same glove with its markers moved at random along [bone lengths] and around [rad] the bones.
+    """The glove with its markers shifted at random, by standard deviations [bone lengths] and [rad].
 
-    Both are standard deviations; on the palm markers move across too, at half of `along`.
+    On the palm markers shift along and across by half of `along`.
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
@@ -157,11 +159,8 @@ def vary_layout(
 def wear(
     layout: MarkerLayout, model: HandModel, *, along: float, around: float, rng: np.random.Generator
 ) -> Attachment:
-    """The glove put on with its markers slipped a little (`vary_layout`).
-
-    It is drawn again if a marker is off the hand; after twenty draws it is put on as designed.
-    """
-    for _ in range(_MOST_FITTINGS):
+    """Put on a glove with random shifts (`vary_layout`), or as designed if twenty draws miss the hand."""
+    for _ in range(_MAX_FITTINGS):
         try:
             return attach_markers(vary_layout(layout, along=along, around=around, rng=rng), model)
         except LayoutError:
@@ -184,7 +183,7 @@ def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], ND
 def _first_exits(
     origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """First exits from the skin along rays: rays that have one, faces, barycentric weights, distances [m]."""
+    """First exits of rays from the skin: rays that have one, faces, barycentric weights, distances [m]."""
     exits = _exits(origins, directions, surface.vertices, np.ascontiguousarray(surface.faces))
     rays = np.flatnonzero(exits[0] >= 0)
     faces, weights, distances = (each[rays] for each in exits)
@@ -205,7 +204,7 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
         for i in range(3):
             first[i] = vertices[faces[f, 1], i] - corner[i]
             second[i] = vertices[faces[f, 2], i] - corner[i]
-        # A line that meets a triangle comes nearer to its first corner than the longer edge from there.
+        # a line through a triangle comes nearer to its first corner than the longer edge there
         reach = 1.01 * max(_dot(first, first), _dot(second, second))
         for r in range(len(origins)):
             for i in range(3):
@@ -302,7 +301,7 @@ class GloveFit:
         return self.attachment.markers(self.model, self.model.forward_kinematics(qpos))
 
     def visible(self, qpos: Float[np.ndarray, "T 27"], rig: CameraRig) -> Bool[np.ndarray, "T M C"]:
-        """Which cameras see each marker: in view, facing, and not occluded by the hand itself.
+        """Whether each camera sees each marker: in view, facing, and not occluded by the hand itself.
 
         Args:
             qpos: Poses of this hand, wrist position [m] in the world of the rig.
@@ -356,7 +355,7 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
         The hand in its glove; `GloveFit.markers` gives marker centers (T, M, 3) [m] of poses.
 
     Raises:
-        ArgumentError: An argument is none of these.
+        ArgumentError: An argument has another type, or there is no such size.
         LayoutError: There is no such layout, or a marker meets no skin; the message names the marker.
     """
     worn_by = load_model(model)
@@ -380,28 +379,27 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
 
 
 _STEPS: Final = 12
-_NEAR: Final = 1e-5  # [m]
-_REACHED: Final = 5e-4  # [m]
-_POINTED: Final = 2e-4  # [m]
+_CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
+_STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
+_ACCEPTED: Final = 5e-4  # [m] distance at which a marker keeps its bone
 _CURVATURE_RADIUS: Final = 0.006  # of the skin of a finger's tip [m]
-_SPACING: Final = 4e-3  # [m] between the skin's vertices, about
+_SPACING: Final = 4e-3  # [m] of the skin's vertices, roughly
 
 
 def place_marker(
     layout: MarkerLayout, index: int, model: HandModel, point: Float[np.ndarray, "3"]
 ) -> MarkerLayout:
-    """The layout with one marker moved to the place on the skin that is nearest to a point, or an error.
+    """The layout with one marker moved to the place on the skin nearest to a point [m] of the flat hand.
 
-    The point [m] is in the wrist's frame of the flat hand. The marker stays on its bone where that reaches
-    the point, or else goes to the one that carries the skin there. On the palm it lies straight above or
-    below its place in the palm's plane. A marker on a stalk keeps its height; the stalk points at the point.
+    The marker stays on its bone if that reaches the point, or else moves to the bone that carries the skin
+    there. A marker on a stalk keeps its height, and its stalk points at the point.
     """
     surface = model.surface
     nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
     normal = vertex_normals(surface.vertices, surface.faces)[nearest]
     aside = point - surface.vertices[nearest]
     aside -= (aside @ normal) * normal
-    aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _NEAR))
+    aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _CONVERGED))
     center = surface.vertices[nearest] + aside + layout.radius * normal
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
@@ -409,7 +407,7 @@ def place_marker(
         candidate, missed = _place_on(layout, index, bone, model, center, point)
         if missed < least:
             best, least = candidate, missed
-        if least < _REACHED:
+        if least < _ACCEPTED:
             break
     if math.isinf(least):
         raise LayoutError(f"marker '{layout.names[index]}' meets no skin there; move it nearer to the hand")
@@ -424,9 +422,9 @@ def _place_on(
     center: NDArray[np.float64],
     point: NDArray[np.float64],
 ) -> tuple[MarkerLayout, float]:
-    """The layout with a marker on one bone, as near to a center or as much towards a point as can be.
+    """The layout with a marker on one bone, nearest to a center or pointing at a point, and its error [m].
 
-    And how far it misses [m]: infinitely where the bone's rays meet no skin.
+    The error is infinite where the bone's rays meet no skin.
     """
     height, wanted, start = layout.markers[index].height, center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
@@ -437,7 +435,7 @@ def _place_on(
         candidate = dataclasses.replace(layout, markers=markers)
         try:
             worn = attach_markers(candidate, model)
-        except LayoutError:  # beside the skin, as beyond a finger's tip
+        except LayoutError:  # the ray misses the skin, as beyond a finger's tip
             wanted = wanted + 0.1 * (middle - wanted)
             continue
         missed = (point if height else center) - worn.points[index]
@@ -446,15 +444,15 @@ def _place_on(
         distance = float(np.linalg.norm(missed))
         if distance < least:
             least, best = distance, candidate
-        if least < (_POINTED if height else _NEAR):
+        if least < (_STALK_CONVERGED if height else _CONVERGED):
             break
-        # On skin as curved as a finger's tip the end of a stalk moves more than its foot.
+        # on curved skin the end of a stalk moves more than its foot
         wanted = wanted + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
     return best, least
 
 
 def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.float64]) -> MarkerPlace:
-    """The place on a bone whose ray goes through a point."""
+    """The place on a bone whose ray passes through a point."""
     T_wrist_bone = model.rest_transforms[bone]
     x, y, z = T_wrist_bone[:3, :3].T @ (point - T_wrist_bone[:3, 3])
     y *= 1.0 if model.shape.side == "right" else -1.0

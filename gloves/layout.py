@@ -29,12 +29,12 @@ FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
 _RADIUS_RANGE: Final = (0.0005, 0.015)  # [m]
 ALONG_RANGE: Final = (-0.3, 1.3)
-"""Of `MarkerPlace.along`."""
+"""Range of `MarkerPlace.along`."""
 _AROUND_RANGE: Final = (-180.0, 180.0)  # [deg]
 ACROSS_RANGE: Final = (-1.0, 1.0)
-"""Of `MarkerPlace.across`."""
+"""Range of `MarkerPlace.across`."""
 HEIGHT_RANGE: Final = (0.0, 0.05)
-"""Of `MarkerPlace.height` [m]."""
+"""Range of `MarkerPlace.height` [m]."""
 _ARM: Final = {
     "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
     "forearm": "markers beyond the wrist's joint move against the hand and are not modeled",
@@ -76,22 +76,21 @@ class MarkerPlace:
     bone: str
     """One of `handsim.hand.shape.BONE_NAMES`; pinky_distal is another name of little_distal, and so on."""
     along: float
-    """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
+    """Position along the bone: 0 at its near end, 1 at its far end, and up to 0.3 beyond either."""
     around: float
     """Angle about the bone [rad]: 0 back, pi/2 thumb side, -pi/2 little-finger side, pi palm side."""
     across: float = 0.0
     """For the palm alone: sideways from its middle, in hand breadths, positive towards the thumb."""
     height: float = 0.0
-    """Length of the stalk [m]: how far the center stands above its place on the skin without one."""
+    """Length of the marker's stalk [m]."""
 
     def __post_init__(self) -> None:
         check_type("name of a marker", self.name, str, "text")
         check_type(f"bone of marker '{self.name}'", self.bone, str, "the name of one", BONE_NAMES)
         object.__setattr__(self, "bone", _ALIASES.get(self.bone, self.bone))
         for key in ("along", "around", "across", "height"):
-            check_type(
-                f"{key} of marker '{self.name}'", getattr(self, key), (int, float, np.number), "a number"
-            )
+            kinds = (int, float, np.number)
+            check_type(f"{key} of marker '{self.name}'", getattr(self, key), kinds, "a number")
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
             raise LayoutError(
                 f"marker name {self.name!r}: expected printable characters without outer blanks"
@@ -102,18 +101,13 @@ class MarkerPlace:
             )
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
-        degrees = math.degrees(self.around)
+        degrees, millimeters = round(math.degrees(self.around), 9), round(1e3 * self.height, 9)
+        heights = (0.0, 1e3 * HEIGHT_RANGE[1])
         for key, value, (low, high), unit, given in (
             ("along", self.along, ALONG_RANGE, "", ""),
-            ("around", round(degrees, 9), _AROUND_RANGE, " degrees", f" ({self.around:g} rad)"),
+            ("around", degrees, _AROUND_RANGE, " degrees", f" ({self.around:g} rad)"),
             ("across", self.across, ACROSS_RANGE, "", ""),
-            (
-                "height",
-                round(1e3 * self.height, 9),
-                (0.0, 1e3 * HEIGHT_RANGE[1]),
-                " mm",
-                f" ({self.height:g} m)",
-            ),
+            ("height", millimeters, heights, " mm", f" ({self.height:g} m)"),
         ):
             if not low <= value <= high:
                 raise LayoutError(
@@ -128,7 +122,7 @@ class MarkerPlace:
 
 @dataclass(frozen=True, slots=True)
 class MarkerLayout:
-    """A marker glove: 5 to 60 markers of one radius, in the order that labels count in.
+    """A marker glove: 5 to 60 markers of one radius, in the order of their labels.
 
     Raises:
         LayoutError: Too few or too many markers, two of one name, or a radius outside 0.5 to 15 mm.
@@ -156,9 +150,8 @@ class MarkerLayout:
             raise LayoutError(
                 f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
             )
-        names = self.names
-        for index, name in enumerate(names):
-            if name in names[:index]:
+        for index, name in enumerate(self.names):
+            if name in self.names[:index]:
                 raise LayoutError(f"two markers are named '{name}'; every marker needs a name of its own")
         low, high = _RADIUS_RANGE
         if not low <= self.radius <= high:
@@ -166,7 +159,6 @@ class MarkerLayout:
                 f"radius is {self.radius * 1e3:g} mm ({self.radius:g} m), expected {low * 1e3:g} to "
                 f"{high * 1e3:g} mm"
             )
-
         for side in self.sides:
             if side not in SIDES:
                 raise LayoutError(f"sides: {choices(side, SIDES, noun='side')}")
@@ -185,7 +177,7 @@ class MarkerLayout:
         return self.radius + np.array([marker.height for marker in self.markers])
 
     def check_side(self, side: Side) -> None:
-        """Raise a `LayoutError` if the glove does not fit this hand."""
+        """Refuse a hand that the glove does not fit by a `LayoutError`."""
         if side not in self.sides:
             raise LayoutError(
                 f"glove '{self.name}' is for a {self.sides[0]} hand only (its file's `sides`), and a {side} "
@@ -212,13 +204,13 @@ class MarkerLayout:
 
 @dataclass(frozen=True, slots=True)
 class ShippedLayout:
-    """A layout that comes with the package, and what its file says about it."""
+    """A layout that comes with the package, its description and its source."""
 
     layout: MarkerLayout
     description: str
     """One sentence."""
     source: str
-    """Where its markers were described: a publication or a page."""
+    """The publication or page that describes the markers."""
 
 
 def list_layouts() -> tuple[str, ...]:
@@ -268,7 +260,7 @@ def shipped_layout(name: str) -> ShippedLayout:
 
 
 def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
-    """A layout from what `dataclasses.asdict` made of it, as takes and training sets keep it."""
+    """A layout from its record in takes and training sets, made by `dataclasses.asdict`."""
     markers = tuple(MarkerPlace(**marker) for marker in stored["markers"])
     return MarkerLayout(**{**stored, "markers": markers})
 
@@ -338,13 +330,13 @@ def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
 
 _TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
 _ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
-_DECIMALS: Final = 1e-8
+_TOLERANCE: Final = 1e-8
 
 
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
-    """The text of a layout file with the same markers in the same order where `layout` has them.
+    """The text of a layout file with its markers moved as in `layout`, and whether its comments stay.
 
-    And whether comments stay: a text that cannot be changed line by line is written anew, without them.
+    A text that cannot be changed line by line is written anew, without comments.
     """
     lines = text.splitlines()
     starts = [number for number, line in enumerate(lines) if _TABLE.match(line)]
@@ -359,7 +351,7 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
 
 
 def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
-    """The lines of one table with the values of a marker; a value that is the same stays as it is written."""
+    """The lines of one table with the values of a marker; equal values keep their text."""
     numbers = {"along": marker.along, "around": math.degrees(marker.around)}
     optional = {"across": marker.across, "height_mm": 1e3 * marker.height}
     numbers |= optional
@@ -385,26 +377,23 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
 
 def _is_number(text: str, value: float) -> bool:
     try:
-        return abs(float(text) - value) < _DECIMALS
+        return abs(float(text) - value) < _TOLERANCE
     except ValueError:
         return False
 
 
 def _says(text: str, layout: MarkerLayout) -> bool:
-    """Whether a text is this layout's, as far as a file's decimals go."""
+    """Whether a text describes this layout, up to the decimals of a file."""
     try:
         read = parse_layout(tomllib.loads(text))
     except (HandSimError, ValueError):
         return False
-    return (
-        read.sides == layout.sides
-        and len(read.markers) == layout.num_markers
-        and all(
-            (ours.name, ours.bone) == (theirs.name, theirs.bone)
-            and abs(ours.along - theirs.along) < _DECIMALS
-            and abs(ours.around - theirs.around) < _DECIMALS
-            and abs(ours.across - theirs.across) < _DECIMALS
-            and abs(ours.height - theirs.height) < _DECIMALS
-            for ours, theirs in zip(read.markers, layout.markers, strict=True)
-        )
+    if (read.sides, read.names) != (layout.sides, layout.names):
+        return False
+    if [marker.bone for marker in read.markers] != [marker.bone for marker in layout.markers]:
+        return False
+    ours, theirs = (
+        np.array([(marker.along, marker.around, marker.across, marker.height) for marker in one.markers])
+        for one in (read, layout)
     )
+    return bool((np.abs(ours - theirs) < _TOLERANCE).all())

@@ -20,20 +20,20 @@ from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles
 
 FARTHEST: Final = 0.4
-"""Where the search for the first contact begins [m], measured along the axis."""
+"""Distance along the axis at which the search for a contact begins [m]."""
 NEAREST: Final = -0.15
-"""Where it ends without one [m]."""
-_PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
-_STEP: Final = 0.15  # of all joints together [rad], from open to closed until the first that is blocked
-_HALVINGS: Final = 6  # of that last step, or fewer where that is exact to
-_PRECISION: Final = 0.003  # of all joints together [rad]
+"""Distance at which the search ends without a contact [m]."""
+_PRESS: Final = 0.0005  # depth of the contact [m]
+_STEP: Final = 0.15  # step of closing fingers, summed over joints [rad]
+_HALVINGS: Final = 6  # bisections of the first blocked step, at most
+_PRECISION: Final = 0.003  # at which bisection stops, summed over joints [rad]
 
 
 class Digit(NamedTuple):
-    """The data of a digit that the searches need: three bones, four joints, three capsules."""
+    """A digit for compiled searches: three bones, four joints, three capsules."""
 
     capsules: NDArray[np.int64]
-    """Indices of its capsules among the hand's (3,)."""
+    """Indices of the digit's capsules in the hand (3,)."""
     others: NDArray[np.int64]
     """Indices of the hand's other capsules (K - 3,)."""
     offsets: NDArray[np.float64]
@@ -41,19 +41,19 @@ class Digit(NamedTuple):
     rotations: NDArray[np.float64]
     """Orientation of each bone in its parent's frame at zero angles (3, 3, 3)."""
     axes: NDArray[np.float64]
-    """Unit axes of its joints in the frames of the bones they move (4, 3)."""
+    """Unit joint axes in the frames of the bones they move (4, 3)."""
     ends: NDArray[np.float64]
     """Both ends of each capsule in its bone's frame (3, 2, 3) [m]."""
     radii: NDArray[np.float64]
-    """Radii of its capsules (3,) [m]."""
+    """Radii of the digit's capsules (3,) [m]."""
     meets: NDArray[np.bool_]
-    """Which capsules of the hand each of its own may collide with (3, K)."""
+    """Capsules of the hand that each capsule of the digit may collide with (3, K)."""
     reach: float
-    """Largest distance of its skin from its first joint [m]."""
+    """Largest distance of the digit's skin from its first joint [m]."""
 
 
 class DigitPaths(NamedTuple):
-    """A digit's path in every frame: the pose of the wrist, and joint angles at the start and at the goal."""
+    """Paths of a digit: the pose of the wrist, and joint angles at start and goal, in every frame."""
 
     rotations: NDArray[np.float64]
     """Orientation of the wrist (T, 3, 3)."""
@@ -66,14 +66,14 @@ class DigitPaths(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """Capsules that a digit may meet: those of the other hand and of its own."""
+    """Capsules of both hands that a digit may meet."""
 
     segments: NDArray[np.float64]
     """Axes in the world (T, K, 2, 3) [m]."""
     radii: NDArray[np.float64]
-    """Their radii (K,) [m]."""
+    """Radii (K,) [m]."""
     meets: NDArray[np.bool_]
-    """Which of them stop which of the digit's bones (3, K)."""
+    """Obstacles that stop each bone of the digit (3, K)."""
     press: float
     """Depth to which the digit may press into them [m]."""
 
@@ -147,13 +147,7 @@ def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 
 @kernel
 def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any:
-    """Share (T,) of its path that a digit can follow before it meets something.
-
-    Args:
-        paths: The digit's `DigitPaths`.
-        parts: The `Digit`.
-        obstacles: The `Obstacles`.
-    """
+    """Share (T,) of its path that a digit can follow before it meets an obstacle."""
     share = np.ones(len(paths.start))
     near = np.empty(len(obstacles.radii), dtype=np.int64)
     centers, sizes = np.empty((len(near), 3)), np.empty(len(near))
@@ -235,8 +229,8 @@ def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
     return posed
 
 
-# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each stage has a depth
-# [m] to which a finger presses into the other hand or its own, and the joints of a digit that it moves.
+# Fingers close in two stages, all joints and then those beyond the knuckle: depth [m] to which a finger may
+# press into a hand, and joints of the digit.
 _STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
 _ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
 
@@ -250,8 +244,8 @@ def first_contact(
 ) -> Float[np.ndarray, "T"]:
     """Distance along `axis` [m] at which the moving hand, coming from outside, first touches the still one.
 
-    Everything farther out is free. Frames without a contact give `NEAREST`. The axis is the unit direction in
-    the world in which the moving hand backs off; its poses are those at distance zero.
+    Frames without a contact give `NEAREST`. The axis is the unit direction in which the moving hand backs
+    off from its given poses, which have distance zero.
     """
     distance: NDArray[np.float64] = search_contact(
         moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
@@ -275,8 +269,7 @@ def close_fingers(
 ) -> Float[np.ndarray, "T 20"]:
     """Joint angles [rad] of fingers that close from one pose towards another until they meet a hand.
 
-    Each digit closes by its share of the path that is free of its own hand and the other. Paths are smoothed
-    over a window of frames; 1 leaves each frame alone.
+    Each digit follows its path as far as it is free of both hands, smoothed over a window of frames.
     """
     busy = np.flatnonzero(strength.max(axis=1) > 0.0)
     angles = opened[:, 7:].copy()
@@ -344,7 +337,7 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
 
 
 MAX_OVERLAP: Final = 0.001
-"""How deep two hands may press into each other [m]."""
+"""Largest overlap of two hands [m]."""
 RATE: Final = 120.0
 """Frames per second [Hz]."""
 MAX_SPEED: Final = 10.0
@@ -352,13 +345,13 @@ MAX_SPEED: Final = 10.0
 MAX_ACCELERATION: Final = 200.0
 """Largest joint acceleration [rad/s^2]."""
 WRIST_SPEED: Final = 1.0
-"""Highest speed of the pair, and of either hand against it between two meetings [m/s]."""
+"""Highest speed of the pair of hands, and of a hand relative to the pair between meetings [m/s]."""
 APPROACH: Final = (0.4, 0.8)
-"""Shortest and longest time to come together or to let go [s]."""
+"""Shortest and longest time of an approach or a release [s]."""
 VOLUME: Final = 0.2
 """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
-_TURNING: Final = 8.0  # fastest rotation of one hand against the other [rad/s]
-_DISTANCE: Final = (0.25, 0.45)  # between the wrists of hands that are apart [m]
+_TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
+_DISTANCE: Final = (0.25, 0.45)  # of the wrists of separate hands [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -378,18 +371,14 @@ class Passage:
         return len(self.right)
 
     def at(self, frames: Any) -> Passage:
-        """Some of its frames."""
+        """The passage at some frames."""
         return Passage(self.rotation[frames], self.position[frames], self.right[frames], self.left[frames])
 
 
 def join_passages(passages: list[Passage]) -> Passage:
     """Passages concatenated in time."""
-    return Passage(
-        np.concatenate([passage.rotation for passage in passages]),
-        np.concatenate([passage.position for passage in passages]),
-        np.concatenate([passage.right for passage in passages]),
-        np.concatenate([passage.left for passage in passages]),
-    )
+    parts = ((one.rotation, one.position, one.right, one.left) for one in passages)
+    return Passage(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def path_between(
@@ -401,7 +390,7 @@ def path_between(
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one pose to another by way of a rest [s] with hands apart; None when not valid."""
+    """Frames from one pose to another through a rest [s] with hands apart; None if not valid."""
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
     )

@@ -44,18 +44,18 @@ MAX_OBJECT_PENETRATION: Final = 0.0015
 _TIMESTEP: Final = 0.002
 _MOTOR_STIFFNESS: Final = 2.0  # [N m/rad]
 _DAMPING: Final = 0.04  # [N m s/rad]
-_ARMATURE: Final = 1e-4  # [kg m^2], tendons and muscles that move along
-# Strongest torque [N m] of a finger's abduction, MCP, PIP and DIP, and of the thumb's four hinges.
+_ARMATURE: Final = 1e-4  # [kg m^2], inertia of tendons and muscles
+# Largest torques [N m] of a finger's abduction, MCP, PIP and DIP, and of the thumb's four hinges.
 _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)
-_GUIDE_TIME: Final = (0.03, 1.0)  # of a soft constraint that holds the object while fingers close
-_FAR: Final = 0.5  # [m], beyond which distances are not needed
+_GUIDE_TIME: Final = (0.03, 1.0)  # of the soft constraint that holds the object while fingers close
+_MAX_DISTANCE: Final = 0.5  # [m] of a capsule from the object that is measured
 
 
 class GraspScene:
-    """One hand and one object, compiled. Poses are in the wrist's frame; the scene itself keeps no state."""
+    """A compiled model of one hand and one object, without a state. Poses are in the wrist's frame."""
 
     def __init__(self, model: HandModel, obj: RigidObject) -> None:
         self.hand = model
@@ -83,15 +83,12 @@ class GraspScene:
 
     def distances(self, data: mujoco.MjData, geoms: Sequence[int] | None = None) -> NDArray[np.float64]:
         """Distance [m] of some of the hand's capsules, or all, to the object (K,), negative inside it."""
-        return np.array(
-            [
-                min(
-                    mujoco.mj_geomDistance(self.mj_model, data, geom, part, _FAR, None)
-                    for part in self.object_geoms
-                )
-                for geom in (self.hand_geoms if geoms is None else geoms)
-            ]
-        )
+
+        def distance(geom: int, part: int) -> float:
+            return float(mujoco.mj_geomDistance(self.mj_model, data, geom, part, _MAX_DISTANCE, None))
+
+        hand = self.hand_geoms if geoms is None else geoms
+        return np.array([min(distance(geom, part) for part in self.object_geoms) for geom in hand])
 
     def depth(
         self, angles: Float[np.ndarray, "T 20"], T_wrist_object: Float[np.ndarray, "T 4 4"]
@@ -190,12 +187,12 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
 
 
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
-_SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
+_SLIDE: Final = 0.15  # [m] below the palm: start of an object that is raised to it
 _SLIDE_HALVINGS: Final = 12
-_ANY: Final = "any"  # the entry for objects that have none of their own
+_ANY: Final = "any"  # the entry of objects without one of their own
 _ROUNDS: Final = 12
-_STIFFNESS: Final = 0.006  # [m/rad]: residual of a tip that weighs as much as a joint's deviation
-_LONGEST_STEP: Final = 0.2  # [rad]
+_STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
+_MAX_STEP: Final = 0.2  # [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,29 +207,29 @@ class HoldStyle:
     strength: Float[np.ndarray, "20"]
     """Share of the motors' torques."""
     palm_up: float
-    """Share of its weight with which the object lies in the palm while the fingers close."""
+    """Share of the object's weight that presses it into the palm while the fingers close."""
     needs: tuple[str, ...]
     """Bones or digits that must touch the object."""
     fingers: int
-    """Number of fingers that must touch it."""
+    """Number of fingers that must touch the object."""
     free: tuple[str, ...]
     """Digits that may leave the object."""
     press: tuple[str, ...]
-    """Digits that may tap on it."""
+    """Digits that may tap on the object."""
     scribble: float
     """Amplitude of a writing wrist [m]; 0 for objects that do not write."""
     entry: dict[str, Any]
-    """The rest of its entry: placement, axes and variation."""
+    """The entry in the library, with placement, axes and variation."""
 
 
 def hold_names(obj: RigidObject) -> tuple[str, ...]:
-    """Names of the ways to hold an object; one loaded from a file has a single way, `"grasp"`."""
+    """Names of the ways to hold an object; an object loaded from a file has one, `"grasp"`."""
     return tuple(_holds(obj))
 
 
 @lru_cache(maxsize=64)
 def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them."""
+    """A way to hold an object, with the angles retargeted to this hand."""
     holds = _holds(obj)
     check_choice(name, holds, noun=f"hold of the {obj.name}")
     entry = holds[name]
@@ -277,7 +274,7 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
     pose = np.eye(4)
-    # Everything is placed for a right hand, then mirrored.
+    # everything is placed for a right hand, then mirrored
     if "between" in placement:
         at = np.mean([_landmark(model, bones, mark) for mark in placement["between"]], axis=0) @ mirror
         back = _landmark(model, bones, placement["through"]) @ mirror
@@ -301,7 +298,7 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
 
 
 def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
-    """Middle of an object's bounding box, x along its shortest side and z along its longest."""
+    """Frame in the middle of an object's bounding box, x along its shortest side and z along its longest."""
     low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
     shortest, _, longest = np.argsort(high - low, kind="stable")
     x, z = np.eye(3)[shortest], np.eye(3)[longest]
@@ -350,10 +347,9 @@ def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]
 
 
 def retarget_angles(model: HandModel, angles: Float[np.ndarray, "P 20"]) -> Float[np.ndarray, "P 20"]:
-    """Joint angles [rad] that bring the last joints and the tips of a hand where the mean hand has them.
+    """Joint angles [rad] that bring last joints and tips to their positions in the mean hand of this size.
 
-    The mean hand has the same length and breadth. `angles` are its poses; the result differs as little from
-    them as the other proportions need.
+    `angles` are poses of the mean hand; the result stays near them.
     """
     shape = model.shape
     mean = HandModel(shape_from_measures(shape.length, shape.breadth, side=shape.side))
@@ -367,7 +363,7 @@ def retarget_angles(model: HandModel, angles: Float[np.ndarray, "P 20"]) -> Floa
             residuals = np.concatenate([away, _STIFFNESS * (angles - solutions)[number]])
             system = np.concatenate([jacobian.reshape(-1, NUM_JOINTS), stiff])
             step = np.linalg.lstsq(system, residuals, rcond=None)[0]
-            solutions[number] += np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+            solutions[number] += np.clip(step, -_MAX_STEP, _MAX_STEP)
         solutions = np.clip(solutions, LOW, HIGH)
     return solutions
 
@@ -388,17 +384,17 @@ def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.fl
     return placed, skinned_jacobian(model, bones, points, indices, weights)[..., 6:]
 
 
-_MOST_TRIES: Final = 40
-_LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles between tries
-_RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
+_MAX_TRIES: Final = 40
+_TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # of the angles in the first tries and later ones
+_RAMP: Final = 10  # steps of the motors' targets from open to closed
 _CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
 _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_MOST_DRIFT: Final = 0.004  # [m] while shaken
-_MOST_ROTATION: Final = np.deg2rad(8.0)
-_TOUCHING: Final = 0.0005  # [m]
-_DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
-_SLOW: Final = 0.5  # [rad/s], of the hinges at the end
+_MAX_DRIFT: Final = 0.004  # [m] of the shaken object
+_MAX_ROTATION: Final = np.deg2rad(8.0)  # of the shaken object
+_TOUCHING: Final = 0.0005  # [m] largest distance of a contact
+_MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
+_MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -406,7 +402,7 @@ class Hold:
     """A grasp: a hand that holds an object."""
 
     name: str
-    """The style of the hold, one of `hold_names`."""
+    """One of `hold_names`."""
     angles: Float[np.ndarray, "20"]
     """Joint angles [rad]."""
     T_wrist_object: Float[np.ndarray, "4 4"]
@@ -418,25 +414,25 @@ class Hold:
 def settle_hold(
     model: HandModel, obj: RigidObject, *, rng: np.random.Generator, hold: str | None = None
 ) -> Hold:
-    """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
+    """Simulate a grasp until one is valid: place the object, close the fingers with limited torque, shake it.
 
-    The hold is one of `hold_names`, a random one when not given.
+    The hold is one of `hold_names`, by default a random one.
     """
     names = hold_names(obj) if hold is None else (hold,)
     scene = grasp_scene(model, obj)
     why = ""
-    for attempt in range(_MOST_TRIES):
+    for attempt in range(_MAX_TRIES):
         style = hold_style(model, obj, names[rng.integers(len(names))])
         settled = try_hold(scene, _varied(style, attempt, rng), rng=rng)
         if isinstance(settled, Hold):
             return settled
         why = settled
-    raise PoseError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+    raise PoseError(f"this hand does not get hold of the {obj.name} in {_MAX_TRIES} tries: {why}")
 
 
 def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:
-    """The style with slightly different angles; the change grows with the number of failed tries."""
-    spread = _LOOSENESS[min(attempt, len(_LOOSENESS) - 1)]
+    """The style with random changes of its angles, which grow with the number of failed tries."""
+    spread = _TRY_SPREADS[min(attempt, len(_TRY_SPREADS) - 1)]
     change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
     opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
     return dataclasses.replace(style, open=opened, closed=closed)
@@ -447,7 +443,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
     _close(scene, data, style, start)
-    _shake(scene, data)  # it settles
+    _shake(scene, data)  # so that the object settles
     before = scene.object_pose(data)
     _shake(scene, data)
     if not _stayed(scene, data, before):
@@ -455,7 +451,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
     if not is_valid(scene.hand, angles[None])[0]:
         return "the fingers penetrate each other"
-    if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
+    if scene.depth(angles[None], pose[None])[0] > _MAX_SETTLED_DEPTH:
         return "the fingers penetrate it"
     distances = scene.distances(scene.new_data(angles, pose))
     names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
@@ -467,7 +463,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
 
 
 def why_not_held(style: HoldStyle, touching: set[str]) -> str:
-    """What a hold by these capsules of the hand lacks; an empty string if it holds."""
+    """Why these touching capsules do not hold the object; an empty string if they do."""
     for need in style.needs:
         if not any(name.startswith(need) for name in touching):
             return f"the {need} does not touch it"
@@ -476,7 +472,7 @@ def why_not_held(style: HoldStyle, touching: set[str]) -> str:
 
 
 def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
-    """Close the fingers; the object is first guided by a soft spring, then free, or lies in the palm."""
+    """Close the fingers around the object, which a soft spring guides at first."""
     model = scene.mj_model
     guide = transform_poses(start[None])[0]
     data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
@@ -496,9 +492,9 @@ def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDAr
 def _set_targets(
     scene: GraspScene, data: mujoco.MjData, style: HoldStyle, target: NDArray[np.float64]
 ) -> None:
-    """Set the motors' targets, so near to the joint angles that no torque exceeds the style's share.
+    """Set the motors' targets so near to the joint angles that torques stay within the style's strength.
 
-    A motor at its torque limit would yield to any push; these keep their stiffness in both directions.
+    Unlike a motor at its torque limit, such a motor stays stiff in both directions.
     """
     here = data.qpos[:NUM_JOINTS]
     limit = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
@@ -506,7 +502,7 @@ def _set_targets(
 
 
 def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
-    """Pull the object by its own weight towards the four corners of a tetrahedron, then let it rest."""
+    """Pull the object with its own weight in the four directions of a tetrahedron, then let it rest."""
     body = scene.mj_model.body("object").id
     for corner in _TETRAHEDRON:
         data.xfrc_applied[body, :3] = scene.obj.mass * _GRAVITY * corner
@@ -516,20 +512,20 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
 
 
 def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
-    """Whether the object is where it was, and the fingers are still."""
+    """Whether the object stayed in place and the fingers are at rest."""
     after = scene.object_pose(data)
     drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
     rotation = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
-    slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
-    return bool(drift < _MOST_DRIFT and rotation < _MOST_ROTATION and slow and np.isfinite(data.qpos).all())
+    slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _MAX_FINAL_SPEED
+    return bool(drift < _MAX_DRIFT and rotation < _MAX_ROTATION and slow and np.isfinite(data.qpos).all())
 
 
-_DEEPEST_HELD: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], room for rounding in the world's frame
+_MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
 _HALVINGS: Final = 4
-_OPENS: Final = 0.55  # how often a free digit lifts
-_TAPS: Final = 0.3  # how often a pressing digit lifts
-_STILL: Final = 0.3  # how often the object stays as it is
-# Largest opening of a lifted digit [rad]: the thumb's four joints; abduction (either way), MCP, PIP, DIP.
+_LIFT_CHANCE: Final = 0.55  # of a free digit
+_TAP_CHANCE: Final = 0.3  # of a pressing digit
+_STILL_CHANCE: Final = 0.3  # of an object that does not move in the hand
+# Largest opening of a lifted digit [rad]: the thumb's four joints; abduction (both ways), MCP, PIP, DIP.
 _LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
 _TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
 _TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # of digits that hold
@@ -548,9 +544,9 @@ class Held(NamedTuple):
 def sample_held_poses(
     model: HandModel, obj: RigidObject, hold: Hold, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "B 20"], Float[np.ndarray, "B 4 4"]]:
-    """Valid variants of a hold: free digits lift, others tap or press, the object tilts a little.
+    """Valid variants of a hold, joint angles [rad] and `T_wrist_object` [m].
 
-    Returns joint angles [rad], and `T_wrist_object` [m].
+    Free digits lift, others tap or press, and the object tilts a little.
     """
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])
@@ -559,12 +555,12 @@ def sample_held_poses(
     angles = np.clip(hold.angles + _deviations(style, count, rng), LOW, HIGH)
     poses = np.tile(hold.T_wrist_object, (count, 1, 1))
     shift, rotation = (scale * rng.standard_normal((count, 3)).clip(-2.0, 2.0) for scale in _WOBBLE)
-    still = rng.random(count) < _STILL
+    still = rng.random(count) < _STILL_CHANCE
     shift[still], rotation[still] = 0.0, 0.0
     poses[:, :3, 3] += shift
     poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
     target = Held(angles, poses)
-    # The path from the hold is bisected, so that what penetrates ends where it touches.
+    # bisect the paths from the hold to poses that penetrate, so that they end at the contact
     share = np.where(is_held_valid(scene, target), 1.0, 0.0)
     step = 1.0
     todo = np.flatnonzero(share == 0.0)
@@ -577,7 +573,7 @@ def sample_held_poses(
 
 
 def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
-    """Poses at shares (B,) of the path from one start to one end or to one end each."""
+    """Poses at shares (B,) of the paths from one start to one end or B ends."""
     angles = start.angles + share[:, None] * (end.angles - start.angles)
     poses = np.tile(np.eye(4), (len(share), 1, 1))
     poses[:, :3, 3] = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
@@ -587,15 +583,15 @@ def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
 
 
 def rotation_between(start: Held, end: Held) -> NDArray[np.float64]:
-    """Rotation vectors (B, 3) [rad] from one orientation of the object to another, in its own frame."""
+    """Rotation vectors (B, 3) [rad] from the start to the end, in the object's frame."""
     between = np.swapaxes(start.poses[:, :3, :3], 1, 2) @ end.poses[:, :3, :3]
     return np.asarray(Rotation.from_matrix(between).as_rotvec())
 
 
 def is_held_valid(scene: GraspScene, held: Held) -> Bool[np.ndarray, "B"]:
-    """Which poses are inside all ranges and penetrate neither the hand nor the object."""
+    """Whether each pose is in range and penetrates neither the hand nor the object."""
     valid: NDArray[np.bool_] = is_valid(scene.hand, held.angles)
-    valid[valid] = scene.depth(held.angles[valid], held.poses[valid]) <= _DEEPEST_HELD
+    valid[valid] = scene.depth(held.angles[valid], held.poses[valid]) <= _MAX_HELD_DEPTH
     return valid
 
 
@@ -604,7 +600,7 @@ def _deviations(style: HoldStyle, count: int, rng: np.random.Generator) -> NDArr
     deviations = _TREMBLE * rng.standard_normal((count, len(DIGITS), 4)).clip(-2.0, 2.0)
     for index, digit in enumerate(DIGITS):
         kind = min(index, 1)
-        for digits, most, often in ((style.press, _TAP, _TAPS), (style.free, _LIFT, _OPENS)):
+        for digits, most, often in ((style.press, _TAP, _TAP_CHANCE), (style.free, _LIFT, _LIFT_CHANCE)):
             if digit not in digits:
                 continue
             lifts = rng.random(count) < often

@@ -38,15 +38,15 @@ from poses.touch import touching_angles
 PEAK_SPEED: Final = 1.875
 """Peak speed of the minimum-jerk profile, in distances per duration."""
 PEAK_ACCELERATION: Final = 5.7735
-"""Its peak acceleration, in distances per duration squared."""
-# Which digits move first on a path to rest: all at once, one before the others, one after them.
+"""Peak acceleration of the minimum-jerk profile, in distances per duration squared."""
+# Joints that move first on a path to rest: all, those of one digit, those of all other digits.
 _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     np.repeat((np.arange(len(DIGITS)) == digit) == first, 4)
     for first in (True, False)
     for digit in range(len(DIGITS))
 ]
-_ROUNDS: Final = 2
-_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # how far the fingers part before, in shares of the gesture "spread"
+_ROUNDS: Final = 2  # of random durations for each path
+_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # spreads of the fingers at first, relative to the gesture "spread"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class MotionConfig(Settings):
     max_acceleration: Annotated[float, Limits(0.0, above=True)] = 200.0
     """Largest joint acceleration [rad/s^2]."""
     durations: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.15, 0.8)
-    """Shortest and longest time of a path that the limits would allow to be quicker [s]."""
+    """Shortest and longest time of a path; speed limits may make it longer [s]."""
     hold: Annotated[float, Limits(0.0)] = 0.3
     """Longest rest at a pose [s]."""
     volume: Annotated[float, Limits(0.0)] = 0.3
@@ -70,7 +70,7 @@ class MotionConfig(Settings):
 
 
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
-    """Share of the path after each of `frames` frames, the last one being 1."""
+    """Share of a minimum-jerk path after each of `frames` frames; the last is 1."""
     time = np.arange(1, frames + 1) / frames
     return time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
 
@@ -78,7 +78,7 @@ def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
 def straight_path(
     start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Frames (T, 20) [rad] from one pose (left out) to another, of a drawn duration within the limits."""
+    """Frames (T, 20) [rad] from one pose (not included) to another, with a random duration."""
     distance = np.abs(target - start).max()
     quickest = max(
         PEAK_SPEED * distance / config.max_speed,
@@ -89,7 +89,7 @@ def straight_path(
 
 
 def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    """The frames, and a rest in the last pose."""
+    """The path, and a random rest at its end."""
     pause = int(rng.uniform(0.0, config.hold) * config.rate)
     return np.concatenate([path, np.repeat(path[-1:], pause, axis=0)])
 
@@ -97,8 +97,8 @@ def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generat
 def path_to_rest(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Valid frames (T, 20) [rad] from a pose to rest: the straight path or the first detour that is valid."""
-    # Each round draws other durations, and so other frames: a path close to the limit may pass.
+    """Valid frames (T, 20) [rad] from a pose to rest: the straight path, or the first valid detour."""
+    # each round draws other durations, and so other frames, of which all may be valid
     for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, path).all():
@@ -109,7 +109,7 @@ def path_to_rest(
 def _via_paths(
     start: NDArray[np.float64], resting: NDArray[np.float64]
 ) -> Iterator[list[NDArray[np.float64]]]:
-    """Stops on paths to rest: fingers part or not, the thumb swings out or not, one digit moves first."""
+    """Stops on paths to rest that differ in spread fingers, the thumb, and the digit that moves first."""
     spread = gesture("spread")
     fan = np.where(np.arange(NUM_JOINTS) % 4 == 0, spread - gesture("flat"), 0.0)
     fan[:4] = 0.0
@@ -124,7 +124,7 @@ def _via_paths(
 
 
 def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.ndarray, "K"]:
-    """Which of these valid poses [rad] have a valid path to rest, and so one from rest."""
+    """Whether each of these valid poses [rad] has a valid path to rest."""
     shares = np.linspace(0.0, 1.0, 32)[:, None]
     paths = poses[:, None] + shares * (resting_angles(model) - poses[:, None])
     valid: NDArray[np.bool_] = is_valid(model, paths.reshape(-1, NUM_JOINTS))
@@ -137,9 +137,9 @@ def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.n
     return free
 
 
-_FREE_ROTATION: Final = 0.6  # from position to position, standard deviation about each axis [rad]
+_FREE_ROTATION: Final = 0.6  # standard deviation about each axis between two positions [rad]
 _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Fingers along +y, back of the hand up."""
+"""Orientation of a wrist with fingers along +y and the back of the hand up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class WristConfig(Settings):
     """Positions and orientations of the wrist of a person at a table."""
 
     center: tuple[float, float, float] = ROOM_CENTER
-    """Middle of the cube it moves in [m]."""
+    """Middle of the cube that the wrist moves in [m]."""
     volume: Annotated[float, Limits(0.0)] = 0.3
     """Half side of that cube [m]."""
     turning: Annotated[float, Limits(0.0)] = 0.5
@@ -160,11 +160,8 @@ def free_wrist_path(
     frames: int, config: MotionConfig, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
     """Positions [m] and orientations (wxyz) of a wrist that takes any orientation."""
-    positions, orientations, shares = (
-        [_draw_position(config, rng)],
-        [random_quaternions(1, rng=rng)[0]],
-        [np.zeros(1)],
-    )
+    positions, orientations = [_draw_position(config, rng)], [random_quaternions(1, rng=rng)[0]]
+    shares = [np.zeros(1)]
     while sum(map(len, shares)) < frames:
         positions.append(_draw_position(config, rng))
         rotation = Rotation.from_rotvec(rng.normal(scale=_FREE_ROTATION, size=3)).as_quat(scalar_first=True)
@@ -213,7 +210,7 @@ def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np
     return ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)
 
 
-_MOST_DRAWS: Final = 25
+_MAX_DRAWS: Final = 25
 _POSES_A_DRAW: Final = 8
 
 
@@ -282,7 +279,7 @@ def motion_through(
 
 
 def count_frames(duration: float, config: MotionConfig) -> int:
-    """Frames of a motion of this duration [s], the first one included."""
+    """Number of frames of a motion of this duration [s], with the first one."""
     steps = duration * config.rate
     if not np.isfinite(steps) or round(steps) < 1:
         raise ArgumentError(
@@ -294,7 +291,7 @@ def count_frames(duration: float, config: MotionConfig) -> int:
 def angles_through(
     model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each."""
+    """Valid frames [rad] through valid poses, without the first pose, with a rest at each."""
     paths = [straight_path(start, target, config, rng) for start, target in pairwise(poses)]
     ends = np.cumsum([len(path) for path in paths])
     valid = np.split(is_valid(model, np.concatenate(paths)), ends[:-1])
@@ -309,9 +306,9 @@ def angles_through(
 def _next_path(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Frames from one pose to another and a rest there, all valid."""
+    """Valid frames from one pose to a random one, with a rest there."""
     resting = resting_angles(model)
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
             direct = straight_path(start, target, config, rng)
             if is_valid(model, direct).all():
@@ -327,7 +324,7 @@ def _next_path(
 def with_wrist(
     angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> HandMotion:
-    """The motion of these joint angles [rad] by a hand whose wrist moves from position to position."""
+    """A motion of these joint angles [rad] with a random path of the wrist."""
     position, quaternion = free_wrist_path(len(angles), config, rng=rng)
     return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
 
@@ -388,10 +385,7 @@ def scripted_motion(
 
 
 def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
-    """The poses [rad] a script goes through, as this hand can strike them.
-
-    Touches that this hand's thumb cannot reach and poses without a valid path to rest are left out.
-    """
+    """The poses [rad] of a script that this hand can strike and leave on a valid path to rest."""
     if script not in _scripts() or script == FREE:
         raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
     entry = _scripts()[script]

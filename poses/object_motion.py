@@ -34,22 +34,19 @@ from poses.grasps import (
 from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
 from poses.shapes import MAX_PENETRATION
 
-_VARIANTS: Final = 12  # drawn at once
-_MOST_DRAWS: Final = 20
-_HOLDS: Final = 3  # grasps of one style that a motion goes between
-_SHIFTS: Final = 0.15  # how often the object shifts in the hand
-_LOOSEST: Final = 0.003  # [m] between the object and the digits that hold it, while it shifts
+_VARIANTS: Final = 12  # held poses of one draw
+_MAX_DRAWS: Final = 20
+_HOLDS: Final = 3  # grasps of one style in a motion
+_SHIFT_CHANCE: Final = 0.15  # of a change to another grasp
+_MAX_GAP: Final = 0.003  # [m] between a shifting object and the digits that hold it
 _SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
-_MARGIN: Final = 0.9  # of the fastest and of the largest acceleration, for the steps between frames
+_MARGIN: Final = 0.9  # share of the limits of speed and acceleration that paths use
 
 
 def sample_object_motion(
     model: HandModel, obj: RigidObject, duration: float, *, rng: np.random.Generator
 ) -> tuple[HandMotion, BodyMotion]:
-    """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
-
-    It has `round(duration * rate) + 1` frames.
-    """
+    """Random smooth motion of a hand that plays with an object, valid at every frame."""
     config = MotionConfig()
     frames = round(duration * config.rate) + 1
     names = hold_names(obj)
@@ -80,15 +77,15 @@ class _Player:
     rng: np.random.Generator
 
     def next_part(self, last: Held, current: int) -> tuple[Held, int]:
-        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index."""
+        """Valid frames to a variant of the current hold, or to another hold, and the index of that hold."""
         start = Held(last.angles[-1:], last.poses[-1:])
-        if self.rng.random() < _SHIFTS:
+        if self.rng.random() < _SHIFT_CHANCE:
             other = int(self.rng.integers(len(self.holds)))
             part = self._path(start, self._home(other))
             if other != current and is_held_valid(self.scene, part).all() and self._keeps_touch(part):
                 return self._rested(part), other
         model, obj = self.scene.hand, self.scene.obj
-        for _ in range(_MOST_DRAWS):
+        for _ in range(_MAX_DRAWS):
             angles, poses = sample_held_poses(model, obj, self.holds[current], _VARIANTS, rng=self.rng)
             paths = (
                 self._path(start, Held(angles[[number]], poses[[number]])) for number in range(_VARIANTS)
@@ -96,7 +93,7 @@ class _Player:
             for part in (*paths, self._path(start, self._home(current))):
                 if is_held_valid(self.scene, part).all():
                     return self._rested(part), current
-        raise PoseError(f"no valid path out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
+        raise PoseError(f"no valid path out of a hold of the {obj.name} in {_MAX_DRAWS * _VARIANTS} tries")
 
     def _home(self, number: int) -> Held:
         return Held(self.holds[number].angles[None], self.holds[number].T_wrist_object[None])
@@ -118,19 +115,19 @@ class _Player:
         return Held(*(np.concatenate([part, np.repeat(part[-1:], pause, axis=0)]) for part in path))
 
     def _keeps_touch(self, held: Held) -> bool:
-        """Whether the digits that hold the object stay near it, at the quarters and halfway."""
+        """Whether the holding digits stay near the object at the quarters of the way."""
         scene = self.scene
         names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
         for number in len(held.angles) * np.array([1, 2, 3]) // 4:
             distances = scene.distances(scene.new_data(held.angles[number], held.poses[number]))
-            near = {name for name, gap in zip(names, distances, strict=True) if gap < _LOOSEST}
+            near = {name for name, gap in zip(names, distances, strict=True) if gap < _MAX_GAP}
             if why_not_held(self.style, near):
                 return False
         return True
 
 
 def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Small quick loops of a writing wrist (T, 3) [m], whose size swells and fades."""
+    """Small loops of a writing wrist (T, 3) [m], of varying size."""
     time = np.arange(frames) / rate
     loops = np.zeros((frames, 3))
     for axis in range(3):
@@ -140,9 +137,9 @@ def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator
     return size * swell[:, None] ** 2 * loops
 
 
-_MOST_RETREATS: Final = 12
-_RETREAT_STEP: Final = 0.003  # [m] beyond what is needed
-_SMOOTHING: Final = 0.25  # [s] over which the pen draws back
+_MAX_RETREATS: Final = 12
+_RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
+_SMOOTHING: Final = 0.25  # [s] window of a retreat
 
 
 def point_pen(
@@ -153,9 +150,9 @@ def point_pen(
     other_motion: HandMotion,
     path: Float[np.ndarray, "T 4 4"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
+    """Lead a held pen along a path, and draw it back wherever hands or pen would touch.
 
-    Fingers and pen move in the wrist's frame as they are `held`. The pen's tip is its first marker.
+    Fingers and pen keep their motion in the wrist's frame. The pen's tip is its first marker.
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(pose_matrices(motion.qpos[:, :7])) @ body.T_world_body
@@ -174,10 +171,10 @@ def keep_apart(
     other_motion: HandMotion,
     direction: Float[np.ndarray, "T 3"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand."""
+    """Draw a hand and its object back smoothly wherever either would touch the other hand."""
     motion, body = held
     back = np.zeros(len(direction))
-    for _ in range(_MOST_RETREATS):
+    for _ in range(_MAX_RETREATS):
         qpos, poses = motion.qpos.copy(), body.T_world_body.copy()
         qpos[:, :3] += back[:, None] * direction
         poses[:, :3, 3] += back[:, None] * direction
@@ -199,7 +196,7 @@ def keep_apart(
 def _rotated_to_the_arm(
     T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Pen in the path's frame: its tip at the origin, rotated about itself until the wrist is at +x."""
+    """Pose of the pen in the path's frame: tip at the origin, rotated so that the wrist is at +x."""
     wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
     away = np.arctan2(wrist[1], wrist[0])
     rotation = np.eye(4)
@@ -212,22 +209,22 @@ def _rotated_to_the_arm(
 DISTANCE: Final = (0.006, 0.02)
 """Smallest and largest distance of the tip from its target [m]."""
 SPEED: Final = 0.6
-"""Highest speed of the tip between still targets, without the retreat [m/s]; slow paths take longer."""
+"""Highest speed of the tip between still targets, without the retreat [m/s]."""
 TURNING: Final = 3.0
-"""The same for the rotation of the pen [rad/s]."""
+"""Highest rotation speed of the pen between still targets [rad/s]."""
 RETREAT: Final = 0.05
 """Distance that the tip draws back between two targets [m]."""
 _STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
 PATH: Final = (0.4, 0.9)
 """Shortest and longest time from target to target [s]."""
-_TILT: Final = 0.6  # lean of the pen from the outward direction, standard deviation of the tangent
+_TILT: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
 _ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
-_CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
-_MOST_LEAN: Final = 1.0  # as a tangent
-_BEHIND: Final = -0.2  # targets that face away from the pen by more, as a cosine, are not pointed at
-_STEADY: Final = 0.15  # [s] over which outward directions are smoothed, standard deviation
+_CONE: Final = 1.2  # largest angle of the pen from upright [rad]
+_MAX_LEAN: Final = 1.0  # from the outward direction, as a tangent
+_MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
+_STEADY: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
 
 
 def pointing_path(
@@ -238,7 +235,7 @@ def pointing_path(
     speed: float = SPEED,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
+    """Poses of a pen (tip at the origin, body along +z) that visits moving targets at random.
 
     Targets [m] are reached from their outward unit directions, by a tip no faster than `speed` [m/s].
     """
@@ -266,7 +263,7 @@ def pointing_path(
 
 @dataclass(frozen=True, slots=True)
 class _Visit:
-    """One target, and the path from it to the next."""
+    """A target, and the path to the next one."""
 
     target: int
     distance: float
@@ -282,7 +279,7 @@ def _plan(
     speed: float,
     rng: np.random.Generator,
 ) -> list[_Visit]:
-    """Visits for all frames, and one more where the last path leads."""
+    """Visits for all frames, and one more at the end of the last path."""
     visits: list[_Visit] = []
     frame = 0
     target, lean = _draw(outward[0], rng)
@@ -305,13 +302,13 @@ def _plan(
 
 def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[int, Float[np.ndarray, "3"]]:
     """A target that can be reached now, and the lean of the pen there."""
-    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
+    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _MIN_FACING)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
     lean = _TILT * rng.standard_normal(3)
     lean -= (lean @ outward[target]) * outward[
         target
     ]  # sideways, or a rotation of the target would swing the pen
-    return target, lean * min(1.0, _MOST_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
+    return target, lean * min(1.0, _MAX_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
 
 
 def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:

@@ -20,14 +20,14 @@ from handsim.hand.shape import JOINTS, NUM_JOINTS, NUM_QPOS, HandShape
 from handsim.settings import Expected, Mixture
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
-"""Names of all libraries; no two hold the same name."""
+"""Names of all libraries; no two libraries share a name of a gesture."""
 _GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, positive to the thumb
 
 
 @cache
 def _library(library: str) -> dict[str, NDArray[np.float64]]:
     check_choice(library, LIBRARIES, noun="library")
-    digits = package_data("poses", "gestures")  # those of single digits serve all libraries
+    digits = package_data("poses", "gestures")  # all libraries use its named digits
     gestures: dict[str, NDArray[np.float64]] = {}
     for name, entry in package_data("poses", library)["gestures"].items():
         fingers = np.array([_angles_of(finger, digits["fingers"]) for finger in entry["fingers"]])
@@ -43,7 +43,7 @@ def _gestures() -> dict[str, NDArray[np.float64]]:
 
 
 def _angles_of(digit: str | list[float], named: dict[str, list[float]]) -> NDArray[np.float64]:
-    """Four angles [deg] of a digit that is named or written out."""
+    """Four angles [deg] of a digit, given by name or as numbers."""
     return np.array(named[digit] if isinstance(digit, str) else digit, dtype=np.float64)
 
 
@@ -53,7 +53,7 @@ def gesture_names(library: str = "gestures") -> tuple[str, ...]:
 
 
 def gesture(name: str) -> Float[np.ndarray, "20"]:
-    """Joint angles [rad] of a gesture of any library, in the order of `topology.JOINTS`, or an error."""
+    """Joint angles [rad] of a gesture of any library, in the order of `JOINTS`."""
     check_choice(name, _gestures(), noun="gesture")
     return _gestures()[name].copy()
 
@@ -69,10 +69,7 @@ def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
 
 
 def all_gestures() -> Float[np.ndarray, "G 20"]:
-    """Joint angles [rad] of the gestures that random poses are blended from: the library "gestures".
-
-    The other libraries are left out, so that a seed keeps giving the same training set.
-    """
+    """Joint angles [rad] of the gestures that random poses are blended from: those of library "gestures"."""
     return gestures_of("gestures")
 
 
@@ -82,17 +79,17 @@ def all_gestures() -> Float[np.ndarray, "G 20"]:
 LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
 HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
 
-_NO_ABDUCTION_AT: Final = np.deg2rad(85.0)  # MCP flexion at which abduction has shrunk to the share below
-_ABDUCTION_LEFT: Final = 0.25
-_DIP_SHARE: Final = 2.0 / 3.0
-_DIP_BELOW: Final = np.deg2rad(32.0)  # how far the DIP may be below or above its share of the PIP
-_DIP_ABOVE: Final = np.deg2rad(28.0)
-# How much more than its neighbor a finger's MCP may flex [rad]: index-middle, middle-ring, ring-little.
+_TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
+_TIGHT_ABDUCTION: Final = 0.25  # share of the abduction range that remains there
+_DIP_SHARE: Final = 2.0 / 3.0  # of the PIP's flexion
+_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
+_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above it
+# Largest difference of MCP flexion between neighbors [rad]: index-middle, middle-ring, ring-little.
 _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 
 def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
-    """The same angles (T, 5, 4), one row per digit; a view, so writing to it writes to `angles`."""
+    """View (T, 5, 4) of the angles, with one row per digit."""
     return angles.reshape(*angles.shape[:-1], 5, 4)
 
 
@@ -104,7 +101,7 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     for near, far, apart in ((1, 0, 0), (1, 2, 1), (2, 3, 2)):
         limit = _MCP_APART[apart]
         flexion[:, far] = np.clip(flexion[:, far], flexion[:, near] - limit, flexion[:, near] + limit)
-    left = 1.0 - (1.0 - _ABDUCTION_LEFT) * np.clip(flexion / _NO_ABDUCTION_AT, 0.0, 1.0)
+    left = 1.0 - (1.0 - _TIGHT_ABDUCTION) * np.clip(flexion / _TIGHT_FLEXION, 0.0, 1.0)
     low, high = LOW.reshape(5, 4)[1:, 0], HIGH.reshape(5, 4)[1:, 0]
     fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
@@ -115,10 +112,10 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)
 _SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
-# How often the fingers part: index-middle, middle-ring, ring-little.
+# Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
 _SPLIT: Final = np.array([0.3, 0.2, 0.25])
-_ALIKE: Final = 0.993
-# How much curl may grow from index to little, standard deviation in the latent.
+_NEIGHBOR_CORRELATION: Final = 0.993
+# Standard deviation of the growth of curl from index to little, in the latent.
 _SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
 _CURL_DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
@@ -130,15 +127,12 @@ _FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviati
 
 @dataclass(frozen=True, slots=True)
 class PoseMix(Mixture):
-    """How often each source of poses is drawn; the shares are normalized.
-
-    No recorded motion is used: common poses are dense, and all possible poses are covered.
-    """
+    """Shares of the sources of poses, which are normalized; no recorded motion is used."""
 
     gestures: float = 0.45
     """Blends of two named gestures, each digit a little ahead or behind."""
     curls: float = 0.50
-    """Correlated finger curls: neighbors move together, any finger may leave the others."""
+    """Correlated finger curls: neighbors mostly move together."""
     anywhere: float = 0.05
     """Uniform within the ranges."""
 
@@ -176,7 +170,7 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
     angles = _thumbs(count, rng)
     digits = finger_view(angles)
-    within = rng.uniform(0.3, 1.0, size=(count, 1))  # how much the two joints of one finger move together
+    within = rng.uniform(0.3, 1.0, size=(count, 1))  # correlation of the joints of one finger
     splits = rng.random((count, 3)) < _SPLIT
     knuckles = _grouped(splits, rng.standard_normal((count, 4)))
     middles = within * knuckles + np.sqrt(1 - within**2) * _grouped(splits, rng.standard_normal((count, 4)))
@@ -193,22 +187,25 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
-    """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
+    """Standard normals (T, digits), correlated over the digits of a pose."""
     common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
     return np.asarray(np.sqrt(0.75) * common + np.sqrt(0.25) * own)
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard normals (T, 4), alike within a group of neighboring fingers, drawn anew at each split."""
+    """Standard normals (T, 4), nearly equal for neighboring fingers without a split between them."""
     grouped = normals.copy()
     for finger in range(1, 4):
-        along = _ALIKE * grouped[:, finger - 1] + np.sqrt(1 - _ALIKE**2) * normals[:, finger]
+        along = (
+            _NEIGHBOR_CORRELATION * grouped[:, finger - 1]
+            + np.sqrt(1 - _NEIGHBOR_CORRELATION**2) * normals[:, finger]
+        )
         grouped[:, finger] = np.where(splits[:, finger - 1], normals[:, finger], along)
     return grouped
 
 
 def _thumbs(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Thumbs that oppose (palmar abduction comes with flexion) and fold (MCP and IP bend together)."""
+    """Thumbs that oppose (abduction with flexion) and fold (MCP with IP); fingers are zero."""
     angles = np.zeros((count, 20))
     reach, sweep, fold, tip = rng.standard_normal((4, count))
     angles[:, 0] = np.deg2rad(14.0) * reach
@@ -233,27 +230,27 @@ _FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])
 def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
-    """Which poses are inside all ranges and penetrate the hand no deeper than `max_penetration` [m]."""
+    """Whether each pose is in range, with a self-penetration of at most `max_penetration` [m]."""
     inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
 
 
 def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
-    """Which poses this hand can strike: in range, and at most 1 mm deep in itself (`MAX_PENETRATION`).
+    """Whether this hand can strike each pose: in range, with a self-penetration of at most 1 mm.
 
     Args:
         model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
         qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; the wrist may be anywhere.
 
     Raises:
-        ArgumentError: `model` is none of these, or `qpos` is not (T, 27) or not finite.
+        ArgumentError: `model` has another type, or `qpos` is not (T, 27) or not finite.
     """
     return is_valid(load_model(model), check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
 
 
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, its fingers fanned just as far as their girth needs."""
+    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows."""
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
@@ -266,11 +263,10 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
 def make_valid(
     model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"]
 ) -> Float[np.ndarray, "T 20"]:
-    """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
+    """Poses [rad] moved towards rest until they are valid; valid ones stay unchanged.
 
-    The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
-    enough: a fist that was too tight ends as a fist whose fingers touch. A shape or the name of a size is a
-    right hand.
+    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough. A shape
+    or the name of a size is a right hand.
     """
     model = load_model(model)
     resting = resting_angles(model)
@@ -288,7 +284,7 @@ def make_valid(
 def _nearest_valid(
     model: HandModel, valid_end: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The last valid poses that bisection finds between valid ends and target poses."""
+    """Valid poses nearest to the target poses, found by bisection from valid ends."""
     low, high = np.zeros(len(target)), np.ones(len(target))  # share of the target pose: valid, invalid
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
@@ -310,10 +306,10 @@ SAMPLER: Final = Expected(
     "a function (model, num_poses, *, rng), module:name of one, or its entry point",
     lambda: list_plugins(SAMPLERS),
 )
-"""What errors say of settings that name a sampler."""
+"""Description of a sampler in errors on settings."""
 _NOUN: Final = "pose sampler"
-_WIDEST: Final = 2.0 * np.pi  # [rad], no joint turns so far
-_FARTHEST: Final = 100.0  # [m] of a wrist from the origin
+_MAX_ANGLE: Final = 2.0 * np.pi  # [rad] of a joint
+_MAX_WRIST_DISTANCE: Final = 100.0  # [m] from the origin
 
 
 class PoseSampler(Protocol):
@@ -336,10 +332,7 @@ class PoseSampler(Protocol):
 
 
 def mixed_angles(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T 20"]:
-    """The sampler that training sets use: gestures, finger curls and uniform angles in the default mix.
-
-    Joint angles [rad] are inside ranges and couplings, the same for every hand; digits may still touch.
-    """
+    """The sampler of training sets: gestures, finger curls and uniform angles in the default mix [rad]."""
     return sample_angles(num_poses, rng=rng)
 
 
@@ -350,7 +343,7 @@ def sample_poses(
     *,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 27"]:
-    """Random valid poses of one hand, with the wrist at the origin unless the sampler says where it is.
+    """Random valid poses of one hand, with the wrist at the origin unless the sampler draws whole poses.
 
     Poses that leave a range or penetrate the hand deeper than 1 mm are moved towards rest until they are
     valid.
@@ -417,17 +410,17 @@ def _drawn(
         )
     check_array(owner, values, values.shape)
     widest = np.abs(values[:, -NUM_JOINTS:]).max()
-    if widest > _WIDEST:
+    if widest > _MAX_ANGLE:
         raise ArgumentError(f"{owner} holds an angle of {widest:.4g} rad; are these degrees?")
     return values if values.shape[1] == NUM_JOINTS else _unit_wrists(owner, values)
 
 
 def _unit_wrists(owner: str, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Whole poses with quaternions of length one."""
+    """Whole poses with normalized quaternions."""
     lengths = np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     if lengths.min() < 1e-6:
         raise ArgumentError(f"{owner} holds a quaternion of zeros (numbers 3 to 6, wxyz), expected length 1")
     farthest = np.abs(qpos[:, :3]).max()
-    if farthest > _FARTHEST:
+    if farthest > _MAX_WRIST_DISTANCE:
         raise ArgumentError(f"{owner} holds a wrist {farthest:.4g} m away; are these millimeters?")
     return np.concatenate([qpos[:, :3], qpos[:, 3:7] / lengths, qpos[:, 7:]], axis=1)

@@ -42,8 +42,7 @@ _FLEXION_NOISE: Final = np.deg2rad(4.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(1.5)
 _NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
 _SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
-_WANDER: Final = 0.4  # noise from beat to beat, as a share of the noise that a whole interaction keeps
-
+_WANDER: Final = 0.4  # noise from beat to beat, relative to the noise of the whole interaction
 
 INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
 """Names of all interactions."""
@@ -56,38 +55,38 @@ class Fingers:
     opened: Float[np.ndarray, "K 20"]
     """Open fingers [rad]."""
     closed: Float[np.ndarray, "K 20"]
-    """Closed fingers if nothing blocks them [rad]."""
+    """Fully closed fingers [rad]."""
     strength: Float[np.ndarray, "K 5"]
-    """Share of that path that each digit closes."""
+    """Share of the path to `closed` that each digit follows."""
 
     def at(self, beats: Float[np.ndarray, "T"]) -> Fingers:
-        """Interpolated between beats, which count from 0."""
+        """Fingers at fractional beats."""
         return Fingers(*(at_beats(keys, beats) for keys in (self.opened, self.closed, self.strength)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """Interactions as they were drawn: poses of the moving hand in the wrist frame of the still one."""
+    """Beats of interactions: poses of the moving hand in the wrist frame of the still one."""
 
     still: Fingers
     moving: Fingers
     rotations: Float[np.ndarray, "K 3"]
-    """Rotation vectors [rad], to be applied after `rotation`."""
+    """Rotation vector of each beat [rad], applied after `rotation`."""
     rotation: Float[np.ndarray, "K 3 3"]
-    """The same for all beats of one interaction."""
+    """Rotation of each interaction, repeated for its beats."""
     targets: Float[np.ndarray, "K 3"]
     """Points of the still hand [m]."""
     anchors: Float[np.ndarray, "K 3"]
-    """Points of the moving hand [m] that are put on them."""
+    """Points of the moving hand [m] that are placed on the targets."""
     axis: Float[np.ndarray, "K 3"]
-    """Unit direction in which the moving hand backs off; the same for all beats of one interaction."""
+    """Unit direction in which the moving hand backs off, repeated for the beats of an interaction."""
 
     def directions(self, beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
         """Unit directions (T, 3) in which the moving hand backs off."""
         return np.asarray(self.axis[beats.astype(int)])
 
     def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
+        """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist, before it backs off."""
         tilts = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
         rotations = tilts @ self.rotation[beats.astype(int)]
         anchors = np.einsum("tij,tj->ti", rotations, at_beats(self.anchors, beats))
@@ -95,7 +94,7 @@ class Meeting:
 
 
 def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
-    """Values between keys, `beats` counting keys from 0."""
+    """Values interpolated linearly between keys, at fractional indices."""
     low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
     share = (beats - low)[:, None]
     return np.asarray(keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low]))
@@ -111,8 +110,7 @@ def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
 class Sketch(NamedTuple):
     """The random part of an interaction's beats, before hands give it their size."""
 
-    variant: dict[str, Any]
-    """Its description, from `draw_variant`."""
+    variant: dict[str, Any]  # from `draw_variant`
     still: _FingerSketch
     moving: _FingerSketch
     targets: Float[np.ndarray, "K 3"]
@@ -122,7 +120,7 @@ class Sketch(NamedTuple):
 
 
 class _FingerSketch(NamedTuple):
-    """Fingers of one hand (K, ...), not valid yet."""
+    """Random fingers of one hand (K, ...), before they are made valid."""
 
     opened: NDArray[np.float64]
     closed: NDArray[np.float64]
@@ -134,7 +132,7 @@ class _FingerSketch(NamedTuple):
 def sketch_meeting(
     variant: dict[str, Any], count: int, *, together: bool, rng: np.random.Generator
 ) -> Sketch:
-    """Random positions, orientations and fingers for beats, which are alike if they are `together`."""
+    """Random positions, orientations and fingers for beats; `together` makes the beats similar."""
     noise = _Noise(count, together, rng)
     still, moving = (
         _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
@@ -145,7 +143,7 @@ def sketch_meeting(
 
 
 def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Meeting:
-    """The beats of all sketches, one sketch after another, with valid fingers of these hands."""
+    """Beats of all sketches, one sketch after another, with valid fingers for these hands."""
     mirror = np.eye(3) if still.shape.side == "right" else MIRROR
     counts = [len(sketch.targets) for sketch in sketches]
     fingers = _valid_fingers(moving, [sketch.moving for sketch in sketches])
@@ -170,7 +168,7 @@ def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Mee
 
 
 class _Noise:
-    """Gaussian noise with a part that all beats share, clipped at two standard deviations."""
+    """Gaussian noise with a part common to all beats, clipped at two standard deviations."""
 
     def __init__(self, count: int, together: bool, rng: np.random.Generator) -> None:
         self.count, self.together, self.rng = count, together, rng
@@ -178,7 +176,7 @@ class _Noise:
     def around(
         self, scale: NDArray[np.float64], wander: float, *, common: float = 1.0
     ) -> NDArray[np.float64]:
-        """Noise (K, n): `common` standard deviations `scale` (n,) that last, `wander` new at each beat."""
+        """Noise (K, n) of scale (n,): `common` times a lasting part plus `wander` times one for each beat."""
         size = (self.count, len(scale))
         lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
         new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
@@ -186,7 +184,7 @@ class _Noise:
 
 
 def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Offsets (K, 2) of the beats from the middle one, in hand lengths."""
+    """Offsets (K, 2) of the beats' targets, in hand lengths."""
     reach = np.array(variant["place"])
     if variant["pattern"] == "random":
         return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
@@ -206,9 +204,9 @@ def _sketch_fingers(
 
 
 def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
-    """The fingers of all sketches, one after another, none in another's way."""
+    """Valid fingers of all sketches, one after another."""
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
-    # Poses with deep contact come a little nearer to rest, because fingers need room.
+    # poses with deep contact move towards rest, because fingers need room to wander
     angles = make_valid(model, np.clip(opened, LOW, HIGH))
     hard = ~is_valid(model, angles, max_penetration=_SNUG)
     angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
@@ -239,8 +237,8 @@ def _anchors(
 
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
 _FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
-_PARTED: Final = (0.08, 0.16)  # how far the hands are moved apart along the axis before and after [m]
-# Single poses: how many touch, how far the others are apart at most [m], how many fingers are half closed.
+_PARTED: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
+# Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
 _TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
 
 
@@ -248,15 +246,15 @@ class _Course(NamedTuple):
     """The course of a meeting, each array (T,)."""
 
     beats: NDArray[np.float64]
-    """Position among the beats, which count from 0."""
+    """Fractional beat."""
     lift: NDArray[np.float64]
-    """Distance of the hands from touching [m]."""
+    """Distance of the hands from contact [m]."""
     grip: NDArray[np.float64]
-    """Share of their strength with which fingers close."""
+    """Factor on the strength of closing fingers."""
 
 
 def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random.Generator) -> Passage | None:
-    """One interaction from coming together to letting go; None when this draw is not valid."""
+    """One interaction, from approach to release; None if this draw is not valid."""
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
@@ -278,7 +276,7 @@ def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random
 def draw_poses(
     right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
 ) -> Passage:
-    """The valid ones of so many single poses of several interactions, the roles drawn once for each."""
+    """Valid poses among `counts` single poses of interactions; roles are drawn once per interaction."""
     draws = [_draw(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")
     passages, valid = [], []
@@ -289,9 +287,10 @@ def draw_poses(
         meeting = meet([draw.sketch for draw in drawn], still, moving)
         distance = _contact_distance(still, moving, meeting, np.arange(float(len(meeting.axis))))
         best = _nearest_tries(drawn, distance)
-        course = _Course(
-            best.astype(float), *(np.concatenate([draw[part] for draw in drawn]) for part in (2, 3))
+        lift, grip = (
+            np.concatenate(parts) for parts in zip(*((draw.lift, draw.grip) for draw in drawn), strict=True)
         )
+        course = _Course(best.astype(float), lift, grip)
         passages.append(_close_contact(still, moving, meeting, course, distance=distance[best], rate=None))
         valid.append((distance[best] > NEAREST) & valid_frames(right, left, passages[-1]))
     sizes = [len(draws[number].lift) for number in order]
@@ -303,13 +302,13 @@ class _Draw(NamedTuple):
     """Single poses of one interaction, before hands give them their size."""
 
     left_still: bool
-    """Whether the left hand holds still."""
+    """Whether the left hand is the still one."""
     sketch: Sketch
-    """The poses, each tried a few times."""
+    """The poses, with several tries for each."""
     lift: NDArray[np.float64]
-    """Distance of the hands from touching (N,) [m]."""
+    """Distance of the hands from contact (N,) [m]."""
     grip: NDArray[np.float64]
-    """Share of their strength with which fingers close (N,)."""
+    """Factor on the strength of closing fingers (N,)."""
 
 
 def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
@@ -322,7 +321,7 @@ def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
 
 
 def _nearest_tries(draws: Sequence[_Draw], distance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The beat of each pose's try whose hands come nearest to each other."""
+    """Beat of the try of each pose whose hands come nearest to each other."""
     best, begin = [], 0
     for draw in draws:
         count, beats = len(draw.lift), len(draw.sketch.targets)
@@ -335,7 +334,7 @@ def _nearest_tries(draws: Sequence[_Draw], distance: NDArray[np.float64]) -> NDA
 def _contact_distance(
     still: HandModel, moving: HandModel, meeting: Meeting, beats: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance (T,) [m] that the moving hand must back off with open fingers."""
+    """Distance (T,) [m] by which the moving hand must back off with open fingers."""
     return first_contact(
         still,
         join_qpos(meeting.still.at(beats).opened),
@@ -354,7 +353,7 @@ def _close_contact(
     distance: NDArray[np.float64],
     rate: float | None,
 ) -> Passage:
-    """Hands brought into contact with their fingers closed; smoothed in time if there is a rate."""
+    """Bring hands into contact and close their fingers; smooth over time if there is a rate."""
     contact_window, finger_window = (
         1 if rate is None else 2 * int(window * rate / 2) + 1 for window in (_CONTACT_WINDOW, _FINGER_WINDOW)
     )
@@ -362,36 +361,29 @@ def _close_contact(
     back = smooth_above(distance, contact_window) + course.lift
     position = position + back[:, None] * meeting.directions(course.beats)
     fingers = meeting.still.at(course.beats), meeting.moving.at(course.beats)
-    still_qpos, moving_qpos = join_qpos(fingers[0].opened), placed_qpos(fingers[1].opened, rotation, position)
-    strength = [each.strength * course.grip[:, None] for each in fingers]
-    still_qpos[:, 7:] = close_fingers(
-        still,
-        still_qpos,
-        fingers[0].closed,
-        strength[0],
-        other=moving,
-        other_qpos=moving_qpos,
-        window=finger_window,
-    )
-    moving_qpos[:, 7:] = close_fingers(
-        moving,
-        moving_qpos,
-        fingers[1].closed,
-        strength[1],
-        other=still,
-        other_qpos=still_qpos,
-        window=finger_window,
-    )
+    hands = still, moving
+    qpos = join_qpos(fingers[0].opened), placed_qpos(fingers[1].opened, rotation, position)
+    for own, other in ((0, 1), (1, 0)):
+        qpos[own][:, 7:] = close_fingers(
+            hands[own],
+            qpos[own],
+            fingers[own].closed,
+            fingers[own].strength * course.grip[:, None],
+            other=hands[other],
+            other_qpos=qpos[other],
+            window=finger_window,
+        )
+    angles = qpos[0][:, 7:], qpos[1][:, 7:]
     if still.shape.side == "right":
-        return Passage(rotation, position, still_qpos[:, 7:], moving_qpos[:, 7:])
+        return Passage(rotation, position, *angles)
     back = np.swapaxes(rotation, 1, 2)
-    return Passage(back, -np.einsum("tij,tj->ti", back, position), moving_qpos[:, 7:], still_qpos[:, 7:])
+    return Passage(back, -np.einsum("tij,tj->ti", back, position), *angles[::-1])
 
 
 def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
-    """The course of a meeting: come together, stay and move `count` times, let go."""
+    """The course of a meeting: approach, stay and move `count` times, release."""
     ends = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
-    # Fingers close after the hands met, and open before they part.
+    # fingers close after the hands meet, and open before they part
     grips = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
     tempo = rng.random(2)
     beats, lift = [np.zeros(ends[0] + grips[0])], [1.0 - minimum_jerk(ends[0]), np.zeros(grips[0])]
@@ -427,9 +419,9 @@ def _too_fast(passage: Passage) -> bool:
 PAUSE: Final = (0.0, 0.6)
 """Shortest and longest rest between two meetings [s]."""
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
-_ROTATION: Final = 0.5  # spread of the rotation between two positions [rad]
-_MOST_DRAWS: Final = 60
-_MOST_PATHS: Final = 10
+_ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
+_MAX_DRAWS: Final = 60
+_MAX_PATHS: Final = 10
 
 
 def two_hands_penetration(
@@ -459,9 +451,8 @@ def sample_two_hand_motion(
 ) -> tuple[HandMotion, HandMotion]:
     """Random smooth motion of two hands through a series of interactions, valid at every frame.
 
-    It has `round(duration * RATE) + 1` frames, and the interactions are all of `INTERACTIONS` when not given.
-    Between two meetings hands rest apart for a time from shortest to longest pause [s]. The left hand may be
-    another person's.
+    It has `round(duration * RATE) + 1` frames; the interactions default to `INTERACTIONS`. Between two
+    meetings hands rest apart for a time within `pause` [s]. The left hand may be another person's.
     """
     names = INTERACTIONS if interactions is None else tuple(interactions)
     frames = round(duration * RATE) + 1
@@ -476,11 +467,11 @@ def sample_two_hand_motion(
 def sample_two_hand_poses(
     right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
-    """Single poses of a right and a left hand that touch or nearly do, each drawn on its own, all valid."""
+    """Independent valid poses of a right and a left hand that touch or nearly do."""
     passages: list[Passage] = []
     missing = count
-    for _ in range(_MOST_DRAWS):
-        # Each name twice, since roles are drawn once per batch; more than needed, since some will fail.
+    for _ in range(_MAX_DRAWS):
+        # each name twice, since roles are drawn once per batch; extra poses, since some will be invalid
         batches = rng.multinomial(
             missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
         )
@@ -492,7 +483,7 @@ def sample_two_hand_poses(
             whole = whole.at(rng.permutation(len(whole))[:count])
             positions = ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=(count, 3))
             return _in_world(whole, positions, Rotation.from_quat(random_quaternions(count, rng=rng)))
-    raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
+    raise PoseError(f"no valid pose of these two hands was found in {_MAX_DRAWS} tries")
 
 
 def _next_passages(
@@ -504,23 +495,23 @@ def _next_passages(
     *,
     rng: np.random.Generator,
 ) -> list[Passage]:
-    """The path from the last frame to a meeting, and the meeting."""
+    """The next meeting, after the path to it from the last frame, if any."""
     name = names[rng.integers(len(names))]
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         meeting = play_meeting(right, left, name, rng=rng)
         if meeting is None:
             continue
         if last is None:
             return [meeting]
-        for _ in range(_MOST_PATHS):
+        for _ in range(_MAX_PATHS):
             path = path_between(right, left, last, meeting.at([0]), pause, rng=rng)
             if path is not None:
                 return [path, meeting]
-    raise PoseError(f"no valid path was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+    raise PoseError(f"no valid path was found in {_MAX_DRAWS} tries to bring these hands to '{name}'")
 
 
 def _travel(frames: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], Rotation]:
-    """Positions (T, 3) and orientations of a pair of hands that moves from position to position."""
+    """Positions (T, 3) and orientations of a traveling pair of hands."""
     positions = [ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3)]
     orientations, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
     while sum(map(len, shares)) < frames:

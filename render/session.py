@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit
@@ -38,7 +37,7 @@ from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
 from render.formats.writer import CONFIG, FORMATS, WRITERS, format_folder, open_writer
-from render.frames import RenderedFrame
+from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import enclose, photo_files
 from render.scenery.lights import sample_surroundings
@@ -47,7 +46,7 @@ from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
-_MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 MB each
+_MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
 
 Cameras = Camera | CameraRig | Sequence[Camera] | str
 """A camera, a rig or several cameras of the user's own, used as they are; or the name of a preset, which is
@@ -95,7 +94,7 @@ def draw(
 def configured(
     config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
 ) -> RenderConfig:
-    """A configuration with the camera and the settings that were named beside it."""
+    """The configuration with the camera and the settings that were given beside it."""
     config = RenderConfig() if config is None else config
     check_type("config", config, RenderConfig, "a RenderConfig")
     config = RenderConfig.of(config, settings)
@@ -112,7 +111,7 @@ def configured(
 
 
 class Drawing:
-    """A subject before its cameras: draws any of its frames."""
+    """A subject and its cameras; draws any of its frames."""
 
     def __init__(self, subject: Subject, config: RenderConfig) -> None:
         if config.shutter is not None and not subject.is_motion:
@@ -122,7 +121,7 @@ class Drawing:
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
-        """Numbers of frames as asked for; else those with a hand."""
+        """Numbers of the requested frames, checked; without a request those that have a hand."""
         if frames is None:
             present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
             found = [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]
@@ -148,12 +147,12 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
-        """Some frames, seen by all cameras, with the people of a shard and all else that changes with it."""
+        """Pictures of frames by all cameras; the frames are given with their places in the shard."""
         config, cast = self.config, self.subject.cast
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
         size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
-        if cast is None:  # a take has its own hands; their looks change with the shard
+        if cast is None:  # a take has its own hands, whose looks change with the shard
             studio = open_studio(self.take.hands, config, bodies=self.take.bodies, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
@@ -180,7 +179,7 @@ class Drawing:
                 yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
     def _studio_of_person(self, person: int) -> Studio:
-        """The hands of one of the cast, with a skin of their own; cached, because they come back."""
+        """The studio of one of the people of `subject.cast`."""
         cast = self.subject.cast
         assert cast is not None
         hands = cast.hands(person, self.take.hands)
@@ -194,7 +193,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
 ) -> Studio:
-    """A studio of one person, whose looks are drawn."""
+    """A studio of one person with random looks."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
@@ -206,9 +205,9 @@ def sample_choices(
     skin: SkinLook | None,
     rng: np.random.Generator,
     size: tuple[int, int],
-    around: Float[np.ndarray, "N 3"] | None = None,
+    around: Doubles | None = None,
 ) -> FrameChoices:
-    """Random choices of a picture."""
+    """Random choices of a picture; several cameras at positions `around` (N, 3) share an enclosure."""
     background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
     sensor = config.depth_sensor
     assert sensor != "auto"
@@ -227,10 +226,10 @@ SHEET: Final = "contact_sheet.png"
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
-_DRAWN: Final = ".drawn-{}"  # grows by a byte a picture of a shard that is being drawn
-_EVERY: Final = 1.0  # [s] between two looks at those
-_SHOWN: Final = 0.5  # of a hand's keypoints, at least, are in the picture of a hand
-_ON_SHEET: Final = 9
+_DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
+_LOOK_INTERVAL: Final = 1.0  # time between two looks at these files [s]
+_SHOWN: Final = 0.5  # least share of a hand's keypoints in a picture that does not cut off the hand
+_ON_SHEET: Final = 9  # pictures on a contact sheet
 
 
 def render_take(
@@ -331,12 +330,12 @@ def _draw_shards(
     workers: int | Executor,
     progress: Progress,
 ) -> bool:
-    """Have the shards drawn that are not there, each of a count of pictures; whether there were any."""
+    """Draw the missing shards; whether there were any. `counts` are the numbers of pictures of all shards."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
     done, total = _finished(output.folder, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
-    tell = _Telling(output.folder, count, total, progress)
+    tell = _Counter(output.folder, count, total, progress)
     try:
         job = output.job(make, last=[INDEX, f"*{TAR}"])
         with tell, interrupts_bare():
@@ -351,8 +350,8 @@ def _draw_shards(
     return bool(todo)
 
 
-class _Telling:
-    """Tells of pictures while shards, which take minutes, are being drawn."""
+class _Counter:
+    """Reports finished pictures from a thread, also those of shards in progress, which take minutes."""
 
     def __init__(self, folder: Path, count: int, total: int, progress: Progress) -> None:
         self._folder, self._count, self._total, self._progress = folder, count, total, progress
@@ -361,26 +360,28 @@ class _Telling:
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> None:
-        for left in self._folder.glob(_DRAWN.format("*")):
-            left.unlink(missing_ok=True)
+        self._clear()
         self._tell()
         self._thread.start()
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
+        self._clear()
+
+    def _clear(self) -> None:
         for left in self._folder.glob(_DRAWN.format("*")):
             left.unlink(missing_ok=True)
 
     def finished(self, shard: int, count: int) -> None:
-        """A shard of so many pictures is drawn."""
+        """Count the pictures of a finished shard."""
         with self._lock:
             (self._folder / _DRAWN.format(shard)).unlink(missing_ok=True)
             self._count += count
         self._tell()
 
     def _watch(self) -> None:
-        while not self._ended.wait(_EVERY):
+        while not self._ended.wait(_LOOK_INTERVAL):
             self._tell()
 
     def _tell(self) -> None:
@@ -393,7 +394,7 @@ class _Telling:
 
 
 def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
-    """What decides the pictures, as JSON; files count by their contents, photographs by names and sizes."""
+    """What decides the pictures, as JSON: digests of files, and of the names and sizes of photographs."""
     subject = drawing.subject
     name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
     settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
@@ -405,7 +406,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
             told = f"left out: {broken[0]}{more}, not readable as photographs"
             warnings.warn(told, HandSimWarning, stacklevel=3)
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
-        names = listed.encode("utf-8", "surrogateescape")  # they need not be text
+        names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text
         settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
@@ -420,12 +421,12 @@ def left_out_frames(out: str | Place) -> list[int]:
 
 
 def cut_off_pictures(out: str | Place) -> list[str]:
-    """Pictures of a rendering that lack a hand of their frame: they have less than half of its keypoints."""
+    """Pictures of a rendering that show less than half of a hand's keypoints."""
     return _noted(out, _CUT_OFF, "pictures")
 
 
 def _noted(out: str | Place, name: str, key: str) -> list[Any]:
-    """What the workers noted beside their shards, of all shards."""
+    """What the workers wrote about all shards."""
     with open_output(out) as output:
         output.fetch(name.format("*"))
         files = sorted(output.folder.glob(name.format("*")))
@@ -443,7 +444,7 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:
-    """Refuse the other shards if the disk has no space for them; those that are drawn show what they need."""
+    """Refuse to go on if the disk has no space for the other shards, at the size of those that are drawn."""
     needed = left * sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) // drawn
     check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
 
@@ -455,10 +456,10 @@ def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
 
 @functools.lru_cache(maxsize=1)
 def _opened(source: Source, config: RenderConfig) -> Drawing:
-    """What is drawn; cached, because a worker draws many of its shards."""
+    """The drawing of a source; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", HandSimWarning)  # told once, before the work
+        warnings.simplefilter("ignore", HandSimWarning)  # the main process has warned already
         return Drawing(load_subject(source, seed=config.seed), config)
 
 
@@ -469,7 +470,7 @@ def _render_shard(
     lost: list[int] = []
 
     def leave_out(frame: int) -> None:
-        lost.append(frame)  # on the disk before the shard is, so that no kill loses it
+        lost.append(frame)  # written before the shard, so that no kill loses it
         save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
 
     cut: list[str] = []
@@ -498,16 +499,13 @@ def _render_shard(
 
 
 def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> None:
-    """Write a few of the pictures on one sheet."""
+    """Write a contact sheet of a few pictures."""
     if not {"rgb", "depth"} & set(drawing.config.passes):
         return
     frames: list[RenderedFrame] = []
     filled = [number for number, shard in enumerate(shards) if shard]
     for shard in np.array(filled)[np.unique(np.linspace(0, len(filled) - 1, _ON_SHEET).round().astype(int))]:
-        chosen = (
-            shards[shard][:1]
-            if len(filled) >= _ON_SHEET
-            else shards[shard][:: max(1, len(shards[shard]) // 3)][:3]
-        )
-        frames += list(drawing.frames(int(shard), enumerate(chosen)))
+        mine = shards[shard]
+        chosen = mine[:1] if len(filled) >= _ON_SHEET else mine[:: max(1, len(mine) // 3)][:3]
+        frames += drawing.frames(int(shard), enumerate(chosen))
     write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))

@@ -34,8 +34,8 @@ from render.subject import Model, Subject, load_subject, models_of, source_of, s
 from render.viewpoints import around_hands, crop_around
 
 _CENTER: Final = 0.5  # COCO counts pixels from the first one's center, we count from its corner
-_FEWEST: Final = 3  # labeled keypoints of a hand that can be cut out
-_FREE: Final = 0.8  # of the room around a hand in a picture, which it is shifted within
+_FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
+_FREE: Final = 0.8  # share of the room around a hand in a picture that it is shifted within
 
 
 class LabeledHand(NamedTuple):
@@ -61,9 +61,9 @@ def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
             "`image_id` and `keypoints`"
         ) from error
     hands = [_hand(path, name, label) for name, label in labels]
-    kept = [hand for hand in hands if np.isfinite(hand.keypoints[:, 0]).sum() >= _FEWEST]
+    kept = [hand for hand in hands if np.isfinite(hand.keypoints[:, 0]).sum() >= _FEWEST_KEYPOINTS]
     if not kept:
-        raise DatasetError(f"{path}: no hand with {_FEWEST} labeled keypoints or more")
+        raise DatasetError(f"{path}: no hand with {_FEWEST_KEYPOINTS} labeled keypoints or more")
     return kept
 
 
@@ -91,9 +91,9 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
 def cut_out(
     hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator
 ) -> dict[str, NDArray[np.generic]]:
-    """A square of `size` pixels around a hand, whose labeled keypoints span a share of it, somewhere in it.
+    """Cut a square of `size` pixels out of a photograph; a hand's keypoints span a share of it.
 
-    What is outside of the photograph has the color of its border; keypoints and box count from the square's.
+    The photograph's border is repeated outside of it. Keypoints and box are in pixels of the square.
     """
     with plain_path(hand.file) as plain:
         photograph = cv2.imread(str(plain), cv2.IMREAD_COLOR)
@@ -103,10 +103,9 @@ def cut_out(
     side = max(float((high - low).max()), 1.0) / share
     corner = 0.5 * (low + high - side) + _FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
     scale = size / side
-    # Of pixels counted from their centers, as OpenCV does.
-    shift = -scale * corner + 0.5 * (scale - 1.0)
+    shift = -scale * corner + 0.5 * (scale - 1.0)  # OpenCV counts from the centers of pixels
     matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
-    if scale < 0.5:  # or fine detail would become noise
+    if scale < 0.5:  # otherwise fine detail would become noise
         photograph = cv2.GaussianBlur(photograph, (0, 0), 0.4 / scale)
     square = cv2.warpAffine(photograph, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
     return {
@@ -118,21 +117,21 @@ def cut_out(
     }
 
 
-_PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # what a stream's spawn key goes on with
-_CROPPED: Final = 0.5  # of the share that hands have of a crop: what they have of the picture it is cut from
-_TRIES: Final = 20  # of a viewpoint that is outside of hands and objects
+_PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # second number of a stream's spawn keys
+_CROPPED: Final = 0.5  # hands' share of the whole picture over their share of the crop
+_TRIES: Final = 20  # random viewpoints that are tried to find one outside of hands and objects
 _SIDE_CHOICES: Final = (*SIDES, "either")
 
 TakeSource = Take | str | Path
 
 
 class _Sitting(NamedTuple):
-    """One person and what is drawn of him or her."""
+    """One person's pictures."""
 
     studio: Studio
     subject: Subject
-    frames: Integers  # of the take, in the order in which they are drawn
-    person: int  # number of the person
+    frames: Integers  # frames of the take, in the order in which they are drawn
+    person: int
 
 
 class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
@@ -263,7 +262,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
         worker = get_worker_info()
         mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        if cv2.getNumThreads() > 1:  # of a worker that was spawned
+        if cv2.getNumThreads() > 1:  # this is a spawned worker
             cv2.setNumThreads(1)
         sitting: dict[int, tuple[int, _Sitting]] = {}
         first = self._start + mine * self._batch
@@ -271,11 +270,13 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             for number in range(first, first + self._batch):
                 rng = SpawnKey.STREAM.rng(self.seed, _PHOTOGRAPH, number)
                 if self._photographs is not None and rng.random() < self._photograph_share:
-                    yield self._photograph(number, rng)
+                    assert self._crop is not None
+                    hand = self._photographs[rng.integers(len(self._photographs))]
+                    cut = cut_out(hand, self._crop, float(rng.uniform(*self._fill)), rng=rng)
+                    yield _tensors(cut | {"drawn": np.array(False), "number": np.array(number)})
                     continue
                 place, turn = number % self._people, number // self._people
-                # Not all at once: each of them begins at another point of a sitting.
-                turn += place * self._sitting // self._people
+                turn += place * self._sitting // self._people  # so that people do not change all at once
                 person, rank = divmod(turn, self._sitting)
                 if place not in sitting or sitting[place][0] != person:
                     sitting[place] = person, self._new_sitting(person * self._people + place)
@@ -283,14 +284,8 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
                 yield picture if self._photographs is None else _as_photographs(picture)
             first += workers * self._batch
 
-    def _photograph(self, number: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-        assert self._photographs is not None and self._crop is not None
-        hand = self._photographs[rng.integers(len(self._photographs))]
-        cut = cut_out(hand, self._crop, float(rng.uniform(*self._fill)), rng=rng)
-        return _tensors(cut | {"drawn": np.array(False), "number": np.array(number)})
-
     def _new_sitting(self, person: int) -> _Sitting:
-        """Somebody new, with poses for all of his or her pictures."""
+        """A new person, with poses for all of their pictures."""
         rng = SpawnKey.STREAM.rng(self.seed, _PERSON, person)
         if self._takes:
             subject = self._takes[rng.integers(len(self._takes))]
@@ -302,26 +297,23 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         return _Sitting(studio, subject, frames, person)
 
     def _posed(self, rng: np.random.Generator) -> Subject:
-        """A person's poses."""
+        """Poses for all pictures of a new person."""
         side: Side = SIDES[rng.integers(2)] if self._side == "either" else self._side
         while True:
             shape = sample_shape(side=side, rng=rng)
             model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
             try:
-                qpos = self._drawn_poses(model, rng)
+                if self._poses is None:
+                    qpos = sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
+                else:
+                    qpos = self._poses[rng.integers(len(self._poses), size=self._sitting)]
                 break
-            except PoseError:  # a hand whose fingers are too thick for its breadth
+            except PoseError:  # the fingers of the drawn hand are too thick for its breadth
                 if self._model is not None:
                     raise
         if qpos.ndim == 3 and self._model is None:
             model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
         return subject_of_poses(qpos, model=model, glove=self._glove)
-
-    def _drawn_poses(self, model: Model | tuple[Model, Model], rng: np.random.Generator) -> Doubles:
-        """Poses for all pictures of a person."""
-        if self._poses is not None:
-            return self._poses[rng.integers(len(self._poses), size=self._sitting)]
-        return sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)
@@ -330,11 +322,21 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         poses = {n: moment.hand(n) for n in range(len(take.hands))}
         there = {n: pose for n, pose in poses.items() if pose is not None}
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
-        moment, camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
+        points, wrists = np.concatenate(keypoints), np.stack(list(there.values()))
+        for _ in range(_TRIES):  # until the camera is outside of all surfaces
+            share = float(rng.uniform(*self._fill))
+            if self._crop is None:
+                camera = around_hands(self._camera, points, wrists, share, rng=rng)
+            else:
+                wide = around_hands(self._camera, points, wrists, share * _CROPPED, rng=rng)
+                camera = crop_around(wide, points, share, self._crop, rng=rng)
+            reaching = sitting.studio.reaching(moment, [camera])
+            if sitting.studio.is_clear(reaching, [camera]):
+                break
         skin = sitting.studio.skin
         chosen = sample_choices(self.config, skin, rng, camera.size)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
-        frame = sitting.studio.photograph(moment, camera, fresh, recorded=False)
+        frame = sitting.studio.photograph(reaching, camera, fresh, recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
         hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
@@ -353,31 +355,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             }
         )
 
-    def _placed(
-        self,
-        studio: Studio,
-        moment: Moment,
-        keypoints: Sequence[Doubles],
-        qpos: Sequence[Doubles],
-        rng: np.random.Generator,
-    ) -> tuple[Moment, Camera]:
-        """The camera somewhere around the hands, outside of all surfaces, and arms that leave its picture."""
-        points, wrists = np.concatenate(keypoints), np.stack(qpos)
-        for _ in range(_TRIES):
-            share = float(rng.uniform(*self._fill))
-            if self._crop is None:
-                camera = around_hands(self._camera, points, wrists, share, rng=rng)
-            else:
-                wide = around_hands(self._camera, points, wrists, share * _CROPPED, rng=rng)
-                camera = crop_around(wide, points, share, self._crop, rng=rng)
-            reaching = studio.reaching(moment, [camera])
-            if studio.is_clear(reaching, [camera]):
-                break
-        return reaching, camera
-
 
 def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Of a drawn picture what a labeled photograph has."""
+    """The arrays of a drawn picture that a labeled photograph has, too."""
     kept = {name: picture[name] for name in ("keypoints", "visible", "box", "side", "drawn", "number")}
     return {"rgb": picture.get("noisy_rgb", picture["rgb"])} | kept
 
@@ -397,7 +377,7 @@ def _camera(camera: Camera | str, crop: int | None) -> Camera:
 
 
 def _rows(poses: ArrayLike) -> Doubles:
-    """A user's poses, a row a pose."""
+    """A user's poses, one in each row."""
     try:
         rows = np.asarray(poses, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -408,7 +388,7 @@ def _rows(poses: ArrayLike) -> Doubles:
 
 
 def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:
-    """The pictures of a frame that there are, colors and normals with their channels first."""
+    """The pictures of a frame, colors and normals with their channels first."""
     ideal, noisy = frame.ideal, frame.noisy
     arrays = {
         "rgb": ideal.rgb,
@@ -428,7 +408,7 @@ def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:
 
 
 def _hand_arrays(hand: HandTruth | None, camera: Camera, shape: HandShape) -> dict[str, NDArray[np.generic]]:
-    """What belongs to a hand; NaN of one that is absent."""
+    """The arrays of one hand; NaN for one that is absent."""
     if hand is None:
         nothing = np.full((NUM_KEYPOINTS, 3), np.nan)
         found = {"keypoints": nothing[:, :2], "keypoints_camera": nothing, "box": nothing[:4, 0]}

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -30,6 +30,7 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
+    Flags,
     Floats,
     Geometry,
     HandTruth,
@@ -44,23 +45,29 @@ from render.scenery.backgrounds import Background, Enclosure, draw_surroundings,
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 
-_PALM_SIDE: Final = [name == "wrist" or name.endswith(("CMC", "MCP")) for name in KEYPOINT_NAMES]
-"""Which keypoints lie in the palm, too."""
+
+def _allowed_parts() -> Flags:
+    """Which parts of the hand may show each keypoint (21, 32): its digit's; palm or forearm for the wrist."""
+    allowed = np.zeros((len(KEYPOINT_NAMES), PARTS_A_HAND), dtype=bool)
+    for keypoint, (name, digit) in enumerate(zip(KEYPOINT_NAMES, KEYPOINT_DIGITS, strict=True)):
+        allowed[keypoint, list(bones_of(DIGITS[digit])) if digit >= 0 else [FOREARM]] = True
+        allowed[keypoint, PALM] = name == "wrist" or name.endswith(("CMC", "MCP"))
+    return allowed
+
+
+_ALLOWED: Final = _allowed_parts()
 
 
 def hand_truth(
     figure: HandFigure,
-    qpos: Float[np.ndarray, "27"],
+    qpos: Doubles,
     number: int,
     camera: Camera,
     pictures: Geometry,
     *,
     recorded: bool = True,
 ) -> HandTruth:
-    """Ground truth of a hand, by its number among those in the picture, from the camera's depth and parts.
-
-    Vertices are computed where it is recorded.
-    """
+    """Ground truth of a hand, by its number among those in the picture; vertices only where `recorded`."""
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     pixels = camera.project(keypoints)
@@ -80,14 +87,12 @@ def hand_truth(
 
 def _visible(
     keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
-) -> Bool[np.ndarray, "21"]:
-    """Keypoints whose pixel shows the finger that they are in.
+) -> Flags:
+    """Keypoints (21,) whose pixel shows their own finger, or the palm for those at its edge.
 
-    The pixel is one of this hand, of the keypoint's digit (or of the palm, where it is at its edge), and the
-    keypoint is no deeper under the surface there than the finger is thick.
+    A visible keypoint is no deeper under the surface at its pixel than the finger is thick.
     """
-    width, height = camera.size
-    inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    inside = np.all((pixels >= 0.0) & (pixels < camera.size), axis=1)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
     bones = pictures.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * number
     own = inside & (pictures.instances[rows, columns] == 1 + number) & (bones >= 0) & (bones < PARTS_A_HAND)
@@ -96,35 +101,19 @@ def _visible(
     ahead = local[:, 2] > 0.0
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
-    # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
+    # A fisheye sees sideways and back, where pictures have no depth: there, only the part is compared.
     return np.asarray(own & np.where(ahead, under <= thickness, True))
 
 
-def _allowed_parts() -> Bool[np.ndarray, "21 32"]:
-    """Parts of the hand that may show each keypoint: those of its digit; the wrist's the palm and forearm."""
-    allowed = np.zeros((len(KEYPOINT_NAMES), PARTS_A_HAND), dtype=bool)
-    for keypoint, digit in enumerate(KEYPOINT_DIGITS):
-        allowed[keypoint, list(bones_of(DIGITS[digit])) if digit >= 0 else [FOREARM]] = True
-        allowed[keypoint, PALM] = _PALM_SIDE[keypoint]
-    return allowed
-
-
-_ALLOWED: Final = _allowed_parts()
-
-
-def _box(parts: UInt8[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "4"]:
+def _box(parts: Bytes, number: int) -> Doubles:
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     first = 1 + PARTS_A_HAND * number
     mine = (parts >= first) & (parts < first + FOREARM)
-    columns, rows = np.flatnonzero(mine.any(axis=0)), np.flatnonzero(mine.any(axis=1))
-    if not len(columns):
-        return np.full(4, np.nan)
-    left, top = float(columns[0]), float(rows[0])
-    return np.array([left, top, columns[-1] + 1.0 - left, rows[-1] + 1.0 - top])
+    left, top, width, height = cv2.boundingRect(mine.view(np.uint8))
+    return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
 
 
-_AROUND: Final = 8
-"""Pixels around a surface that a depth sensor's windows look at, and more."""
+_WINDOW: Final = 8  # pixels around a surface that change what a depth sensor measures on it, at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,26 +123,26 @@ class FrameChoices:
     lighting: Lighting
     background: Background
     exposure: Exposure | None  # None for a perfect color sensor
-    shutter: Shutter | None  # None for a picture of a moment
+    shutter: Shutter | None  # None for a picture of an instant
     depth_noise: DepthNoise | None  # None for a perfect depth sensor
     seed: int  # seed of the sensors' noise
     enclosure: Enclosure | None = None
-    """The box whose walls have the background, for several cameras; None: a picture without depth."""
+    """Box whose walls show the background to several cameras; None for a background without depth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One frame of a take, and the time around it, which shutters blur."""
+    """One frame of a take, and the motion around it, which shutters blur."""
 
     take: Take
     frame: int
     person: Int[np.ndarray, "T"] | None = None
-    """Who is in each frame, where that changes: the time around a frame ends where another person comes."""
+    """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's upper arm; see `Studio.reaching`."""
 
-    def hand(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "27"] | None:
-        """Pose of a hand `shift` seconds after the frame; None where the frame has none."""
+    def hand(self, number: int, shift: float = 0.0) -> Doubles | None:
+        """Pose (27,) of a hand `shift` seconds after the frame; None where the frame has none."""
         rows = self.take.qpos[:, number]
         if not np.isfinite(rows[self.frame]).all():
             return None
@@ -164,8 +153,8 @@ class Moment:
         pose[3:7] /= np.linalg.norm(pose[3:7])
         return pose
 
-    def body(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "4 4"] | None:
-        """Pose of a rigid body `shift` seconds after the frame; None where the frame has none."""
+    def body(self, number: int, shift: float = 0.0) -> Doubles | None:
+        """Pose (4, 4) of a rigid body `shift` seconds after the frame; None where the frame has none."""
         rows = self.take.body_poses[:, number]
         if not np.isfinite(rows[self.frame]).all():
             return None
@@ -176,10 +165,10 @@ class Moment:
         T_world_body[:3, :3] = left @ right
         return T_world_body
 
-    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[Doubles, float]:
-        """The rows before and after a time, and the share of the way between them.
+    def _around(self, rows: Doubles, shift: float) -> tuple[Doubles, float]:
+        """The rows before and after a time, and the time's position between them, from 0 to 1.
 
-        Rows without numbers, and those of others than the frame's person, count as the frame's own.
+        The frame's own row replaces rows with NaN and rows of other people.
         """
         frames = shift * self.take.rate
         step = int(np.floor(frames))
@@ -214,7 +203,7 @@ class Studio:
         ]
         self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, body_colors, strict=True)]
         self._colors = tuple(body_colors)
-        self._posed: tuple[Moment, list[Drawn]] | None = None  # the last moment's, seen by several cameras
+        self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
 
     @property
     def skin(self) -> SkinLook | None:
@@ -224,13 +213,18 @@ class Studio:
     def photograph(
         self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
     ) -> RenderedFrame:
-        """Draw one moment of the studio's hands and bodies, with all other choices.
+        """Draw one moment of the hands and bodies.
 
-        Where `recorded`, the frame has its choices as JSON and the hands' vertices, which take time.
+        The frame has its choices as JSON, and the hands' vertices, only where `recorded`: both take time.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
         drawn = self._still(moment)
-        _check_outside(camera, drawn, frame)
+        nearest = _clearance(camera, drawn)
+        if nearest < 2.0 * NEAR:
+            raise HandSimError(
+                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
+                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+            )
         present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
         sensor = choices.depth_noise if "depth" in self.passes else None
         surfaces = [one.triangles for one in drawn]
@@ -271,16 +265,12 @@ class Studio:
     def reaching(self, moment: Moment, cameras: Sequence[Camera]) -> Moment:
         """The moment with arms that leave the pictures of these cameras."""
         found = np.full((len(self._hands), 3), np.nan)
-        there, elbows, forearms = [], [], []
-        for number, hand in enumerate(self._hands):
-            pose = moment.hand(number)
-            if pose is not None:
-                elbow, forearm = hand.skin.forearm_line(pose)
-                there.append(number)
-                elbows.append(elbow)
-                forearms.append(forearm)
+        poses = {number: moment.hand(number) for number in range(len(self._hands))}
+        there = {number: pose for number, pose in poses.items() if pose is not None}
         if there:
-            found[there] = upper_arms(np.array(elbows), np.array(forearms), cameras)
+            lines = (self._hands[number].skin.forearm_line(pose) for number, pose in there.items())
+            elbows, forearms = zip(*lines, strict=True)
+            found[[*there]] = upper_arms(np.array(elbows), np.array(forearms), cameras)
         return dataclasses.replace(moment, upper_arms=found)
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
@@ -295,7 +285,7 @@ class Studio:
         return self._posed[1]
 
     def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
-        """Surfaces of the hands and bodies that are there, `shift` seconds later."""
+        """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
         drawn: list[Drawn] = []
         number = 0
         for index, hand in enumerate(self._hands):
@@ -319,22 +309,26 @@ class Studio:
         camera: Camera,
         sensor: DepthNoise,
         rng: np.random.Generator,
-    ) -> Float32[np.ndarray, "H W"]:
-        """Depth as the sensor has it; only the part of the picture that has depth takes time."""
+    ) -> Floats:
+        """Depth that the sensor measures, computed for the part of the picture with surfaces."""
         assert truth.normals is not None
         noisy = np.zeros_like(truth.depth)
         left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
         if width == 0:
             return noisy
         right, bottom = (
-            min(end + _AROUND, side)
+            min(end + _WINDOW, side)
             for end, side in zip((left + width, top + height), camera.size, strict=True)
         )
-        left, top = max(0, left - _AROUND), max(0, top - _AROUND)
+        left, top = max(0, left - _WINDOW), max(0, top - _WINDOW)
         part = np.s_[top:bottom, left:right]
         light = None
-        if isinstance(sensor, TimeOfFlight):  # others need none
-            light = self._infrared(truth.instances[part], None if rgb is None else rgb[part], present)
+        if isinstance(sensor, TimeOfFlight):
+            shape = bottom - top, right - left
+            light = np.ones(shape, np.float32) if rgb is None else reflectance_of(rgb[part])
+            for index, number in enumerate(present):
+                if self._people[number].glove is None:
+                    light[truth.instances[part] == index + 1] = self._people[number].skin.infrared
         noisy[part] = apply_depth_noise(
             truth.depth[part],
             truth.normals[part],
@@ -345,41 +339,27 @@ class Studio:
         )
         return noisy
 
-    def _infrared(self, instances: Bytes, rgb: Bytes | None, present: Sequence[int]) -> Floats:
-        """Infrared reflectance of each pixel (H, W), from its color; bare skin has its own."""
-        infrared = np.ones(instances.shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
-        for index, number in enumerate(present):
-            if self._people[number].glove is None:
-                infrared[instances == index + 1] = self._people[number].skin.infrared
-        return infrared
-
-    def _colors_of(
-        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
-    ) -> UInt8[np.ndarray, "H W 3"]:
+    def _colors_of(self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Bytes:
         """The perfect color picture."""
+        background = choices.background
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
         whole = warp(camera, painted, cv2.INTER_LINEAR)
-        if choices.enclosure is None:
-            return put_before(whole, self._behind(camera, drawn, choices))
-        behind = draw_surroundings(choices.background, choices.enclosure, camera)
-        return put_before(whole, behind.rgb.astype(np.float32))
-
-    def _behind(
-        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
-    ) -> Float32[np.ndarray, "H W 3"]:
-        """The background with what shadows fall on it, sRGB from 0 to 255."""
-        plain, backdrop = _background(choices.background, camera.size), choices.background.backdrop
-        if backdrop is None or camera.lens.kind != "pinhole":
-            return plain
-        light = light_behind(camera, drawn, choices.lighting, backdrop)
+        if choices.enclosure is not None:
+            behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
+            return put_before(whole, behind)
+        plain, light = _background(background, camera.size), None
+        if background.backdrop is not None and camera.lens.kind == "pinhole":
+            light = light_behind(camera, drawn, choices.lighting, background.backdrop)
         if light is None:
-            return plain
-        return np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
+            return put_before(whole, plain)
+        return put_before(
+            whole, np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
+        )
 
     def _exposed(
         self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
-    ) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The color picture of shutter and sensor; None when they change nothing."""
+    ) -> Bytes | None:
+        """The color picture of shutter and sensor; None if they change nothing."""
         if choices.exposure is None and choices.shutter is None:
             return None
         if choices.shutter is None:
@@ -392,6 +372,7 @@ class Studio:
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
     def _requested(self, truth: Geometry, rgb: Bytes | None) -> Pictures:
+        """The pictures of the requested passes."""
         ids = "ids" in self.passes
         return Pictures(
             rgb,
@@ -419,7 +400,7 @@ def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
 
 @kernel
 def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
-    """Distance [m] of the nearest of some vertices (V, 3) from a place."""
+    """Distance [m] from a position to the nearest of some vertices (V, 3)."""
     least = np.inf
     for vertex in range(len(vertices)):
         dx, dy, dz = vertices[vertex, 0] - x, vertices[vertex, 1] - y, vertices[vertex, 2] - z
@@ -427,17 +408,8 @@ def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
     return float(np.sqrt(least))
 
 
-def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
-    nearest = _clearance(camera, drawn)
-    if nearest < 2.0 * NEAR:
-        raise HandSimError(
-            f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
-            f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
-        )
-
-
 @functools.lru_cache(maxsize=2)
-def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """SRGB from 0 to 255."""
+def _background(background: Background, size: tuple[int, int]) -> Floats:
+    """A background (H, W, 3) in sRGB, from 0 to 255."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
     return enlarged(np.multiply(display, np.float32(255.0), out=display), size)

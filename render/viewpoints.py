@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from gloves.takes.take import Take
@@ -26,76 +26,64 @@ from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.frames import Doubles, Flags, Floats, Integers
 
-_KEPT: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that a hand's outline depends on
+_OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
 _CHUNK: Final = 2048  # frames whose keypoints are computed at once
-_SKIN: Final = 0.012  # [m] around keypoints
-_BORDER: Final = 0.04  # of half a picture, which hands keep free
-_NEAREST: Final = 0.15  # [m] between a camera and the nearest keypoint, at least
-_WIDEST: Final = 2.0  # tangent of half the angle of view that is made use of
+_SKIN: Final = 0.012  # thickness of the skin around keypoints [m]
+_BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of half its width or height
+_NEAREST_KEYPOINT: Final = 0.15  # least depth of a keypoint before a camera [m]
+_WIDEST_TANGENT: Final = 2.0  # largest tangent of half an angle of view that hands may fill
 
 
 class Framing:
-    """The hands of a take as cameras have to show them."""
+    """Distances and directions at which cameras show the hands of a take."""
 
     def __init__(self, take: Take) -> None:
-        shape = (take.num_frames, len(take.hands), len(_KEPT), 3)
-        self.points: Float32[np.ndarray, "T H P 3"] = np.full(shape, np.nan, dtype=np.float32)
-        """Keypoints of all hands in the world [m]; NaN where a hand is absent."""
+        shape = (take.num_frames, len(take.hands), len(_OUTLINE), 3)
+        self.points: Floats = np.full(shape, np.nan, dtype=np.float32)
+        """Keypoints of all hands in the world (T, H, P, 3) [m]; NaN where a hand is absent."""
         for number, hand in enumerate(take.hands):
             there = np.flatnonzero(np.isfinite(take.qpos[:, number]).all(axis=1))
             for first in range(0, len(there), _CHUNK):
                 rows = there[first : first + _CHUNK]
-                self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _KEPT]
+                self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _OUTLINE]
         self._there = np.isfinite(self.points[..., 0, 0])
-        self.centers: Float[np.ndarray, "T 3"] = self._centers()
-        """Middle of the box around all hands of each frame [m]; interpolated over frames without hands."""
-        self._window = max(1, round(0.5 * take.rate))
-
-    def _centers(self) -> Doubles:
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
         middles = 0.5 * (np.nanmin(flat, axis=1) + np.nanmax(flat, axis=1))
-        frames = np.arange(len(self.points))
-        return np.stack([np.interp(frames, known, middles[:, axis]) for axis in range(3)], axis=1)
+        frames = np.arange(take.num_frames)
+        self.centers = np.stack([np.interp(frames, known, middles[:, axis]) for axis in range(3)], axis=1)
+        """Middle of the box around all hands of each frame (T, 3) [m], interpolated where there are none."""
+        self._window = max(1, round(0.5 * take.rate))
 
-    def middle(self) -> Float[np.ndarray, "3"]:
-        """Middle of all places where the hands are [m]."""
+    def middle(self) -> Doubles:
+        """Middle (3,) of the box around the centers of all frames [m]."""
         return np.asarray(0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0)))
 
-    def followed(self) -> Float[np.ndarray, "T 3"]:
-        """The centers as a person with a camera follows them [m]: without what is quicker than a second."""
+    def followed(self) -> Doubles:
+        """The centers (T, 3) [m] averaged over half a second, as a person with a camera follows them."""
         return np.asarray(uniform_filter1d(self.centers, self._window, axis=0, mode="nearest"))
 
-    def held(self, distances: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
-        """Distances that change slowly and are nowhere shorter than these [m]."""
+    def held(self, distances: Doubles) -> Doubles:
+        """Distances (T,) that change slowly and are nowhere shorter than these [m]."""
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
         return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
-    def sides(
-        self, rotations: Float[np.ndarray, "F 3 3"], frames: Int[np.ndarray, "F"] | None = None
-    ) -> Float[np.ndarray, "F"]:
-        """Longer side of a hand in each frame from afar, the mean of its hands [m]; NaN without hands."""
+    def sides(self, rotations: Doubles, frames: Integers | None = None) -> Doubles:
+        """Longer side of the hands seen from far away, the mean of each frame (F,) [m]; NaN without hands."""
         points, there = self._rows(frames)
-        local = self._turned(points, rotations)[..., :2]
-        longer = np.ptp(local, axis=2).max(axis=-1)
+        longer = np.ptp(self._rotated(points, rotations)[..., :2], axis=2).max(axis=-1)
         count = there.sum(axis=1)
         total = np.where(there, longer, 0.0).sum(axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
-    def shares(
-        self,
-        camera: Camera,
-        poses: Float[np.ndarray, "F 4 4"],
-        most: float,
-        frames: Int[np.ndarray, "F"] | None = None,
-    ) -> Float[np.ndarray, "F"]:
-        """Share of the picture's height that a hand's longer side has, the mean of a frame's hands.
+    def shares(self, camera: Camera, poses: Doubles, most: float, frames: Integers | None = None) -> Doubles:
+        """Share (F,) of the picture's height that hands' longer sides have, at most `most`, their mean.
 
-        Two hands before one another count for less, by how much of the smaller one's box the other covers.
+        Where two hands overlap, it is less by the covered share of the smaller one's box.
         """
         points, there = self._rows(frames)
         rotations, positions = poses[:, :3, :3], poses[:, None, None, :3, 3]
-        local = self._turned(points - positions.astype(np.float32), rotations)
+        local = self._rotated(points - positions.astype(np.float32), rotations)
         pixels = local[..., :2] / np.maximum(local[..., 2:], 1e-3) * camera.K[1, 1] / camera.size[1]
         low, high = pixels.min(axis=2), pixels.max(axis=2)
         longer = np.where(there, np.minimum((high - low).max(axis=-1), most), 0.0)
@@ -107,71 +95,57 @@ class Framing:
         return np.where(there.any(axis=1), total, np.nan)
 
     def shortest(
-        self,
-        camera: Camera,
-        centers: Float[np.ndarray, "F 3"],
-        rotations: Float[np.ndarray, "F 3 3"],
-        frames: Int[np.ndarray, "F"] | None = None,
-    ) -> Float[np.ndarray, "F"]:
-        """Shortest distance of a camera from the place that it looks at with all hands in its picture [m]."""
+        self, camera: Camera, centers: Doubles, rotations: Doubles, frames: Integers | None = None
+    ) -> Doubles:
+        """Shortest distance (F,) from these centers at which a camera sees all hands [m]."""
         points, there = self._rows(frames)
         around = points - centers[:, None, None].astype(np.float32)
-        local = self._turned(around, rotations).reshape(len(centers), -1, 3)
+        local = self._rotated(around, rotations).reshape(len(centers), -1, 3)
         needed = ((np.abs(local[..., :2]) + _SKIN) / half_view(camera)).max(axis=-1)
-        distances = np.maximum(needed, _NEAREST) - local[..., 2]
+        distances = np.maximum(needed, _NEAREST_KEYPOINT) - local[..., 2]
         return np.where(there.any(axis=1), np.nan_to_num(distances, nan=-np.inf).max(axis=1), 0.0)
 
-    def centered(
-        self,
-        centers: Float[np.ndarray, "T 3"],
-        rotations: Float[np.ndarray, "T 3 3"],
-        distances: Float[np.ndarray, "T"],
-    ) -> Float[np.ndarray, "T 3"]:
-        """Places to look at [m] with all hands in the middle of the picture, as near these as may be."""
+    def centered(self, centers: Doubles, rotations: Doubles, distances: Doubles) -> Doubles:
+        """Points near these centers (T, 3) [m] to look at with all hands in the middle of the picture."""
         around = self.points - centers[:, None, None].astype(np.float32)
-        local = self._turned(around, rotations).reshape(len(centers), -1, 3)
+        local = self._rotated(around, rotations).reshape(len(centers), -1, 3)
         there = self._there.any(axis=1)
-        rays = local[there, :, :2] / np.maximum(local[there, :, 2:] + distances[there, None, None], _NEAREST)
+        depths = np.maximum(local[there, :, 2:] + distances[there, None, None], _NEAREST_KEYPOINT)
+        rays = local[there, :, :2] / depths
         shifts = np.zeros((len(centers), 2))
         shifts[there] = 0.5 * distances[there, None] * (np.nanmin(rays, axis=1) + np.nanmax(rays, axis=1))
         shifts = uniform_filter1d(shifts, self._window, axis=0, mode="nearest")
         return np.asarray(centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts))
 
     def _rows(self, frames: Integers | None) -> tuple[Floats, Flags]:
-        if frames is None:
-            return self.points, self._there
-        return self.points[frames], self._there[frames]
+        return (self.points, self._there) if frames is None else (self.points[frames], self._there[frames])
 
     @staticmethod
-    def _turned(points: Floats, rotations: Doubles) -> Doubles:
+    def _rotated(points: Floats, rotations: Doubles) -> Doubles:
         """Points (T, H, P, 3) in the axes of cameras (T, 3, 3)."""
-        flat = points.reshape(len(points), -1, 3)
-        return (flat @ rotations).reshape(points.shape)
+        return (points.reshape(len(points), -1, 3) @ rotations).reshape(points.shape)
 
 
-def half_view(camera: Camera) -> Float[np.ndarray, "2"]:
-    """Tangents of half the angles of view across and down that hands may fill."""
+def half_view(camera: Camera) -> Doubles:
+    """Tangents (2,) of half the angles of view across and down that hands may fill."""
     (width, height), (cx, cy) = camera.size, camera.K[:2, 2]
     rays = camera.unproject(np.array([[0.0, cy], [width, cy], [cx, 0.0], [cx, height]]))
     ahead = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
-    tangents = np.nan_to_num(np.abs(rays[:, :2]).max(axis=1) / ahead, nan=_WIDEST)
-    return np.asarray((1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST))
+    tangents = np.nan_to_num(np.abs(rays[:, :2]).max(axis=1) / ahead, nan=_WIDEST_TANGENT)
+    return np.asarray((1.0 - _BORDER) * np.minimum(tangents.reshape(2, 2).min(axis=1), _WIDEST_TANGENT))
 
 
-def looking(directions: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3 3"]:
-    """Axes of upright cameras in these unit directions from what they look at, as columns."""
+def looking(directions: Doubles) -> Doubles:
+    """Axes (T, 3, 3), as columns, of upright cameras in these unit directions from their targets."""
     forward = -directions
     steep = np.abs(forward[:, 2:]) >= 0.999
-    up = np.where(steep, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.where(steep, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     return np.stack([right, np.cross(forward, right), forward], axis=2)
 
 
-def poses_at(
-    positions: Float[np.ndarray, "T 3"], rotations: Float[np.ndarray, "T 3 3"]
-) -> Float[np.ndarray, "T 4 4"]:
-    """Poses of cameras at these positions [m] with these axes."""
+def _transforms(positions: Doubles, rotations: Doubles) -> Doubles:
+    """Poses (T, 4, 4) of cameras at positions [m], with these axes."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
     return poses
@@ -179,28 +153,28 @@ def poses_at(
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
-_EYES: Final = (0.32, 0.38)  # [m] of the head's camera behind and above the hands
-_HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
-_ORBIT_PERIOD: Final = 12.0  # [s] of one revolution of a camera in orbit
+_EYES: Final = (0.32, 0.38)  # position of a head's camera behind and above the hands [m]
+_HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # least angle between a head's line of sight and a forearm
+_ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
-_TRIES: Final = 60
-_CLOSER: Final = 1.35  # largest share of a hand over `ViewConfig.share`
-_ENOUGH: Final = 1.05  # by how much smaller than the share hands may be before other places are tried
-_SKIN_CLEARANCE: Final = 0.08  # [m] between a camera around hands and the nearest keypoint, at least
-_FREE: Final = 0.8  # of the room around hands in a picture, which they are shifted within
-_ROUNDS: Final = 8
-_NEARLY_ALL: Final = 0.97  # of the frames: what a lens of one length shows whole
-_PLACES: Final = 16  # in front of the hands, and orbits, that are tried
-_AROUND: Final = 36  # azimuths of an orbit whose views are compared,
-_SAMPLES: Final = 48  # in so many frames
-_CENTERED: Final = 2  # times that a camera is turned to the middle of what it sees
-_LINGER: Final = 20.0  # power of their share that an orbit's time where hands are small falls with
-_QUICKEST: Final = 0.02  # of the longest time, at least
-_ASIDE: Final = np.deg2rad(90.0)  # farther from the front, at most
-_HIDDEN: Final = 10.0  # what a view from behind an arm counts as, times the distance of the share
-_ARM: Final = 0.5  # [m] of a forearm that views keep clear of
-_ARM_DISTANCE: Final = 0.2  # [m] between its middle and a camera, at least
-_ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at least
+_TRIES: Final = 60  # random directions that are tried for one camera
+_CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
+_ENOUGH: Final = 1.05  # ratio between the share and that of hands up to which no other place is tried
+_SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
+_FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
+_ROUNDS: Final = 8  # iterations that fit the hands into a picture
+_NEARLY_ALL: Final = 0.97  # share of the frames that a lens without zoom shows whole
+_PLACES: Final = 16  # places, or orbits, that are tried for hands that are far apart
+_AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
+_SAMPLES: Final = 48  # frames in which they are compared
+_CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
+_LINGER: Final = 20.0  # exponent: how fast an orbit skips views with small hands
+_QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
+_ASIDE: Final = np.deg2rad(90.0)  # largest further angle from the front
+_HIDDEN: Final = 10.0  # penalty of a view from behind an arm; that of a view from twice as far is 1
+_ARM: Final = 0.5  # length of a forearm that views keep clear of [m]
+_ARM_DISTANCE: Final = 0.2  # least distance between its axis and a camera [m]
+_ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,18 +229,16 @@ class ViewConfig(Settings):
 
 
 class _Path(NamedTuple):
-    """A camera on its way."""
+    """A camera and its poses."""
 
     camera: Camera
-    poses: Doubles  # (T, 4, 4)
-    zoom: Doubles | None = None  # factor on its focal lengths (T,); None: it keeps them
+    poses: Doubles  # pose of each frame (T, 4, 4)
+    zoom: Doubles | None = None  # factor on the focal lengths in each frame (T,)
 
     def at(self, frame: int) -> Camera:
         """The camera of one frame."""
         camera = self.camera.at(self.poses[frame])
-        if self.zoom is None:
-            return camera
-        return zoomed(camera, float(self.zoom[frame]))
+        return camera if self.zoom is None else zoomed(camera, float(self.zoom[frame]))
 
 
 class Viewpoints:
@@ -295,7 +267,7 @@ class Viewpoints:
         return self._paths[0].camera.size
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
-        """All positions of the cameras, and of the hands' centers, over the whole take [m]."""
+        """Positions of the cameras and of the hands' centers in all frames [m]."""
         return np.concatenate([self._centers, *(path.poses[:, :3, 3] for path in self._paths)])
 
     def cameras(self, frame: int) -> list[Camera]:
@@ -315,16 +287,17 @@ def _towards_user(take: Take) -> Doubles:
     return level / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
 
 
-def _spherical(azimuth: float, elevation: float) -> Doubles:
-    return np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+def _spherical(azimuth: Doubles | float, elevation: Doubles | float) -> Doubles:
+    """Unit vectors (..., 3) at these angles [rad]."""
+    level = np.cos(elevation)
+    parts = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 
 def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """In front of the user; several cameras form a fan.
 
-    Hands that are far apart are large only from a side, or from above: other places are tried then.
+    Hands that are far apart look large only from a side or from above, so several places are tried.
     """
     user = _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
@@ -340,7 +313,7 @@ def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
 
 
 def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    """Around the hands, and around hands that are far apart more slowly where they are large."""
+    """Around the hands; hands that are far apart are passed more slowly where they look large."""
     turned = 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
 
     def orbits(first: float) -> Iterator[Doubles]:
@@ -349,8 +322,7 @@ def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
             elevation = rng.uniform(0.0, 0.8)
             if attempt:
                 azimuths = _lingering(config, framing, azimuths, elevation)
-            level = np.cos(elevation) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
-            yield np.column_stack([level, np.full(len(level), np.sin(elevation))])
+            yield _spherical(azimuths, elevation)
 
     first = 2.0 * np.pi * np.arange(config.views) / config.views
     return [_largest(config, framing, orbits(one), rng) for one in first]
@@ -359,10 +331,7 @@ def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
 def _largest(
     config: ViewConfig, framing: Framing, ways: Iterator[Doubles], rng: np.random.Generator
 ) -> _Path:
-    """The first of some cameras that shows hands as large as asked for; if none does, the best of them.
-
-    Of the directions (T, 3) the first is taken where hands have one distance.
-    """
+    """A camera in the first of these directions (T, 3) that shows hands large enough, or in the best one."""
     best, chosen = np.inf, None
     for directions in ways:
         farther, path = _followed(config, framing, directions, rng)
@@ -379,31 +348,29 @@ def _largest(
 
 
 def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation: float) -> Doubles:
-    """Azimuths (T,) in the place of those of an even turn, that pass quickly where hands would be small."""
-    camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
+    """Azimuths (T,) of an even turn, changed so that they pass quickly where hands would be small."""
+    camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AZIMUTHS, endpoint=False)
     frames = np.unique(np.linspace(0, len(turned) - 1, _SAMPLES).astype(int))
     shares = []
     for azimuth in azimuths:
         directions = np.tile(_spherical(azimuth, elevation), (len(frames), 1))
         centers, rotations = framing.centers[frames], looking(directions)
         away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
-        poses = poses_at(centers + away, rotations)
+        poses = _transforms(centers + away, rotations)
         shares.append(np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames)))
     time = np.minimum(np.array(shares) / config.share, 1.0) ** _LINGER
     time = np.maximum(time, _QUICKEST * time.max())
     passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
     laps, rest = np.divmod(turned, 2.0 * np.pi)
-    slow: Doubles = 2.0 * np.pi * laps
-    slow += np.interp(rest, passed, np.append(azimuths, 2.0 * np.pi))
-    return slow
+    return np.asarray(2.0 * np.pi * laps + np.interp(rest, passed, np.append(azimuths, 2.0 * np.pi)))
 
 
 def _followed(
     config: ViewConfig, framing: Framing, directions: Doubles, rng: np.random.Generator
 ) -> tuple[float, _Path]:
-    """A camera in these directions (T, 3) of the hands that shows them all, and moves as little as it can.
+    """A camera in these directions (T, 3) that shows all hands and moves as little as it can.
 
-    Before it comes how much farther away it is than the share takes (the median).
+    The first value is the median ratio of its distance and that of the share.
     """
     camera, rotations = preset(config.camera), looking(directions)
     kept = np.broadcast_to(framing.middle(), directions.shape)
@@ -417,15 +384,14 @@ def _followed(
     if enough <= _ENOUGH * farthest:
         centers, distances = kept, np.full(len(kept), usual if config.distance else max(usual, enough))
     else:
-        centers = framing.followed()
-        distances = np.full(len(centers), usual)
+        centers, distances = framing.followed(), np.full(len(kept), usual)
         if config.distance is None:
-            for _ in range(_CENTERED):
+            for _ in range(_CENTERINGS):
                 shortest = framing.shortest(camera, centers, rotations)
                 distances = framing.held(np.maximum(shortest, usual))
                 centers = framing.centered(centers, rotations, distances)
             distances = framing.held(np.maximum(framing.shortest(camera, centers, rotations), usual))
-    poses = poses_at(centers + distances[:, None] * directions, rotations)
+    poses = _transforms(centers + distances[:, None] * directions, rotations)
     return float(np.median(distances)) / farthest, _Path(camera, poses)
 
 
@@ -435,9 +401,8 @@ def _distance_of(camera: Camera, side: Doubles | float, share: Doubles | float) 
 
 
 def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    """At the eyes, following the hands with a delay; several cameras are side by side, as two eyes are."""
-    centers = framing.followed()
-    user = _towards_user(take)
+    """At the user's eyes, turned to the hands; several cameras stand side by side, as two eyes do."""
+    centers, user = framing.followed(), _towards_user(take)
     back, up = _EYES[0] + rng.uniform(-0.05, 0.05), _EYES[1] + rng.uniform(-0.05, 0.05)
     direction = _past_forearms(take, back * user + [0.0, 0.0, up])
     aside = np.cross(user, [0.0, 0.0, 1.0])
@@ -447,7 +412,7 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
         eyes += 0.064 * (number - 0.5 * (config.views - 1)) * aside
         away = eyes - centers
         directions = away / np.linalg.norm(away, axis=1, keepdims=True)
-        paths.append(_Path(preset(config.camera), poses_at(eyes, looking(directions))))
+        paths.append(_Path(preset(config.camera), _transforms(eyes, looking(directions))))
     return paths
 
 
@@ -457,18 +422,18 @@ def _past_forearms(take: Take, offset: Doubles) -> Doubles:
     direction = offset / length
     medians = np.nanmedian(-_along(take), axis=0)
     medians /= np.linalg.norm(medians, axis=1, keepdims=True)
-    for arm in [*medians] * 2:  # twice: avoiding one arm may lead into the other
+    for arm in [*medians] * 2:  # once more, because avoiding one arm may lead into the other
         if direction @ arm > np.cos(_HEAD_CLEARANCE):
             across = direction - (direction @ arm) * arm
             if np.linalg.norm(across) < 1e-3:
                 across = np.cross(arm, [1.0, 0.0, 0.0])
-            direction = np.cos(_HEAD_CLEARANCE) * arm + np.sin(_HEAD_CLEARANCE) * across / np.linalg.norm(
-                across
-            )
+            sideways = np.sin(_HEAD_CLEARANCE) * across / np.linalg.norm(across)
+            direction = np.cos(_HEAD_CLEARANCE) * arm + sideways
     return length * direction
 
 
 def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
+    """At another random position in every frame, not behind an arm, where hands look large enough."""
     centers, paths, camera = framing.centers, [], preset(config.camera)
     for _ in range(config.views):
         best, chosen = np.full(take.num_frames, np.inf), np.tile([0.0, 0.0, 1.0], (take.num_frames, 1))
@@ -479,8 +444,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
             count, middles = len(remaining), centers[remaining]
             azimuths = rng.uniform(-np.pi, np.pi, count)
             rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), count))
-            level = np.cos(rise)[:, None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
-            directions = np.column_stack([level, np.sin(rise)])
+            directions = _spherical(azimuths, rise)
             rotations = looking(directions)
             if config.distance is None:
                 usual = _distance_of(camera, framing.sides(rotations, remaining), config.share)
@@ -488,7 +452,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
                 distance = np.maximum(usual / closer[remaining], shortest)
                 smaller = distance / usual
                 if attempt:
-                    poses = poses_at(middles + distance[:, None] * directions, rotations)
+                    poses = _transforms(middles + distance[:, None] * directions, rotations)
                     shares = framing.shares(camera, poses, _CLOSER * config.share, remaining)
                     smaller = config.share / np.maximum(shares, 1e-6)
                 bad = np.maximum(np.nan_to_num(smaller, nan=1.0), _ENOUGH)
@@ -501,16 +465,13 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
             remaining = remaining[best[remaining] > _ENOUGH]
             if not len(remaining):
                 break
-        distances = np.where(np.isfinite(distances), distances, 1.0)  # of frames without hands
-        paths.append(_Path(camera, poses_at(centers + distances[:, None] * chosen, looking(chosen))))
+        distances = np.where(np.isfinite(distances), distances, 1.0)  # frames without hands
+        paths.append(_Path(camera, _transforms(centers + distances[:, None] * chosen, looking(chosen))))
     return paths
 
 
 def _behind_arms(qpos: Doubles, positions: Doubles) -> Flags:
-    """Whether each frame's position (T, 3) [m] is behind a forearm, where little else is seen, or beside one.
-
-    NaN, where there is no hand, never is.
-    """
+    """Whether positions (T, 3) [m] are close to a forearm, or behind one, which would hide its hand."""
     away = np.nan_to_num(positions)[:, None] - qpos[..., :3]
     along = quaternion_matrix(qpos[..., 3:7])[..., 0]
     back = -(away * along).sum(axis=-1)
@@ -520,15 +481,15 @@ def _behind_arms(qpos: Doubles, positions: Doubles) -> Flags:
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    """At the cameras of a rig, with the lens that the share takes, or one that shows nearly all hands.
+    """At the cameras of a rig, with lenses as long as the share takes, if they show nearly all hands.
 
-    Where that makes them small, cameras follow the hands, and where it still does, they zoom too.
+    If no such lens does, cameras turn to follow the hands, and if that is not enough either, they zoom.
     """
     middle, paths = framing.middle(), []
     for T_world_camera in load_rig(config.rig).T_world_camera:
         camera, position, zoom = preset(config.camera), T_world_camera[:3, 3], None
         followed = framing.followed()
-        for _ in range(_CENTERED):
+        for _ in range(_CENTERINGS):
             _, distances, rotations = _turned_to(position, followed)
             followed = framing.centered(followed, rotations, distances)
         for centers in (np.broadcast_to(middle, followed.shape), followed):
@@ -546,7 +507,7 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
             zoom = 1.0 / framing.held(1.0 / np.minimum(wanted, longest)) / lens
         if camera.lens.kind == "pinhole":
             camera = zoomed(camera, lens)
-        paths.append(_Path(camera, poses_at(np.broadcast_to(position, away.shape), rotations), zoom))
+        paths.append(_Path(camera, _transforms(np.broadcast_to(position, away.shape), rotations), zoom))
     return paths
 
 
@@ -554,14 +515,14 @@ _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _a
 
 
 def _turned_to(position: Doubles, centers: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Ways (T, 3) [m] from places to a camera, their lengths (T,) [m], and its axes (T, 3, 3) then."""
+    """Offsets (T, 3) of a camera from its targets [m], distances (T,) [m], and its axes (T, 3, 3)."""
     away = position - centers
     distances = np.linalg.norm(away, axis=1)
     return away, distances, looking(away / distances[:, None])
 
 
 def zoomed(camera: Camera, zoom: float) -> Camera:
-    """The camera with so many times its focal lengths."""
+    """The camera with its focal lengths multiplied."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= zoom
     return dataclasses.replace(camera, K=K)
@@ -610,7 +571,7 @@ def around_hands(
     *,
     rng: np.random.Generator,
 ) -> Camera:
-    """A camera at a random place around hands, turned at random about its axis, not behind their forearms.
+    """A camera at a random place around hands, not behind their forearms, with a random roll.
 
     The keypoints of all hands, in the world [m], span this share of the picture's shorter side.
     """
@@ -628,9 +589,9 @@ def around_hands(
     local = (keypoints - center) @ pose[:3, :3]
     focal, size = camera.K[[0, 1], [0, 1]], np.array(camera.size, dtype=np.float64)
     nearest = _SKIN_CLEARANCE - float(local[:, 2].min())
-    shift = np.array([0.0, 0.0, 4.0 * nearest])  # of the hands in the camera's axes
+    shift = np.array([0.0, 0.0, 4.0 * nearest])  # position of the hands in the camera's axes
     room = rng.uniform(-0.5, 0.5, 2) * _FREE
-    for _ in range(_ROUNDS):  # perspective widens what is near
+    for _ in range(_ROUNDS):  # several times, because perspective widens what is near
         pixels = focal * (local + shift)[:, :2] / (local + shift)[:, 2:]
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         target = 0.5 * size - camera.K[:2, 2] + room * np.maximum(size - (high - low), 0.0)
@@ -643,9 +604,9 @@ def around_hands(
 def crop_around(
     camera: Camera, keypoints: Float[np.ndarray, "K 3"], share: float, size: int, *, rng: np.random.Generator
 ) -> Camera:
-    """A pinhole camera at the place of another one that sees a square of `size` pixels around hands.
+    """The pinhole camera that sees a square of `size` pixels around hands, cut out of a camera's picture.
 
-    The keypoints of all hands, in the world [m], span this share of its side, somewhere in it.
+    The keypoints of all hands, in the world [m], span this share of its side, at a random place in it.
     """
     pixels = camera.project(keypoints)
     low, high = pixels.min(axis=0), pixels.max(axis=0)

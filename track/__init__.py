@@ -47,12 +47,12 @@ if TYPE_CHECKING:
     from track.settings import TrackSettings as TrackSettings
     from track.sinks import SinkGroup as SinkGroup
     from track.sinks import open_sinks as open_sinks
+    from track.streams import ReplaySettings as ReplaySettings
     from track.streams.live_stream import LiveStream as LiveStream
     from track.streams.live_stream import StreamSettings as StreamSettings
     from track.streams.live_stream import open_source as open_source
     from track.streams.natnet import PointFrames as PointFrames
     from track.streams.natnet import ReplayServer as ReplayServer
-    from track.streams.natnet import ReplaySettings as ReplaySettings
     from track.take_summary import SuspectSpan as SuspectSpan
     from track.take_summary import find_suspect_spans as find_suspect_spans
     from track.tracker import Tracker as Tracker

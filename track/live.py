@@ -1,4 +1,4 @@
-"""Live streams: hands are measured in the first frames, then tracked, sent on and recorded until the end."""
+"""Tracking of a live stream: hands are measured in its first frames, then tracked, sent on and recorded."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from track.settings import TrackerSetup
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 from track.tracker import warm_up
 
-_MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
-_LONGEST_WAIT: Final = 10.0  # [s] for them
-_TOLD: Final = 1.0  # [s] between two lines about frames that are dropped
+_MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
+_LONGEST_WAIT: Final = 10.0  # [s] for such frames
+_PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
 _LAGS: Final = 100_000  # newest frames whose lag is kept
-_MANY_FAR: Final = 0.5  # share of the points out of range from which their unit is asked for
+_MANY_FAR: Final = 0.5  # share of points out of range above which the unit is questioned
 _FOREIGN: Final = "foreign_packets"
 _PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
-"""Counts of packets that do not go on, in words."""
+"""Counts of packets that were left out, in words."""
 _FRAMES: Final = {
     "frames_in_order": "in order",
     "reordered_frames": "put in order",
@@ -42,20 +42,20 @@ _FRAMES: Final = {
     "late_frames": "too late",
     "frames_with_wild_times": "with a wild time",
 }
-"""Counts of all frames that came, in words."""
+"""Counts that add up to all received frames, in words."""
 _OF_THEM: Final = {
     "dropped_frames": "of them dropped, as they were not kept up with",
     "frames_after_end": "of them after the end",
 }
-"""Counts of some of them, in words."""
+"""Counts of some of these frames, in words."""
 
 
 class FrameOutput(Protocol):
-    """Takes tracked frames somewhere as they are made: a `SinkGroup`, or a page that shows them."""
+    """Takes tracked frames as they are made: a `SinkGroup` or a `LiveView`."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Frames that were dropped, by where they should have gone."""
+        """Numbers of dropped frames, by their destination."""
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         """Take on the tracker's hands and bodies."""
@@ -64,21 +64,21 @@ class FrameOutput(Protocol):
         """Take a frame, without waiting."""
 
     def notes(self) -> tuple[str, ...]:
-        """What to print at the end, one line each."""
+        """Lines to print at the end."""
 
 
 class LiveTake(NamedTuple):
-    """What was tracked of a stream."""
+    """The result of tracking a stream."""
 
     take: Take | None
-    """The take; of a long stream, parts of it; None where nothing was recorded."""
+    """The take, only some blocks of a long one; None if nothing was recorded."""
     num_frames: int
     """Number of all frames."""
     notes: tuple[str, ...]
-    """What to print at the end, one line each."""
+    """Lines to print at the end."""
 
     def whole_take(self, path: Path) -> Take:
-        """All of a take that was recorded; that of a long stream is read from its file."""
+        """The whole recorded take; a long one is read from its file."""
         take = self.take
         return load_take(path) if take is None or take.num_frames < self.num_frames else take
 
@@ -92,29 +92,15 @@ def track_live(
     seconds: float | None = None,
     on_frame: OnFrame = lambda frame, tracked: None,
 ) -> LiveTake:
-    """Track a stream, and record it, until time is up, the stream ends, or a signal ends it.
+    """Track a stream, to `out` if given, until `seconds` are over, the stream ends or a signal comes.
 
-    At the first signal the take is written, without the frames that still wait. The recording is kept as it
-    is at the second one.
-
-    Args:
-        address: The stream, see `open_source`.
-        setup: What the tracker is made of; its hands may be measured in the first second.
-        outputs: Take every frame before it is recorded.
-        out: The take's file, beside which the recording is until its end; nothing is recorded when None.
-        seconds: How long to track [s], by this machine's clock from the first frame's arrival; None for as
-            long as frames come.
-        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
-
-    Raises:
-        CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
-        Stopped: A signal came before the tracking began, or a second one after that.
+    The first signal writes the take without waiting frames; a second one keeps the recording as it is.
     """
     if out is not None:
         check_unused(growing_path(out))
     with Console(stderr=True).status("getting ready"):
         warm_up(setup.user, setup.labeler)
-    until = math.inf  # [s], when it is over by this machine's clock
+    until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()
     with (
         open_source(address, ended=lambda: interrupted() or monotonic() >= until) as stream,
@@ -125,7 +111,7 @@ def track_live(
         tracker = setup.tracker()
         for output in outputs:
             output.start(tracker.hands, tracker.bodies)
-        stack.enter_context(interrupt_flag(interrupted))  # from here on the frames so far are kept
+        stack.enter_context(interrupt_flag(interrupted))  # from here on a signal keeps the frames so far
         recorder = None
         if out is not None:
             recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
@@ -173,7 +159,7 @@ def _measured_setup(
     stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None
 ) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
     """The setup with the hands as measured in the first frames of a stream, and all its frames."""
-    gc.freeze()  # to look through all that was loaded took the collector a quarter of a second now and then
+    gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
     if not setup.is_auto:
         stream.forgive()
         return setup, stream
@@ -184,7 +170,7 @@ def _measured_setup(
 
 
 def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterator[StreamedFrame]:
-    """All frames of a stream; those that came while the first ones were looked at are caught up with."""
+    """All frames of a stream, also those that came while hands were measured in the first ones."""
     stream.forgive(math.inf)
     yield from first
     stream.forgive()
@@ -194,7 +180,7 @@ def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterato
 def _first_frames(
     stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus
 ) -> list[StreamedFrame]:
-    """The first frames of a stream, until there were enough points for a second, or ten seconds are over."""
+    """The first frames of a stream, until there were enough points for one second, or for ten seconds."""
     frames: list[StreamedFrame] = []
     began = shown = np.inf
     status.show("waiting for hands, to measure their size")
@@ -214,7 +200,7 @@ def _first_frames(
 
 @contextmanager
 def _recording_kept(recorder: Recorder) -> Iterator[None]:
-    """An interrupt that ends the block closes the recording as it is, and says where it is kept."""
+    """Close the recording if an interrupt ends the block, and say where it is kept."""
     try:
         with interrupts_bare():
             yield
@@ -224,19 +210,19 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
 
 
 class _Pace:
-    """How far a stream is kept up with: its rate, lags and what was dropped in the last second."""
+    """Measures rate, lag and dropped frames of a stream."""
 
     def __init__(self) -> None:
         self.lags: deque[float] = deque(maxlen=_LAGS)
-        """From the arrival of each frame to its output [s], once it was caught up with the stream."""
+        """Times from the arrival of frames to their output [s]."""
         self.first_lags: list[float] = []
-        """Those before: of frames that came while hands were measured."""
+        """Lags [s] of the frames that came while hands were measured."""
         self.words = ""
-        """The last second in words; empty before."""
+        """A summary of the last second."""
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
     def add(self, frame: StreamedFrame, forgiven_until: float) -> None:
-        """Take on a frame that has been sent on; before `forgiven_until` its lag counts as start-up lag."""
+        """Add the lag of a frame, before `forgiven_until` as start-up lag."""
         if frame.silent:
             return
         now = monotonic()
@@ -245,10 +231,10 @@ class _Pace:
         (self.first_lags if is_first else self.lags).append(lag)
 
     def tick(self, counts: dict[str, int]) -> bool:
-        """Once a second sum up what became of it; returns whether frames were dropped."""
+        """Once a second renew the summary; returns whether frames were dropped in that second."""
         now = monotonic()
         span = now - self._begin
-        if span < _TOLD:
+        if span < _PACE_PERIOD:
             return False
         received = counts["received_frames"] - self._received
         dropped = counts["dropped_frames"] - self._dropped
@@ -261,7 +247,7 @@ class _Pace:
 
 
 def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> Iterator[str]:
-    """What to print of a stream at its end; `interval` is from frame to frame [s]."""
+    """Lines to print on a stream at its end; `interval` is the time from frame to frame [s]."""
     told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
     others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
     others = f" ({others})" if others else ""
@@ -290,7 +276,7 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
 
 
 def _unit_doubt(stream: LiveStream) -> str:
-    """A question about the unit of a stream whose points lie out of range; empty if they do not."""
+    """A question about the unit if many points are out of range, else an empty string."""
     if stream.far_points <= _MANY_FAR * stream.points or not stream.far_points:
         return ""
     return (
@@ -302,7 +288,7 @@ def _unit_doubt(stream: LiveStream) -> str:
 def _status_line(
     frame: StreamedFrame, tracked: TrackedFrame, counts: dict[str, int], unsent: int, pace: _Pace
 ) -> str:
-    """Status of a live stream, in one line."""
+    """A line on the status of a live stream."""
     if frame.silent:
         if foreign := counts.get(_FOREIGN):
             return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"

@@ -1,7 +1,4 @@
-"""What is sent of a tracked frame: names that never change, numbers that do, and both as documents.
-
-Every outgoing message is made here, by `MessageEncoder`; docs/live_output.md describes the documents.
-"""
+"""Outgoing messages on tracked frames, and their documents, which docs/live_output.md describes."""
 
 from __future__ import annotations
 
@@ -128,7 +125,7 @@ class LiveSink(Protocol):
 
 
 class MessageEncoder:
-    """Makes messages of the frames of one tracker."""
+    """Makes the messages on the frames of one tracker."""
 
     def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         self._models = [hand.model for hand in hands]
@@ -139,10 +136,9 @@ class MessageEncoder:
             tuple(body.name for body in bodies),
             label_names(hands, bodies),
         )
-        """The names in its messages."""
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
-        """The message of a frame, which has the tracker's time."""
+        """Make the message on a frame."""
         return LiveMessage(
             header=self.header,
             number=frame.number,
@@ -175,11 +171,7 @@ class MessageFormat(NamedTuple):
 
 
 def document_format(name: str, *, points: bool = False) -> MessageFormat:
-    """Messages as documents, with all points and their labels if `points`.
-
-    Raises:
-        ArgumentError: The format, one of `FORMATS`, needs a package that is not installed.
-    """
+    """Messages as documents in one of `FORMATS`, with all points and their labels if `points`."""
     encode: Callable[[dict[str, Any]], bytes] = _encode_json
     if name == "msgpack":
         packer: Callable[[], Any] = import_extra("msgpack", f"format={name}", "send").Packer
@@ -192,7 +184,7 @@ def document_format(name: str, *, points: bool = False) -> MessageFormat:
 
 
 def header_document(header: LiveHeader) -> dict[str, Any]:
-    """The header: names and units of everything that the frames hold."""
+    """The names and units of all numbers in frames."""
     return {
         "type": "header",
         "schema": SCHEMA,
@@ -207,7 +199,7 @@ def header_document(header: LiveHeader) -> dict[str, Any]:
 
 
 def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, Any]:
-    """A frame: what is NaN in the message is null here."""
+    """A frame, with null for NaN."""
     document = {
         "type": "frame",
         "schema": SCHEMA,
@@ -248,5 +240,5 @@ def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> Any:
-    """Numbers of a document, as lists."""
+    """Rounded numbers as nested lists."""
     return np.round(values, _DECIMALS).tolist()

@@ -1,7 +1,7 @@
-"""Recording of tracked frames: in memory, or on disk, as they come, so that memory does not grow.
+"""Recording of tracked frames in memory or on disk.
 
 A recording on disk grows in `take.npz.part` (`gloves.takes.archives`), which is readable at any time and
-holds all but the last half second, whatever ends the process. `finish` turns it into `take.npz`.
+lacks at most the last half second if the process dies. `finish` turns it into `take.npz`.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 
-_SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
-_MOST_ID: Final = (1 << 31) - 1  # as takes store them; of larger IDs the last 31 bits
+_SUMMARIZED: Final = 20_000  # most frames that are read for a summary
+_ID_BITS: Final = (1 << 31) - 1  # bits of an ID that takes store
 
 
 class TakeRecorder:
@@ -58,20 +58,20 @@ class TakeRecorder:
             self._rows.append(frame_values(frame, tracked))
 
     def take(self, capture: Capture | None = None) -> Take:
-        """The take so far, with columns and rate of its capture; of a stream, with the median rate."""
+        """The take so far, with columns and rate of the capture, or with the median rate of a stream."""
         if not self._rows or (capture is None and len(self._rows) < 2):
             raise CaptureError(f"{len(self._rows)} frames came, expected two or more")
         return Take.of_frames(self._rows, self._hands, self._bodies, capture=capture, settings=self._settings)
 
 
 def settings_of(tracker: Tracker) -> dict[str, Any]:
-    """What a take's settings say of the tracker that made it, as JSON."""
+    """The entries of a take's settings on the tracker that made it, as JSON."""
     known = {"user": tracker.user.notes} if tracker.user.notes else {}
     return {"glove": tracker.user.layout.name, **known, "tracker": dataclasses.asdict(tracker.config)}
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's rows of the arrays of a take, by their names; those of points have N rows."""
+    """A frame's rows of the arrays of a take, by name; arrays of points have N rows."""
     hands, bodies = tracked.hands, tracked.bodies
     poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
     return {
@@ -86,7 +86,7 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "body_status": np.array([body.status for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
         "points": frame.points,
-        "ids": np.where(frame.ids < 0, -1, frame.ids & _MOST_ID).astype(np.int32),
+        "ids": np.where(frame.ids < 0, -1, frame.ids & _ID_BITS).astype(np.int32),
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
@@ -117,7 +117,7 @@ class Recorder:
         out = Path(path)
         if out.suffix.lower() != ".npz":
             raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
-        remove_abandoned(out)  # of a run that was killed while it finished
+        remove_abandoned(out)  # left by a run that was killed in `finish`
         self.part = growing_path(out)
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
@@ -162,7 +162,7 @@ class Recorder:
                     f"before, {last:g} s"
                 )
             values = frame_values(frame, tracked)
-            usable = np.abs(values["points"]) < FARTHEST  # which NaN is not
+            usable = np.abs(values["points"]) < FARTHEST  # False for NaN
             if not usable.all():
                 kept = usable.all(axis=1)
                 values |= {column.name: values[column.name][kept] for column in POINTS}
@@ -208,7 +208,7 @@ class Recorder:
             step = grown.step_for(_SUMMARIZED)
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)
-        except Exception as error:  # whatever it is, the recording must not go
+        except Exception as error:  # after any error the recording must be kept
             reason = (error.strerror if isinstance(error, OSError) else None) or error
             raise CaptureError(
                 f"{self._out}: cannot be written ({reason}); the recording is kept in {self.part}"

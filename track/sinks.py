@@ -1,7 +1,7 @@
 """Live output: sinks take tracked frames to other programs as they are made.
 
 An address names a sink: `osc://host:port`, `udp://host:port`, `ws://:8765`, `lsl:NAME` or `module:name`. Each
-frame goes to all of them, and none that fails stops the tracker.
+frame goes to all sinks, and a failing sink does not stop the tracker.
 """
 
 from __future__ import annotations
@@ -50,17 +50,17 @@ VALID: Final = ("osc://host:port", "udp://host:port", "ws://host:port", "lsl:NAM
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that bring sinks."""
 STATUSES: Final = tuple(reversed(Status))
-"""The value of a status channel of LSL is an index into these."""
+"""Values of a status channel of LSL are indices of these."""
 _DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # options of an address
-_RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an address of OSC
-_MOST_NUMBER: Final = 0x7FFFFFFF  # of OSC
-_HEADERS: Final = 1.0  # [s] between two headers, for those who begin to listen later
+_RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
+_LARGEST_INTEGER: Final = 0x7FFFFFFF  # of OSC
+_HEADER_PERIOD: Final = 1.0  # [s] between two headers, for receivers that begin to listen later
 _WAITING: Final = 256  # frames that may wait for a client
-_SEND_BUFFER: Final = 1 << 17  # bytes that the system holds for a client, older than those that wait
-_LARGEST: Final = 1 << 10  # bytes of a message of a client, which is not read
-_FLUSH: Final = 1.0  # [s] for clients to take what waits at the end
+_SEND_BUFFER: Final = 1 << 17  # bytes of the system's buffer for each client
+_LARGEST: Final = 1 << 10  # bytes of a client's message, which is ignored
+_FLUSH: Final = 1.0  # [s] for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
-"""Pages of this machine; without this rule any page in its browser could read along."""
+"""Pages of this machine; any other page in its browser is refused."""
 _AXES: Final = ("x", "y", "z")
 _POSE: Final = (*[(f"position_{axis}", "meters") for axis in _AXES], *[(f"rotation_{c}", "") for c in "wxyz"])
 
@@ -97,7 +97,7 @@ class SinkGroup(Closing):
         for address, sink in list(self._sinks.items()):
             try:
                 sink.send(message)
-            except Exception as error:  # of the user's code: any; the recording goes on
+            except Exception as error:  # the user's code may raise anything; the recording goes on
                 _warn(f"{address} failed and gets no further frame", error)
                 self._close(address)
 
@@ -120,7 +120,7 @@ class SinkGroup(Closing):
     def _close(self, address: str) -> None:
         try:
             self._sinks.pop(address).close()
-        except Exception as error:  # of the user's code: any
+        except Exception as error:  # the user's code may raise anything
             _warn(f"{address} could not be closed", error)
 
 
@@ -177,13 +177,7 @@ def open_sink(address: str) -> LiveSink:
 
 
 class DatagramSink:
-    """Sends each frame as one UDP datagram, and the header every second.
-
-    It never waits: what the network does not take is dropped and counted.
-
-    Raises:
-        ArgumentError: The host is unknown.
-    """
+    """Sends each frame as one UDP datagram, and the header every second; it drops frames rather than wait."""
 
     def __init__(self, host: str, port: int, format: MessageFormat) -> None:
         try:
@@ -197,30 +191,26 @@ class DatagramSink:
         """Number of datagrams that were not sent."""
 
     def send(self, message: LiveMessage) -> None:
-        """Send a frame, and before it the header when that is due."""
+        """Send a frame, after the header if that is due."""
         now = time.monotonic()
         if now >= self._due:
-            self._due = now + _HEADERS
+            self._due = now + _HEADER_PERIOD
             self._put(self._format.header(message.header))
         self._put(self._format.frame(message))
 
     def close(self) -> None:
-        """Send nothing more."""
+        """Close the socket."""
         self._socket.close()
 
     def _put(self, datagram: bytes) -> None:
         try:
             self._socket.sendto(datagram, self._address)
-        except OSError:  # the buffer is full, the network is down, or it is too large for a datagram
+        except OSError:  # the buffer is full, the network is down, or the datagram is too large
             self.dropped += 1
 
 
 def osc_format() -> MessageFormat:
-    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md has the addresses.
-
-    Raises:
-        ArgumentError: The package python-osc is missing.
-    """
+    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists their addresses."""
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
 
@@ -240,7 +230,7 @@ def osc_format() -> MessageFormat:
 
 
 def _osc_header(header: LiveHeader) -> Iterator[_Content]:
-    """The names in the order of the numbers."""
+    """The messages of a header: names, in the order of the numbers in frames."""
     yield "/handsim/schema", "i", [SCHEMA]
     yield _strings("/handsim/sides", header.sides)
     yield _strings("/handsim/angles", header.angles)
@@ -249,8 +239,8 @@ def _osc_header(header: LiveHeader) -> Iterator[_Content]:
 
 
 def _osc_frame(message: LiveMessage) -> Iterator[_Content]:
-    """A frame; of a hand or a body without a pose only the status."""
-    yield "/handsim/frame", "idi", [message.number & _MOST_NUMBER, message.time, int(message.silent)]
+    """The messages of a frame; a hand or body without a pose only has a status."""
+    yield "/handsim/frame", "idi", [message.number & _LARGEST_INTEGER, message.time, int(message.silent)]
     if not math.isnan(message.lag):
         yield "/handsim/lag", "f", [message.lag]
     for hand in message.hands:
@@ -268,7 +258,7 @@ def _osc_frame(message: LiveMessage) -> Iterator[_Content]:
 
 
 def _part(name: str) -> str:
-    """A name as a part of an address."""
+    """A name as a part of an OSC address."""
     return _RESERVED.sub("_", name)
 
 
@@ -290,11 +280,7 @@ class Channel(NamedTuple):
 
 
 class LabStreamingSink:
-    """Pushes a sample per frame into a stream of the Lab Streaming Layer; a number that is missing is NaN.
-
-    Raises:
-        ArgumentError: The package pylsl or its library is missing.
-    """
+    """Pushes a sample per frame into a stream of the Lab Streaming Layer; missing numbers are NaN."""
 
     def __init__(self, name: str) -> None:
         self._lsl: Any = import_extra("pylsl", "lsl:", "send")
@@ -319,7 +305,7 @@ class LabStreamingSink:
             len(channels),
             self._lsl.IRREGULAR_RATE,
             self._lsl.cf_double64,
-            f"handsim:{self._name}",  # by which a client finds the stream again after a restart
+            f"handsim:{self._name}",  # clients find the stream by this ID after a restart
         )
         description = info.desc()
         description.append_child_value("manufacturer", "handsim")
@@ -350,7 +336,7 @@ def channels_of(header: LiveHeader) -> Iterator[Channel]:
 
 
 def _pose_channels(status: str, name: str) -> Iterator[Channel]:
-    """Status, position and orientation; kinds are those of XDF's motion capture: PositionX, OrientationW."""
+    """Status, position and orientation, with the kinds of XDF's motion capture such as PositionX."""
     yield Channel(status, "", "Status")
     for label, unit in _POSE:
         what, _, axis = label.partition("_")
@@ -371,17 +357,10 @@ def sample_of(message: LiveMessage) -> np.ndarray:
 
 
 class WebSocketSink:
-    """Serves messages to any number of clients from a thread of its own.
+    """Serves messages to any number of clients from a thread of its own; port 0 is any free one.
 
-    A client gets the header, then every frame from then on; one that reads too slowly loses frames and delays
-    nobody. A loopback address serves pages of this machine and programs that are no browsers; another address
-    serves everybody.
-
-    Args:
-        port: TCP port to listen at; 0 for a free one.
-
-    Raises:
-        ArgumentError: The package websockets is missing, or the port cannot be listened at.
+    A client gets the header, then every new frame; a slow client loses frames and delays nobody. A loopback
+    address serves pages of this machine and other programs; another address serves everybody.
     """
 
     def __init__(self, host: str, port: int, format: MessageFormat) -> None:
@@ -391,7 +370,6 @@ class WebSocketSink:
         address = self._socket.getsockname()
         self._origins = [None, _OWN_PAGES] if ipaddress.ip_address(address[0]).is_loopback else None
         self.port: int = address[1]
-        """The port that it listens at."""
         self.dropped = 0
         """Number of frames that were dropped for slow clients."""
         self._header = b""
@@ -414,7 +392,7 @@ class WebSocketSink:
             self._loop.call_soon_threadsafe(self._spread, self._format.frame(message))
 
     def close(self) -> None:
-        """Give clients a second for what they have not read, and disconnect them."""
+        """Give clients a second to read waiting frames, and disconnect them."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._ending.set)
             self._thread.join()
@@ -432,7 +410,7 @@ class WebSocketSink:
             self._ready.set()
 
     async def _listen_until_the_end(self) -> None:
-        quiet = logging.getLogger("handsim.websocket")  # what strangers send is not for the user's terminal
+        quiet = logging.getLogger("handsim.websocket")  # invalid requests are not the user's mistakes
         quiet.setLevel(logging.CRITICAL + 1)
         server = await self._serve(
             self._talk,
@@ -445,35 +423,31 @@ class WebSocketSink:
         )
         self._ready.set()
         await self._ending.wait()
-        await self._flush()
-        server.close()
-        await server.wait_closed()
-
-    async def _flush(self) -> None:
-        """Let clients take what waits, and cut those off that do not: a closing handshake would wait too."""
         waiting = {asyncio.ensure_future(client.empty.wait()): client for client in self._clients}
         if waiting:
             _, late = await asyncio.wait(waiting, timeout=_FLUSH)
             for one in late:
                 one.cancel()
-                waiting[one].connection.transport.abort()
+                waiting[one].connection.transport.abort()  # a closing handshake would wait, too
+        server.close()
+        await server.wait_closed()
 
     async def _talk(self, connection: ServerConnection) -> None:
-        """Send a client everything until it leaves."""
+        """Send messages to a client until it leaves."""
         client = _Client(connection)
         self._clients.add(client)
         sending = asyncio.ensure_future(self._deliver(client))
         try:
             with suppress(self._closed_error):
                 while True:
-                    await connection.recv()  # and ignore it: so pongs and the leave are noticed
+                    await connection.recv()  # this notices pongs and the end of the connection
         finally:
             self._clients.discard(client)
             client.empty.set()
             sending.cancel()
 
     async def _deliver(self, client: _Client) -> None:
-        """Send a client the header, and each frame when the one before is on its way."""
+        """Send a client the header, then frame after frame."""
         with suppress(self._closed_error):
             frame = await client.next()
             await client.connection.send(self._header, text=self._format.is_text)
@@ -494,7 +468,7 @@ class _Client:
         self.empty.set()
 
     def put(self, frame: bytes) -> bool:
-        """Add a frame; returns whether another was dropped for it."""
+        """Add a frame; returns whether the oldest one was dropped."""
         full = len(self.frames) == _WAITING
         self.frames.append(frame)
         self._came.set()
@@ -519,5 +493,5 @@ def _listen(host: str, port: int) -> socket.socket:
             f"port {port} of {host} cannot be listened at ({error.strerror or error}), expected a free port "
             "of this machine"
         ) from error
-    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # of its connections too
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # connections inherit it
     return one

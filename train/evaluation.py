@@ -27,6 +27,7 @@ from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_rng, check_type
+from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
 from train.data.batches import Cloud, Corruption, OwnCorruption, draw_cloud, paper_corruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
@@ -42,10 +43,9 @@ LEAST_SURE: Final = 0.02
 
 @dataclass(slots=True)
 class LabelCounts:
-    """Running counts; every figure is a share in [0, 1], NaN where there was nothing to count.
+    """Running counts of right and wrong labels.
 
-    Precision is NaN also where nothing was hidden, or no point a ghost: whatever was said is wrong then, and
-    its number says more than its share, zero.
+    Precision is NaN where nothing was occluded, or no point was a ghost: it could only be zero.
     """
 
     frames: int = 0
@@ -69,7 +69,7 @@ class LabelCounts:
     def add(
         self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
     ) -> Bool[np.ndarray, "M"]:
-        """Count one frame by given and true labels, -1 for a ghost; which label slots are right."""
+        """Count one frame, given its labels and the true ones, -1 for a ghost. Returns the right slots."""
         given, true = _slots(labels, num_labels), _slots(truth, num_labels)
         right: np.ndarray = given == true
         slots_right, points_right = int(right.sum()), int((labels == truth).sum())
@@ -91,7 +91,7 @@ class LabelCounts:
         return right
 
     def figures(self) -> dict[str, float]:
-        """All figures by name."""
+        """All figures by name: shares in [0, 1], NaN where there was nothing to count."""
         return {
             "slot_accuracy": _share(self.slots_right, self.slots),
             "point_accuracy": _share(self.points_right, self.points),
@@ -106,7 +106,7 @@ class LabelCounts:
         }
 
     def numbers(self) -> dict[str, int]:
-        """What the shares of occlusions and ghosts come from."""
+        """The counts behind the shares of occlusions and ghosts."""
         names = ("occluded", "occluded_given", "occluded_right", "ghosts", "ghosts_given", "ghosts_right")
         return {name: getattr(self, name) for name in ("slots", "points", *names)}
 
@@ -115,9 +115,7 @@ def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
     """Mean F1 of the classes that occur, as true (rows) or given labels; NaN where none does."""
     occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
     there = occurs > 0
-    if not there.any():
-        return float("nan")
-    return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean())
+    return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean()) if there.any() else float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,10 +149,9 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 def error_without(
     confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
 ) -> float:
-    """Share of points labeled wrongly after a share of least confidence is left out; NaN when none is kept.
+    """Share of points labeled wrongly once the share of least confidence is left out; NaN if none is left.
 
-    Where only some points of one confidence are left out, the result is the mean over all choices, so that
-    the order of the points does not matter.
+    Of points with equal confidence that are left out in part, the mean over all choices counts.
     """
     kept = len(confidence) - round(share * len(confidence))
     if not kept:
@@ -167,7 +164,7 @@ def error_without(
 
 @dataclass(slots=True)
 class History:
-    """Loss, learning rate and held-out accuracy of a training run; it is kept in the checkpoint."""
+    """Loss, learning rate and held-out accuracy of a training run, as checkpoints keep them."""
 
     losses: list[tuple[int, float, float]] = field(default_factory=list)
     """Samples done, mean loss of the steps since the previous entry, learning rate of the last of them."""
@@ -175,11 +172,11 @@ class History:
     """Samples done, minutes of steps until then, slot accuracy on some held-out frames with the paper's
     corruption."""
     minutes: float = 0.0
-    """Time of all steps."""
+    """Time of all steps [min]."""
     waiting: float = 0.0
-    """Sum of the losses of the steps that are in no entry yet."""
+    """Sum of the losses of the steps since the last entry."""
     steps: int = 0
-    """Number of those steps."""
+    """Number of steps since the last entry."""
 
     def add(self, loss: float) -> None:
         """Count a step."""
@@ -187,7 +184,7 @@ class History:
         self.steps += 1
 
     def close(self, done: int, rate: float) -> float:
-        """Make an entry of the steps since the last one (at least one) and return their mean loss."""
+        """Add an entry for the steps since the last one, and return their mean loss."""
         mean = self.waiting / self.steps
         self.losses.append((done, mean, rate))
         self.waiting, self.steps = 0.0, 0
@@ -216,19 +213,12 @@ def _share(part: int, whole: int) -> float:
 
 
 def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
-    """Print figures as a table in percent, a column each."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title)
-    table.add_column("figure")
-    for name in columns:
-        table.add_column(f"{name} [%]", justify="right")
-    for figure in next(iter(columns.values())):
-        table.add_row(
-            figure.replace("_", " "), *map(percent, (column[figure] for column in columns.values()))
-        )
-    Console().print(table)
+    """Print figures in percent as a table, a column for each set of them."""
+    shares = [
+        [name.replace("_", " "), *(percent(one[name]) for one in columns.values())]
+        for name in next(iter(columns.values()))
+    ]
+    print_table([["figure", *(f"{name} [%]" for name in columns)], *shares], title=title)
 
 
 _CHUNK: Final = 4096
@@ -239,8 +229,8 @@ class LabelingReport:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1]: those of `LabelCounts`, the expected calibration error, and the share of points
-    labeled wrongly without the 2 % of least confidence."""
+    """Shares in [0, 1]: accuracies, precision and recall of occlusions and ghosts, macro F1, the expected
+    calibration error, and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
     confusion: Int[np.ndarray, "M+1 M+1"]
@@ -310,31 +300,25 @@ def cloud_frames(cloud: Cloud) -> Frames:
 
 
 def _take_frames(take: Take) -> Iterator[Frames]:
-    """The points of every hand of every frame of a take, separated by the truth."""
-    for hand in range(len(take.hands)):
-        clouds, truths = _hand_frames(take, hand)
+    """The points of every hand of every frame of a take, separated by the truth.
+
+    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of tracked
+    bodies belong to no hand.
+    """
+    labels = take.point_list.labels
+    nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
+    for hand, mine in enumerate(take.hand_labels):
+        own = (labels >= mine.start) & (labels < mine.stop)
+        ghost = (labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
+        here = take.point_list.without(~(own | ghost))
+        truth = np.where(here.labels >= 0, here.labels - mine.start, -1)
+        clouds, truths = (np.split(values, here.starts[1:-1]) for values in (here.points, truth))
         for first in range(0, len(clouds), _CHUNK):
             yield clouds[first : first + _CHUNK], truths[first : first + _CHUNK]
 
 
-def _hand_frames(take: Take, hand: int) -> Frames:
-    """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
-
-    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of a body
-    with three or more are left out, since the system tracks it, as are those of the other hand.
-    """
-    nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
-    mine, labels = take.hand_labels[hand], take.point_list.labels
-    own = (labels >= mine.start) & (labels < mine.stop)
-    ghost = (labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
-    here = take.point_list.without(~(own | ghost))
-    truth = np.where(here.labels >= 0, here.labels - mine.start, -1)
-    clouds, truths = (np.split(values, here.starts[1:-1]) for values in (here.points, truth))
-    return clouds, truths
-
-
 def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
-    """Distance of every point from the nearest marker seen of one hand [m]; inf where none is seen."""
+    """Distance from every point to the nearest visible marker of one hand [m]; inf where none is visible."""
     markers, points = take.observed(label), take.point_list
     distance = np.full(len(points.labels), np.inf)
     for frame, every in enumerate(markers):
@@ -388,7 +372,11 @@ def evaluate_labeler(
     check_rng(rng)
     several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
     given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
-    if takes := [one for one in given if _is_take(one)]:
+    takes = [
+        one for one in given
+        if isinstance(one, Take) or (isinstance(one, str | Path) and Path(one).suffix == ".npz")
+    ]  # fmt: skip
+    if takes:
         if len(takes) < len(given):
             raise CaptureError(
                 f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
@@ -412,12 +400,8 @@ def evaluate_labeler(
 
 
 def _shown(take: Any) -> str:
-    """A take as sentences name it."""
+    """A take in an error message: its path, if it was given by one."""
     return str(take) if isinstance(take, str | Path) else "the take"
-
-
-def _is_take(truth: Any) -> bool:
-    return isinstance(truth, Take) or (isinstance(truth, str | Path) and Path(truth).suffix == ".npz")
 
 
 def _simulated_take(given: Take | str | Path, names: tuple[str, ...]) -> Take:
@@ -431,7 +415,7 @@ def _simulated_take(given: Take | str | Path, names: tuple[str, ...]) -> Take:
 
 
 def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:
-    """The markers of all that was given [m], in the labeler's order."""
+    """True markers of all captures, sets and arrays [m], in the labeler's order."""
     parts = []
     for one in truth:
         if isinstance(one, np.ndarray):
@@ -446,8 +430,7 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
         elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
             dataset = load_dataset(one)
             _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
-            markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
-            parts.append(markers)
+            parts.append(dataset.rows()["markers"].astype(np.float64))
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)

@@ -8,7 +8,7 @@ import signal
 import time
 import zipfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -57,15 +57,18 @@ from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_s
 CHECKPOINT: Final = "checkpoint.pt"
 _SETTINGS: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
-_MOST_HELD_OUT: Final = 8192
+_MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
-_CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of these evaluations
-_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MOST_HELD_OUT, "cnn": 1024}  # of the last evaluation
-_CURVE: Final = 200  # points of the loss curve
-_PRIOR_STRETCH: Final = 0.03  # anisotropy of the hands of the pose prior: people differ more than simulated
-_COST_FRAMES: Final = 400  # for the costs of the paper's network
-_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m]
-_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m]
+_CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
+_CARD_FRAMES: Final[dict[Kind, int]] = {
+    "set": _MAX_HELD_OUT,
+    "cnn": 1024,
+}  # held-out frames of the model card
+_CURVE_POINTS: Final = 200  # entries of the loss curve
+_PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
+_COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
+_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # costs of a ghost that are tried [m]
+_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # spreads of the confidence that are tried [m]
 
 
 class TrainingError(HandSimError):
@@ -126,7 +129,9 @@ def train_labeler(
     if threads is None:
         alone_on_cpu = fabric.device.type == "cpu" and fabric.world_size == 1
         threads = torch.get_num_threads() if settings.labeler == "cnn" and alone_on_cpu else 1
-    with _curves_closed(fabric), lost_peers_told(), torch_threads(threads):
+    with ExitStack() as stack, lost_peers_told(), torch_threads(threads):
+        # The thread that writes curves complains in a process that ends before the writer is closed.
+        stack.callback(fabric.logger.finalize, "")
         on_step("training set")
         flag = InterruptFlag()
         # A process that a signal ends at once would have the others wait for it.
@@ -138,26 +143,26 @@ def train_labeler(
             return fabric.broadcast(run.finish(on_step) if fabric.is_global_zero else {})
 
 
-@contextmanager
-def _curves_closed(fabric: Fabric) -> Iterator[None]:
-    """Close the writer of the curves after the block; its thread complains in a process that ends before."""
-    try:
-        yield
-    finally:
-        fabric.logger.finalize("")
-
-
 def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabric) -> _Run:
-    """Claim the folder of the run and go on from its checkpoint."""
+    """Claim the folder of the run, or check that the run there is this one, and restore its checkpoint."""
     rows = dataset.mapped_rows()
     settings = settings.for_set(len(dataset.marker_names), len(rows))
-    held_out = min(_MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
+    held_out = min(_MAX_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
     if len(rows) - held_out < settings.batch:
         raise DatasetError(
             f"{dataset.path} has {len(rows)} frames, expected at least {settings.batch + held_out + 1}"
         )
     if fabric.is_global_zero:
-        _claim(out, settings, dataset)
+        record = settings.record()
+        if settings.corruption is None:
+            del record["corruption"]
+        else:
+            check_corruption(settings.corruption, len(dataset.marker_names))
+        # Older runs name their devices.
+        claim(
+            out / _SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
+            error=WeightsError, grows="train.samples", free=("train.devices",),
+        )  # fmt: skip
     seen = rows.span(0, len(rows) - held_out)
     torch.manual_seed(settings.seed)
     state = TrainingState(settings, fabric, seen)
@@ -165,23 +170,9 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
     return _Run(state, dataset.manifest, seen, rows.span(len(seen), len(rows)), out)
 
 
-def _claim(out: Path, settings: TrainSettings, dataset: Dataset) -> None:
-    """Claim the folder of the run, or check that the run there is this one."""
-    record = settings.record()
-    if settings.corruption is None:
-        del record["corruption"]
-    else:
-        check_corruption(settings.corruption, len(dataset.marker_names))
-    # Older runs name their devices.
-    claim(
-        out / _SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
-        error=WeightsError, grows="train.samples", free=("train.devices",),
-    )  # fmt: skip
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """The state of a run, and what it learns from."""
+    """A run: its state, its training set and its folder."""
 
     state: TrainingState
     manifest: Manifest
@@ -190,9 +181,9 @@ class _Run:
     out: Path
 
     def do_steps(self, flag: InterruptFlag, progress: Progress, on_step: OnStep, save_every: float) -> None:
-        """Do what steps there are to do, and keep the state now and then.
+        """Make the remaining steps, and save the state every `save_every` seconds.
 
-        A step is made whole or not at all. Of several processes all end after the same one.
+        A signal ends the run between two steps; several processes all end after the same step.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe = batch_recipe(settings, len(self.manifest.marker_names))
@@ -203,7 +194,8 @@ class _Run:
                 # each device.
                 rng = np.random.default_rng((settings.seed, state.done, 0))
                 loss = state.step(draw_batch(self.rows, recipe, rng=rng), rng=rng)
-            if flag() if alone else state.is_any(flag()):
+            ended = torch.tensor(float(flag()), device=state.fabric.device)
+            if state.fabric.all_reduce(ended, reduce_op="sum"):
                 raise Stopped(flag.number or signal.SIGTERM)
             on_step(f"loss {loss:.3f}")
             progress(min(state.done, settings.samples), settings.samples)
@@ -215,7 +207,7 @@ class _Run:
         state.save(self.out / CHECKPOINT)
 
     def _is_unfinished(self, on_step: OnStep) -> bool:
-        """Whether there are steps to do; an evaluation that is due is done first."""
+        """Evaluate the network if that is due, and return whether steps remain."""
         state, settings = self.state, self.state.settings
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         due = state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS)
@@ -226,7 +218,7 @@ class _Run:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Write a checkpoint when a signal ends the block, and say so."""
+        """Write a checkpoint if a signal ends the block."""
         try:
             with interrupts_bare():
                 yield
@@ -262,7 +254,7 @@ class _Run:
         return card
 
     def _card(self, network: nn.Module, rows: NDArray[np.void]) -> tuple[dict[str, Any], LabelingReport]:
-        """Model card with figures on held-out frames; the evaluation with the paper's corruption."""
+        """The model card, and the evaluation on held-out frames with the paper's corruption."""
         labeler = labeler_of(network, self.manifest.marker_names)
         markers = rows["markers"].astype(np.float64)
         clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
@@ -328,16 +320,12 @@ class TrainingState:
             )
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
-        if _passed(self.done, self.settings, _CURVE) or self.done >= self.settings.samples:
+        if _passed(self.done, self.settings, _CURVE_POINTS) or self.done >= self.settings.samples:
             self._log(rate)
         return value
 
-    def is_any(self, here: bool) -> bool:
-        """Whether something is so in any process."""
-        notes = torch.tensor(float(here), device=self.fabric.device)
-        return bool(self.fabric.all_reduce(notes, reduce_op="sum"))
-
     def _average(self) -> None:
+        """Update the running mean of the weights."""
         every = self.settings.batch * self.settings.average_every
         if self.done % every and self.done < self.settings.samples:
             return
@@ -350,6 +338,7 @@ class TrainingState:
                     self.mean[name].copy_(tensor)
 
     def _log(self, rate: float) -> None:
+        """Add the last steps to the curves."""
         loss = self.history.close(self.done, rate)
         since, done = self.began
         now = time.monotonic()
@@ -368,7 +357,7 @@ class TrainingState:
 
     def averaged(self) -> nn.Module:
         """The network with the mean weights."""
-        with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
+        with torch.random.fork_rng(devices=[]):  # initial weights are drawn, and replaced at once
             network = new_network(self.settings.chosen)
         network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
         return network.eval()
@@ -415,11 +404,11 @@ class TrainingState:
         self.began = time.monotonic(), self.done
 
     def _check(self, content: dict[str, Any]) -> None:
-        """Raise a ValueError unless a checkpoint's tensors are this run's, finite, and its count is one."""
+        """Raise a ValueError unless a checkpoint's tensors are finite and fit this network."""
         _check_stored(content)
         done, mean, network = content["done"], content["mean"], content["network"]
         if type(done) is not int or done < 0 or done % self.settings.batch:
-            raise ValueError("the number of samples is none of this run's")
+            raise ValueError(f"{done} samples cannot be done in this run")
         for name, tensor in self.mean.items():
             for stored in (mean[name], network[name]):
                 if stored.shape != tensor.shape or stored.dtype != tensor.dtype:
@@ -429,46 +418,44 @@ class TrainingState:
 
 
 def _optimizer(settings: TrainSettings, network: nn.Module) -> torch.optim.Optimizer:
+    """The optimizer of the settings."""
+    weights, rate, decay = network.parameters(), settings.learning_rate, settings.weight_decay
     if settings.optimizer == "sgd":
-        return torch.optim.SGD(
-            network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-        )
-    return torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
-    )
+        return torch.optim.SGD(weights, lr=rate, weight_decay=decay)
+    return torch.optim.AdamW(weights, lr=rate, weight_decay=decay, fused=True)
 
 
 def _rate(settings: TrainSettings, progress: float) -> float:
-    """Share of the peak learning rate at a share of the run."""
+    """Learning rate at a share of the run, as a share of the peak rate."""
     if settings.schedule == "steps":
         return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
     return float(min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress))))
 
 
 def _check_stored(content: object, seen: set[int] | None = None) -> None:
-    """Raise a ValueError for a tensor in nested tables that has more entries than are stored of it."""
+    """Raise a ValueError if a tensor in nested tables has more entries than its storage."""
     seen = set() if seen is None else seen
     if id(content) in seen:
         return
     seen.add(id(content))
     if isinstance(content, torch.Tensor):
         if content.numel() * content.element_size() > content.untyped_storage().nbytes():
-            raise ValueError("a tensor of more entries than are stored")
+            raise ValueError("a tensor has more entries than its storage")
     elif isinstance(content, dict | list | tuple):
         for entry in content.values() if isinstance(content, dict) else content:
             _check_stored(entry, seen)
 
 
 def _passed(done: int, settings: TrainSettings, parts: int) -> bool:
-    """Whether the last step ended one of this many parts of the run, each at least one step long."""
+    """Whether the last step ended one of `parts` equal parts of the run, each at least one step long."""
     part = max(settings.batch, settings.samples // parts)
     return (done - settings.batch) // part != done // part
 
 
 def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:
-    """Choose the reject that labels most slots of held-out rows right, and the best calibrated spread.
+    """Choose the reject with the best slot accuracy on held-out rows, and the best calibrated spread.
 
-    Settings that the network has already are kept.
+    A reject or spread that was set before stays.
     """
     labeler = _Recalling(network, marker_names)
 
@@ -488,7 +475,7 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
 
 
 class _Recalling:
-    """A labeler that runs its network once: later calls label the same frames with other costs."""
+    """A labeler that runs its network once and labels the same frames again at other costs."""
 
     def __init__(self, network: DeepLabelCNN, marker_names: tuple[str, ...]) -> None:
         self.marker_names = marker_names
@@ -497,6 +484,6 @@ class _Recalling:
         self._distances: list[NDArray[np.float64]] = []
 
     def label_frames(self, frames: Sequence[NDArray[np.float64]]) -> list[Labeling]:
-        """Label the frames that were given first."""
+        """Label the frames of the first call."""
         self._distances = self._distances or self._labeler.distances(list(frames))
         return [label_by_distance(distances, self.reject, self.spread) for distances in self._distances]

@@ -17,12 +17,12 @@ KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 Preset = Literal["han2018"]
 PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
 EPOCHS: Final = 75
-"""How often the paper's training goes through its frames."""
+"""Passes of the paper's training through its frames."""
 Views = Literal["aligned", "random"]
 """`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
 for labeling the one of ten on which the cloud spreads best."""
-_MOST_CLOUDS: Final = 1_000_000  # in a batch
-_MOST_POINTS: Final = 100  # to add to a cloud or drop from it
+_MAX_CLOUDS: Final = 1_000_000  # in a batch
+_MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class TrainSettings(Settings):
     samples: Annotated[int, Limits(0)] = 5_000_000
     """Clouds to learn from; rows are used repeatedly, corrupted anew each time. 0 stands for the paper's 75
     epochs of the training set."""
-    batch: Annotated[int, Limits(1, _MOST_CLOUDS)] = 256
+    batch: Annotated[int, Limits(1, _MAX_CLOUDS)] = 256
     optimizer: Literal["adamw", "sgd"] = "adamw"
     learning_rate: Annotated[float, Limits(0.0, 10.0, above=True)] = 2e-3
     """Peak learning rate."""
@@ -93,10 +93,10 @@ class TrainSettings(Settings):
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
-    occlude: Annotated[int | None, Limits(0, _MOST_POINTS)] = None
+    occlude: Annotated[int | None, Limits(0, _MAX_CHANGED)] = None
     """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
     in the paper for its 19 and 13 markers."""
-    ghosts: Annotated[int, Limits(0, _MOST_POINTS)] = 2
+    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 2
     """Most ghosts added in the paper's corruption."""
     corruption: Annotated[
         OwnCorruption | str | None, Expected("a function (markers, *, rng), or its module:name")
@@ -186,9 +186,9 @@ class EvaluateSettings(Settings):
 
     noun = "setting of an evaluation"
 
-    occlude: Annotated[int, Limits(0, _MOST_POINTS)] = 0
+    occlude: Annotated[int, Limits(0, _MAX_CHANGED)] = 0
     """Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse)."""
-    ghosts: Annotated[int, Limits(0, _MOST_POINTS)] = 0
+    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 0
     """Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2)."""
     every: Annotated[int, Limits(1)] = 1
     """Take one frame of this many of captures; 1 takes all."""

@@ -1,4 +1,4 @@
-"""Where jobs leave their files: a folder, or a folder of an object store, of which the rest is made here."""
+"""Output folders of jobs: on this machine, or in an object store, with a local folder that stands for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from handsim.files.inputs import checksum
 from handsim.files.outputs import claim, remove_abandoned, remove_leftovers, temporary_beside
 
 Make = Callable[[Path, int], int]
-"""Takes a folder and a number, leaves the number's files in the folder, and returns the number."""
+"""Writes the files of a number to a folder, and returns the number."""
 Place = Path | UPath
 """A folder of this machine, or of an object store."""
 _PASSWORD: Final = re.compile(r"[^/@]*:[^/]*@")
@@ -29,7 +29,7 @@ _HERE: Final = ("", "file", "local")
 
 
 def place_of(out: str | Place) -> Place:
-    """What a name stands for: a folder, or a folder of an object store, as s3://bucket/prefix."""
+    """The folder of a name: on this machine, or of an object store, as s3://bucket/prefix."""
     if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):
         return Path(out)
     wrong = f"the address is '{shortened(str(out), 200)}', expected"
@@ -57,15 +57,13 @@ def place_of(out: str | Place) -> Place:
 class Output:
     """A folder that all jobs write to.
 
-    Where that is in an object store, each job writes to a folder of its own, wherever it is done, and puts
-    the files into the store, those last that say that it is finished. What is made of all jobs is made in a
-    folder here, out of what `fetch` brings, and then put too.
+    For an object store, each job writes to a temporary folder on its own machine and puts the files into the
+    store. Files made of all jobs are written to `folder`, from what `fetch` brings, and put by `publish`.
     """
 
     place: Place
-    """Where the files shall be."""
     folder: Path
-    """The same, or the folder here that stands for it."""
+    """`place`, or the local folder that stands for it."""
     _claimed: list[str] = field(default_factory=list)
     _fetched: set[str] = field(default_factory=set)
 
@@ -74,7 +72,7 @@ class Output:
 
     @property
     def is_here(self) -> bool:
-        """Whether it is a folder of this machine."""
+        """Whether the output is a folder of this machine."""
         return self.place is self.folder
 
     def claim(
@@ -110,15 +108,13 @@ class Output:
     def job(self, make: Make, *, last: Sequence[str] = ()) -> Job:
         """A job that writes to the claimed folder.
 
-        Files whose names match the patterns `last` say that a job is finished: all others come before them.
+        Files that match the patterns `last` mark a finished job, so they are put after all others.
         """
         name = self._claimed[0]
-        if isinstance(self.place, Path):
-            return _FolderJob(make, self.folder, name, checksum(self.folder / name))
-        return _StoredJob(make, self.place, tuple(last), self.folder.parent)
+        return _Job(make, self.place, self.folder, name, checksum(self.folder / name), tuple(last))
 
     def sizes(self) -> dict[str, int]:
-        """Names of all files there and their lengths [bytes]."""
+        """Names and sizes [bytes] of all files in the output."""
         if self.is_here:
             return {name: (self.folder / name).stat().st_size for name in _files_in(self.folder)}
         with _one_sentence(self.place, "listing"):
@@ -132,7 +128,7 @@ class Output:
         return {name: size for name, size in names.items() if _is_inside(name)}
 
     def fetch(self, *patterns: str, names_of: Sequence[str] = ()) -> None:
-        """Have files in the folder here that match patterns, and empty ones where the name is enough."""
+        """Copy files that match `patterns` to the local folder; those of `names_of` become empty files."""
         if self.is_here:
             return
         lacking = [name for name in self.sizes() if not (self.folder / name).exists()]
@@ -146,12 +142,12 @@ class Output:
         _transfer("get", self.place, {str(self.place / name): str(self.folder / name) for name in wanted})
 
     def checksum(self, name: str) -> str:
-        """SHA-256 of a file there."""
+        """SHA-256 of a file in the output."""
         with _one_sentence(self.place, f"reading {name}"):
             return checksum(self.place / name)
 
     def publish(self, last: str) -> None:
-        """Put all files that were made in the folder here, one of them after all others."""
+        """Put all files that were made in the local folder, `last` after all others."""
         if not self.is_here:
             made = [name for name in _files_in(self.folder) if name not in self._fetched]
             _put(self.place, self.folder, made, [last])
@@ -159,7 +155,7 @@ class Output:
 
 @contextmanager
 def open_output(out: str | Place) -> Iterator[Output]:
-    """Where the files of jobs go; what workers left that died or were ended is removed after the block."""
+    """Open the output of jobs; files of workers that died are removed after the block."""
     place = place_of(out)
     if isinstance(place, Path):
         output = Output(place, place)
@@ -181,46 +177,36 @@ def open_output(out: str | Place) -> Iterator[Output]:
 
 
 @dataclass(frozen=True, slots=True)
-class _FolderJob:
-    """A job that writes to a folder, if the worker sees the settings file there as the command does."""
+class _Job:
+    """A job that writes to a folder which all workers share, or puts its files into a store."""
 
     make: Make
+    place: Place
     folder: Path
     claimed: str
     content: str
-    """Checksum of the settings file."""
-
-    def __call__(self, number: int) -> int:
-        path = self.folder / self.claimed
-        if not path.is_file() or checksum(path) != self.content:
-            raise HandSimError(
-                f"the worker on {platform.node()} does not see the files in {self.folder}; write to a folder "
-                "that all workers share, under the same path"
-            )
-        return self.make(self.folder, number)
-
-
-@dataclass(frozen=True, slots=True)
-class _StoredJob:
-    """A job whose files go into a store."""
-
-    make: Make
-    store: UPath
+    """Checksum of the claimed settings file."""
     last: tuple[str, ...]
-    near: Path
-    """Where to have its folder, if this machine has that: it is removed at the end of the run."""
 
     def __call__(self, number: int) -> int:
-        _check_store(self.store)  # before the work
-        near = self.near if self.near.is_dir() else None
-        with tempfile.TemporaryDirectory(prefix="handsim-", dir=near) as name:
+        if isinstance(self.place, Path):
+            path = self.folder / self.claimed
+            if not path.is_file() or checksum(path) != self.content:
+                raise HandSimError(
+                    f"the worker on {platform.node()} does not see the files in {self.folder}; write to a "
+                    "folder that all workers share, under the same path"
+                )
+            return self.make(self.folder, number)
+        _check_store(self.place)  # before the work
+        near = self.folder.parent  # removed at the end of the run, if this machine has it
+        with tempfile.TemporaryDirectory(prefix="handsim-", dir=near if near.is_dir() else None) as name:
             self.make(Path(name), number)
-            _put(self.store, Path(name), _files_in(Path(name)), self.last)
+            _put(self.place, Path(name), _files_in(Path(name)), self.last)
         return number
 
 
 def _check_store(store: UPath) -> None:
-    """Load what an address needs."""
+    """Import the packages that a store needs."""
     try:
         with _one_sentence(store, "opening"):
             store.fs  # noqa: B018
@@ -232,14 +218,14 @@ def _check_store(store: UPath) -> None:
 
 
 def _put(store: Place, folder: Path, names: Collection[str], last: Sequence[str] = ()) -> None:
-    """Put files of a folder, those that match `last` after the others; each is whole, or as it was before."""
+    """Put files of a folder into a store, those that match `last` after the others."""
     for late in (False, True):
         chosen = [name for name in names if _matches(name, last) == late]
         _transfer("put", store, {str(folder / name): str(store / name) for name in chosen})
 
 
 def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
-    """Have the file system of a store get or put files, several at a time."""
+    """Get files from a store or put them, several at a time."""
     if pairs:
         with _one_sentence(store, "writing" if method == "put" else "reading"):
             getattr(store.fs, method)(list(pairs), list(pairs.values()))  # type: ignore[union-attr]
@@ -247,7 +233,7 @@ def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
 
 @contextmanager
 def _one_sentence(place: Place, doing: str) -> Iterator[None]:
-    """Tell trouble with a store in one sentence: each protocol has errors of its own."""
+    """Turn any error of a store into one sentence, since each protocol has its own errors."""
     try:
         yield
     except ImportError:

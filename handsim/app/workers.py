@@ -29,9 +29,9 @@ from handsim.errors import ArgumentError, DatasetError, HandSimError
 from handsim.files.inputs import load_json
 
 Job = Callable[[int], int]
-"""Takes a number, leaves files that depend on nothing else, and returns the number; it can be pickled."""
+"""Writes files that depend on the number alone, and returns the number; it can be pickled."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_IN_FLIGHT: Final = 1000  # jobs that an executor knows of: enough for hundreds of workers, few in memory
+_MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
 _AGAIN: Final = "run the same command again to go on"
 
 
@@ -41,7 +41,7 @@ def usable_cores() -> int:
 
 
 def check_workers(workers: int | None) -> int:
-    """A number of processes: the given one, or one a core."""
+    """Number of processes, by default one per core."""
     if workers is None:
         return usable_cores()
     check_count("workers", workers, 1)
@@ -49,10 +49,10 @@ def check_workers(workers: int | None) -> int:
 
 
 def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:
-    """Do jobs, each in any process and in any order, and yield the number of each when it is done.
+    """Do jobs in any process and any order, and yield the number of each finished job.
 
-    With a number of processes (all cores when None) the first job is done in this process, before the others:
-    this fills numba's cache before workers need it, and a mistake common to all jobs shows at once.
+    With a number of processes (by default one per core) this process does the first job before the others
+    start: that fills numba's cache for the workers, and shows mistakes that are common to all jobs.
     """
     if isinstance(workers, Executor):
         yield from _share_out(job, todo, workers)
@@ -67,12 +67,12 @@ def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> I
 
 
 def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[int]:
-    """Keep an executor supplied with jobs, and yield the numbers of those that are done."""
+    """Keep an executor supplied with jobs, and yield the numbers of finished ones."""
     waiting = iter(todo)
     pending: set[Future[int]] = set()
     try:
         while True:
-            more = islice(waiting, _IN_FLIGHT - len(pending))
+            more = islice(waiting, _MAX_PENDING - len(pending))
             pending.update([executor.submit(_do, job, number) for number in more])
             if not pending:
                 return
@@ -89,7 +89,7 @@ def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[in
 
 
 def _do(job: Job, number: int) -> int:
-    """Do a job in a worker; its error comes back as it is, or in words where it cannot be pickled."""
+    """Do a job in a worker; an error that cannot be pickled comes back as text."""
     try:
         return job(number)
     except Exception as error:
@@ -99,8 +99,8 @@ def _do(job: Job, number: int) -> int:
 class LocalProcesses(ProcessPoolExecutor):
     """Processes of this machine, spawned when they are needed, with one thread each unless the user chose.
 
-    They end with the block; at once if it raises, or if this process ends, however that ends. They do not
-    hear Ctrl-C and hang-ups.
+    They end with the block, at once if it raises, and with this process, however it ends. They ignore Ctrl-C
+    and hang-ups.
     """
 
     def __init__(self, workers: int) -> None:
@@ -110,7 +110,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
-        with _one_thread(), without_signals():  # this starts a process if none waits for work
+        with _one_thread(), without_signals():  # submit starts a process if none is idle
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -123,7 +123,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
 
 def _end_with(channel: Connection) -> None:
-    """Have this process end when the other end of a pipe is closed, as it is when its process ends."""
+    """End this process when the process at the other end of a pipe ends."""
 
     def watch() -> None:
         try:
@@ -137,7 +137,7 @@ def _end_with(channel: Connection) -> None:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes that are started within the block use one thread each, unless the user chose otherwise."""
+    """Let processes started in the block use one thread each, unless the user chose otherwise."""
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:
@@ -149,7 +149,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def without_signals() -> Iterator[None]:
-    """Processes started within the block do not hear Ctrl-C or hang-ups; this one hears them after it."""
+    """Let processes started in the block ignore Ctrl-C and hang-ups; this one gets them after it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -161,7 +161,7 @@ def without_signals() -> Iterator[None]:
 
 
 def portable(error: Exception) -> Exception:
-    """The same error, or its words where it does not survive pickling."""
+    """The error, or its text if it cannot be pickled."""
     try:
         same = pickle.loads(pickle.dumps(error))
     except Exception:
@@ -170,20 +170,17 @@ def portable(error: Exception) -> Exception:
 
 
 LOCAL: Final = "local"
-"""Stands for a scheduler and workers on this machine, which end with the command."""
-_DECIDING: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
+"""Name of a scheduler and workers on this machine that end with the command."""
+_COMPARED: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
 """Packages that the bytes of results depend on."""
-_PATIENCE: Final = 5.0  # [s] until a scheduler must have answered
+_TIMEOUT: Final = 5.0  # [s] for the answer of a scheduler
 
 
 @contextmanager
 def chosen_workers(
     cluster: str | None, workers: int | None, tell: Callable[[str], None]
 ) -> Iterator[int | Executor]:
-    """What the options --cluster and --workers stand for: a number of processes, or a cluster's executor.
-
-    The user is told of the cluster by a line.
-    """
+    """The workers of the options --cluster and --workers: a number of processes, or a cluster's executor."""
     if cluster is None:
         yield check_workers(workers)
         return
@@ -206,7 +203,7 @@ def chosen_workers(
 
 @contextmanager
 def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
-    """A connection to the scheduler, which is started for it where it is local."""
+    """A client of a scheduler, which is started if the address is `LOCAL`."""
     if address == LOCAL:
         with without_signals():  # Ctrl-C is for this process, which ends the others
             cluster = distributed.LocalCluster(
@@ -225,9 +222,9 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
             raise HandSimError(f"{file}: no address, expected what `dask scheduler --scheduler-file` writes")
     try:
         _greet(distributed, address)
-        client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
+        client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        reason = str(error.__cause__ or error).rpartition("] ")[2] or f"none within {_PATIENCE:g} s"
+        reason = str(error.__cause__ or error).rpartition("] ")[2] or f"none within {_TIMEOUT:g} s"
         raise HandSimError(
             f"no Dask scheduler answers at {address}: {reason}; expected tcp://host:port, tls://host:port, a "
             f"scheduler's file (.json), or {LOCAL}"
@@ -237,36 +234,35 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
 
 
 def _greet(distributed: Any, address: str) -> None:
-    """Connect to the scheduler and close the connection again.
+    """Connect to a scheduler once as a test.
 
-    A `distributed.Client` that cannot connect stays half made: it tries for as long as it may, and when it is
-    collected it waits ten seconds, or forever if that happens while another client is being made.
+    A `distributed.Client` that cannot connect keeps trying, and blocks for ten seconds or longer when it is
+    collected.
     """
 
     async def connect_and_close() -> None:
-        async with asyncio.timeout(_PATIENCE):
-            client = distributed.Client(address, timeout=_PATIENCE, asynchronous=True, set_as_default=False)
+        async with asyncio.timeout(_TIMEOUT):
+            client = distributed.Client(address, timeout=_TIMEOUT, asynchronous=True, set_as_default=False)
             try:
                 await client
             finally:
                 await client.close()
 
     host_and_port = distributed.comm.get_address_host_port(address)
-    socket.create_connection(host_and_port, timeout=_PATIENCE).close()  # a refusal ends here
+    socket.create_connection(host_and_port, timeout=_TIMEOUT).close()  # a refusal ends here
     try:
         asyncio.run(connect_and_close())
     except (OSError, RuntimeError, TypeError):
         raise
-    except Exception:  # whatever Dask makes of the words
+    except Exception:  # Dask cannot parse the answer
         raise ValueError("something else listens there") from None
 
 
 class ClusterExecutor(Executor):
-    """Dask's executor of a client, whose workers check themselves before they work.
+    """Dask's executor, whose workers check that they have the versions of this machine and one thread.
 
-    A worker that dies loses the job that it was doing, and another does that again. Workers that come later
-    take part. Each must have the versions of this machine and one thread. Jobs are done in the folder that
-    this process runs in, where a worker has it.
+    The job of a worker that dies is done again by another. Workers may join later. Jobs are done in the
+    working directory of this process, if the worker has it.
     """
 
     def __init__(self, client: Any) -> None:
@@ -286,13 +282,11 @@ class ClusterExecutor(Executor):
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A function as a worker calls it."""
+    """A function that a worker calls, with the package versions and the working directory of its sender."""
 
     function: Callable[..., Any]
     versions: dict[str, str]
-    """Of packages where it comes from."""
     place: Path
-    """The folder there: jobs have names of files that start in it."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         worker = import_extra("distributed", "a cluster", "cluster").get_worker()
@@ -307,7 +301,7 @@ class _Task:
 
 
 def check_worker(worker: str, threads: int, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a worker that other bytes may come from: jobs take a process each, of these versions."""
+    """Refuse a worker whose results may differ: it needs one thread and these versions."""
     if threads != 1:
         raise HandSimError(
             f"the worker {worker} has {threads} threads, expected 1; start workers with --nthreads 1, one "
@@ -323,7 +317,7 @@ def check_worker(worker: str, threads: int, found: dict[str, str], expected: dic
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    """Versions in this process of the packages that decide."""
+    """Versions of the compared packages in this process."""
     about = import_extra("distributed.versions", "a cluster", "cluster")
-    found = about.get_package_info(_DECIDING)
-    return {name: found.get(name) or "none" for name in _DECIDING}
+    found = about.get_package_info(_COMPARED)
+    return {name: found.get(name) or "none" for name in _COMPARED}

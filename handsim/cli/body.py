@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -12,9 +12,6 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import as_text, check_ending, check_outputs
 from handsim.space.objects import named_object
-
-if TYPE_CHECKING:
-    from track.rigid_body import RigidTemplate
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
@@ -28,29 +25,21 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
         out: The body's file, .toml.
     """
     from gloves.captures.formats import read_capture
-    from gloves.takes.take import SUFFIX
+    from gloves.takes.take import SUFFIX, load_take
     from track.rigid_body import SUFFIX as TOML
-    from track.rigid_body import learn_body, save_body
+    from track.rigid_body import RigidTemplate, learn_body, save_body
 
     check_ending(out, TOML)
     check_outputs([source], [out])
     if source.name.endswith(SUFFIX):
-        found = _take_body(source)
+        bodies = load_take(source).bodies
+        if not bodies:
+            raise ArgumentError(
+                f"{source}: the take has no object, expected one of handsim simulate --kind hand-controller"
+            )
+        found = RigidTemplate.of(named_object(bodies[0].name))
     else:
         found = learn_body(read_capture(source), as_text(out.stem))
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)
     print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")
-
-
-def _take_body(truth: Path) -> RigidTemplate:
-    """The object of a simulated take."""
-    from gloves.takes.take import load_take
-    from track.rigid_body import RigidTemplate
-
-    bodies = load_take(truth).bodies
-    if not bodies:
-        raise ArgumentError(
-            f"{truth}: the take has no object, expected one of handsim simulate --kind hand-controller"
-        )
-    return RigidTemplate.of(named_object(bodies[0].name))

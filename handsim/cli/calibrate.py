@@ -57,7 +57,7 @@ def calibrate(
 
 
 def _report(done: Calibration) -> list[str]:
-    """Held-out frames before and after, and suggestions for a better capture, as lines."""
+    """Lines on the held-out frames before and after, and suggestions for a better capture."""
     line = str(done)
     before, after = 1e3 * done.gaps()
     if done.is_better and np.isfinite(before):

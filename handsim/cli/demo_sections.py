@@ -1,17 +1,15 @@
-"""What `handsim demo` runs and shows: each function makes a section of the page, out of what others made."""
+"""The steps of `handsim demo`, each of which makes a section of its page."""
 
 from __future__ import annotations
 
 import platform
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
@@ -36,16 +34,16 @@ from train.simulation.takes import simulate_take
 
 GLOVE: Final = "dense19"
 GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
-"""Drawn in a row; the last one is the thumb's opposition to the little finger."""
-_RAISED: Final = np.deg2rad(35.0)
+"""Gestures in the picture; the last one is the thumb's opposition to the little finger."""
+_RAISED: Final = np.deg2rad(35.0)  # pitch of the hand in front of the camera
 _CAMERA: Final = 4
 _PICTURES: Final = 6
 _TRACKED: Final = 120  # frames of the capture
 _PAPER: Final = Corruption(occlude=5, ghosts=2)  # Han et al. 2018, section 5
-_TIMED: Final = 1024  # frames that are labeled at once to time the labeler
-_CANDIDATES: Final = 400  # frames among which the shown one is chosen
+_TIMED: Final = 1024  # frames that time the labeler
+_CANDIDATES: Final = 400  # frames from which the shown one is chosen
 
-# The figures on the page, and the ratio that is zero where there was nothing to find.
+# The figures on the page. A figure is undefined if the ratio beside it is zero.
 _SHOWN: Final = {
     "slot_accuracy": "",
     "point_accuracy": "",
@@ -56,40 +54,12 @@ _SHOWN: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class LabeledFrame:
-    """One frame of the set with the labels that the labeler gave it."""
-
-    points: Float[np.ndarray, "N 3"]
-    """[m]"""
-    labels: Int[np.ndarray, "N"]
-    truth: Int[np.ndarray, "N"]
-    seen: Bool[np.ndarray, "M"]
-    """Which markers the rig sees."""
-    hand: PosedHand
-
-
-@dataclass(frozen=True, slots=True)
-class DemoFigures:
-    """The labeler's figures on the set, and speeds [frames/s]."""
-
-    columns: dict[str, dict[str, float]]
-    generated_per_second: float
-    labeled_per_second: float
-    frame: LabeledFrame
-
-
 def demo_sections(
     pictures: Path, work: Path, *, seed: int, num_frames: int, report: Callable[[str], None]
 ) -> Iterator[Section]:
-    """Run the whole chain; the sections of the page in order, their pictures written to a folder.
+    """Run the whole chain and make the sections of the page in order.
 
-    Args:
-        pictures: Folder for the pictures.
-        work: Folder for the training set, which may go afterwards.
-        seed: Of the generated frames and of everything drawn at random.
-        num_frames: Frames to generate and label.
-        report: Shows what is being done.
+    The pictures go to the folder `pictures`, and the training set to `work`; `report` shows the running step.
     """
     labeler = load_labeler(GLOVE)  # first, so that a missing labeler is reported before any work
     report("drawing hands")
@@ -98,16 +68,16 @@ def demo_sections(
     yield _draw_worn_glove(pictures)
     report("drawing what a camera sees")
     yield _draw_camera_view(pictures)
-    figures = _generate_and_label(work, labeler, seed, num_frames, report)
+    dataset, figures = _generate_and_label(work, labeler, seed, num_frames, report)
     report("drawing a labeled frame")
-    yield _draw_labeled_frame(pictures, figures.frame)
+    yield _draw_labeled_frame(pictures, dataset, labeler, seed)
     report("tracking a simulated capture")
     yield _track_and_draw(pictures, labeler, seed)
-    yield _figures_section(figures, seed, num_frames)
+    yield figures
 
 
 def _draw_hands(out: Path) -> Section:
-    """The five sizes, and some gestures."""
+    """Draw the five sizes and some gestures."""
     write_png(out / "sizes.png", draw_sizes())
     write_png(out / "gestures.png", draw_gestures(HandModel.named("M"), GESTURES))
     return Section(
@@ -121,7 +91,7 @@ def _draw_hands(out: Path) -> Section:
 
 
 def _draw_worn_glove(out: Path) -> Section:
-    """The glove from two sides, with the names of its markers."""
+    """Draw the glove from two sides, with the names of its markers."""
     fit = nominal_fit(load_layout(GLOVE), "M", "right")
     write_png(out / "glove.png", draw_glove(fit, sides=("back", "thumb side")))
     return Section(
@@ -134,11 +104,9 @@ def _draw_worn_glove(out: Path) -> Section:
 
 
 def _draw_camera_view(out: Path) -> Section:
-    """What one camera of the rig sees of a raised hand."""
+    """Draw a raised hand as one camera of the rig sees it."""
     fit, rig = nominal_fit(load_layout(GLOVE), "M", "right"), load_rig("figure5")
-    raised = np.array(
-        [np.cos(_RAISED / 2), 0.0, -np.sin(_RAISED / 2), 0.0]
-    )  # about y: fingers up, back of the hand behind
+    raised = np.array([np.cos(_RAISED / 2), 0.0, -np.sin(_RAISED / 2), 0.0])  # about y: fingers up
     qpos = join_qpos(gesture("ok")[None], position=np.array([0.0, 0.0, 1.1]), quaternion=raised)[0]
     picture, seen = draw_camera(fit, qpos, rig, _CAMERA)
     write_png(out / "camera.png", picture)
@@ -158,8 +126,8 @@ def _draw_camera_view(out: Path) -> Section:
 
 def _generate_and_label(
     work: Path, labeler: Labeler, seed: int, num_frames: int, report: Callable[[str], None]
-) -> DemoFigures:
-    """Generate a small training set, label it clean and corrupted, and keep one labeled frame."""
+) -> tuple[Dataset, Section]:
+    """Generate a small training set and label it, clean and corrupted; returns it and a table."""
 
     def tell(done: int, total: int) -> None:
         report(f"generating frames: {done} of {total}")
@@ -177,11 +145,26 @@ def _generate_and_label(
     start = time.perf_counter()
     labeler.label_frames(clouds)
     labeled = len(clouds) / (time.perf_counter() - start)
-    return DemoFigures(columns, num_frames / seconds, labeled, _labeled_frame(dataset, labeler, seed))
+    versions = ", ".join(
+        f"{package} {metadata.version(package)}"
+        for package in ("mujoco", "numpy", "torch", "pyrender-maintained")
+    )
+    return dataset, Section(
+        "Figures of this run",
+        f"{num_frames} freshly generated frames (seed {seed}) of random people, none of whom is in the "
+        f"training set. Occluded: 0 to {_PAPER.occlude} markers dropped and 0 to {_PAPER.ghosts} ghosts per "
+        "frame.",
+        table=_table(columns),
+        notes=[
+            f"generated {num_frames / seconds:,.0f} frames/s (start included), "
+            f"labeled {labeled:,.0f} frames/s, on {usable_cores()} CPU cores",
+            f"handsim {__version__}, Python {platform.python_version()}, {versions}.",
+        ],
+    )
 
 
-def _labeled_frame(dataset: Dataset, labeler: Labeler, seed: int) -> LabeledFrame:
-    """One frame with ghosts and its labels."""
+def _draw_labeled_frame(out: Path, dataset: Dataset, labeler: Labeler, seed: int) -> Section:
+    """Draw one frame with ghosts, as the labeler takes it and with its labels."""
     rows = dataset.rows()
     row = rows[_clear_frame(rows)]
     cloud = corrupt(
@@ -191,19 +174,29 @@ def _labeled_frame(dataset: Dataset, labeler: Labeler, seed: int) -> LabeledFram
         rng=np.random.default_rng(seed),
     )
     present = cloud.present[0]
-    points = cloud.points[0][present]
+    points, truth = cloud.points[0][present], cloud.truth[0][present]
+    labels = labeler.label_frames([points])[0].labels
     model = HandModel(dataset.hands(0)[int(row["hand"])])
-    return LabeledFrame(
-        points=points,
-        labels=labeler.label_frames([points])[0].labels,
-        truth=cloud.truth[0][present],
-        seen=np.isfinite(row["observed"][:, 0]),
-        hand=PosedHand(model, row["qpos"].astype(np.float64), covering="glove"),
+    hand = PosedHand(model, row["qpos"].astype(np.float64), covering="glove")
+    write_png(out / "labels.png", draw_labels(hand, points, labels, load_layout(GLOVE)))
+    hidden = int(np.isnan(row["observed"][:, 0]).sum())
+    return Section(
+        "A frame and its labels",
+        "A frame is a set of points in random order: some markers are hidden, some points are ghosts, which "
+        "no marker made. The labeler labels each point from this one frame alone.",
+        pictures=[
+            (
+                "labels.png",
+                f"Left: the labeler's input, {len(points)} points; ghosts: {int((truth < 0).sum())}, "
+                f"hidden markers: {hidden}. Right: its labels, {int((labels == truth).sum())} of "
+                f"{len(points)} right; the hand behind them is the simulation's.",
+            )
+        ],
     )
 
 
 def _clear_frame(rows: np.ndarray) -> int:
-    """An early frame with hidden markers, whose seen markers lie well apart when viewed from the back."""
+    """An early frame with hidden markers, whose seen markers are far apart in a view of the back."""
     best, widest = 0, -1.0
     model = HandModel.named("M")
     for number in range(min(_CANDIDATES, len(rows))):
@@ -219,27 +212,8 @@ def _clear_frame(rows: np.ndarray) -> int:
     return best
 
 
-def _draw_labeled_frame(out: Path, frame: LabeledFrame) -> Section:
-    """One frame as it comes, and with the labels that the labeler gave it."""
-    write_png(out / "labels.png", draw_labels(frame.hand, frame.points, frame.labels, load_layout(GLOVE)))
-    right = int((frame.labels == frame.truth).sum())
-    return Section(
-        "A frame and its labels",
-        "A frame is a set of points in random order: some markers are hidden, some points are ghosts, which "
-        "no marker made. The labeler labels each point from this one frame alone.",
-        pictures=[
-            (
-                "labels.png",
-                f"Left: the labeler's input, {len(frame.points)} points; ghosts: "
-                f"{int((frame.truth < 0).sum())}, hidden markers: {int((~frame.seen).sum())}. Right: its "
-                f"labels, {right} of {len(frame.points)} right; the hand behind them is the simulation's.",
-            )
-        ],
-    )
-
-
 def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
-    """Track a simulated capture of two hands, say how far its joints are off, and draw it."""
+    """Track a simulated capture of two hands, measure the error of the joints, and draw it."""
     take = simulate_take("hand-hand", num_frames=_TRACKED, seed=seed)
     tracked = track_capture(take.capture(), hands=take.hands, labeler=labeler)
     errors = []
@@ -258,28 +232,8 @@ def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
     )
 
 
-def _figures_section(figures: DemoFigures, seed: int, num_frames: int) -> Section:
-    """The figures of this run as a table, with speeds and versions."""
-    versions = ", ".join(
-        f"{package} {metadata.version(package)}"
-        for package in ("mujoco", "numpy", "torch", "pyrender-maintained")
-    )
-    return Section(
-        "Figures of this run",
-        f"{num_frames} freshly generated frames (seed {seed}) of random people, none of whom is in the "
-        f"training set. Occluded: 0 to {_PAPER.occlude} markers dropped and 0 to {_PAPER.ghosts} ghosts per "
-        "frame.",
-        table=_table(figures.columns),
-        notes=[
-            f"generated {figures.generated_per_second:,.0f} frames/s (start included), "
-            f"labeled {figures.labeled_per_second:,.0f} frames/s, on {usable_cores()} CPU cores",
-            f"handsim {__version__}, Python {platform.python_version()}, {versions}.",
-        ],
-    )
-
-
 def _table(columns: dict[str, dict[str, Any]]) -> list[list[str]]:
-    """Header and rows in percent; a dash where there was nothing to find."""
+    """Header and rows in percent, with a dash for undefined figures."""
     table = [["", *(f"{title} [%]" for title in columns)]]
     for name, ratio in _SHOWN.items():
         cells = ("-" if ratio and not one[ratio] else f"{100 * one[name]:.2f}" for one in columns.values())

@@ -22,7 +22,7 @@ from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
-# These run in processes of their own: a broken driver ends its process, and torch and GL stay out of ours.
+# These programs run in processes of their own, because a broken driver kills its process.
 _DRAW: Final = """
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
@@ -47,11 +47,11 @@ class Finding:
     what: str
     found: str
     expected: str = ""
-    """What is needed, in words or as limits of a version; empty when anything will do."""
+    """Requirement in words or as limits of a version; empty if there is none."""
     remedy: str = ""
-    """What to do about it; empty when all is well."""
+    """Advice to the user; empty if the requirement is met."""
     needed: bool = True
-    """Whether commands fail until the remedy is followed."""
+    """Whether commands fail without the remedy."""
 
 
 def doctor() -> int:
@@ -69,7 +69,7 @@ def doctor() -> int:
 
 
 def examine() -> list[Finding]:
-    """Every finding about this machine, in the order of the report; takes a few seconds."""
+    """All findings about this machine, in the order of the report; this takes a few seconds."""
     drawing, gpu = _start(_DRAW), _start(_FIND_GPU)
     return [
         *check_requirements(),
@@ -83,7 +83,7 @@ def examine() -> list[Finding]:
 
 
 def check_requirements() -> Iterator[Finding]:
-    """Python itself and each dependency, as the installed handsim asks for them."""
+    """Python itself and each dependency of the installed handsim."""
     try:
         limits = metadata.metadata("handsim")["Requires-Python"]
     except metadata.PackageNotFoundError:
@@ -94,7 +94,7 @@ def check_requirements() -> Iterator[Finding]:
     remedy = "" if fits else "make a virtual environment with one of these versions"
     yield Finding("Python", python, limits, remedy)
     for requirement in metadata.requires("handsim") or ():
-        if ";" not in requirement:  # what has a marker belongs to an extra
+        if ";" not in requirement:  # requirements with markers belong to extras
             yield check_requirement(requirement)
 
 
@@ -111,11 +111,9 @@ def check_requirement(requirement: str) -> Finding:
 
 
 def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:
-    """Whether the generic import names, and pyrender's, belong to the right distributions.
+    """Whether the generic import names and pyrender's belong to the right distributions.
 
-    Args:
-        owners: The distributions that install each import name.
-        shadowed: Where each sibling leads that does not lie beside handsim.
+    `owners` holds the distributions of each import name, `shadowed` the paths of siblings from elsewhere.
     """
     for name in ("handsim", *SIBLINGS):
         strangers = sorted(set(owners.get(name, ())) - {"handsim"})
@@ -133,7 +131,7 @@ def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]
 
 
 def _pyrender_version() -> str:
-    """The version that pyrender's files state, which is not always the one its distribution claims."""
+    """The version in pyrender's files, which may differ from that of its distribution."""
     spec = util.find_spec("pyrender")
     if spec is None or spec.origin is None:
         return ""
@@ -143,7 +141,7 @@ def _pyrender_version() -> str:
 
 
 def check_drawing(code: int, output: str) -> Finding:
-    """Whether pictures can be drawn without a screen, judged by an attempt."""
+    """Whether a drawing without a screen succeeded, by its exit code and output."""
     what, expected = "drawing (EGL)", "an OpenGL driver"
     if code == 0:
         return Finding(what, output, expected)
@@ -154,13 +152,13 @@ def check_drawing(code: int, output: str) -> Finding:
 
 
 def check_gpu(code: int, output: str) -> Finding:
-    """What torch can compute on; only a torch that cannot be imported is a fault."""
+    """The device that torch computes on; only a torch that cannot be imported is a fault."""
     remedy = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
     return Finding("GPU for training", output, remedy=remedy)
 
 
 def check_kernel_cache() -> Finding:
-    """Where numba keeps compiled kernels; without a lasting place each machine start compiles them anew."""
+    """The folder of compiled kernels, which are compiled anew at each start if it does not last."""
     folder, lasts = kernel_cache()
     writable = os.access(folder if folder.exists() else folder.parent, os.W_OK)
     remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
@@ -169,16 +167,16 @@ def check_kernel_cache() -> Finding:
 
 
 def check_learned_gloves() -> Finding:
-    """Where the labelers of gloves that were learned are kept, and how many there are."""
+    """The number and folder of labelers that were trained for gloves while labeling."""
     try:
         from train.labelers.protocol import learned_folder, learned_gloves
-    except ImportError:  # a dependency is missing, which is told above
+    except ImportError:  # another finding names the missing dependency
         return Finding("learned gloves", "unknown")
     return Finding("learned gloves", f"{len(learned_gloves())} in {learned_folder()}")
 
 
 def check_room() -> Iterator[Finding]:
-    """Cores for the workers and space on the disk of the current folder."""
+    """The number of cores, and the free space on the disk of the current folder."""
     yield Finding("CPU cores", str(usable_cores()))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     remedy = "" if free >= 1.0 else "free some space, or give --out on another disk"
@@ -186,13 +184,13 @@ def check_room() -> Iterator[Finding]:
 
 
 def _start(code: str) -> subprocess.Popen[str]:
-    # -P: a file in the current folder must not be imported as numpy or torch
+    # With -P, files in the current folder are not imported as numpy or torch.
     command = [sys.executable, "-P", "-c", code]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def _finish(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit code and last line of output, or of the errors when it failed."""
+    """Exit code and last line of the output, or of the errors of a failed process."""
     try:
         output, errors = process.communicate(timeout=_PROBE_SECONDS)
     except subprocess.TimeoutExpired:

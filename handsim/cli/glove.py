@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -26,7 +26,6 @@ from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
-    from track.glove_score import Trial
 
 
 def list_gloves(out: Path | None = None) -> None:
@@ -157,7 +156,7 @@ def score_glove(
     check_ending(page, ".html")
     check_outputs([glove, settings.rig, settings.motion], [page])
     from track import glove_score
-    from track.glove_page import write_glove_page
+    from track.glove_page import trial_rows, write_glove_page
     from train.evaluation import percent
 
     with named_steps("getting ready") as step:
@@ -177,17 +176,11 @@ def score_glove(
     )
     if score.trials:
         print_line("captures, hands not calibrated; slots and whole frames that are right:")
-        _tell_trials(score.trials, score.layout)
+        print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
     for number, sentence in enumerate(score.advice, 1):
         print_line(f"{number}. {sentence}")
     write_glove_page(page, score)
     print_line(f"{page}: the hand with its confusions, markers and joints")
-
-
-def _tell_trials(trials: Mapping[str, Trial], layout: MarkerLayout) -> None:
-    from track.glove_page import trial_rows
-
-    print_table(trial_rows(trials, layout), left=6, wraps=True)
 
 
 def improve_glove(
@@ -207,6 +200,7 @@ def improve_glove(
     check_ending(out, ".toml")
     check_outputs([glove, settings.rig], [out])
     from track import glove_improvement
+    from track.glove_page import trial_rows
 
     with named_steps("getting ready") as step:
         improved = glove_improvement.improve_glove(glove, settings, name=as_text(out.stem), on_step=step)
@@ -216,7 +210,7 @@ def improve_glove(
     print_line(f"after:  {found.num_markers} markers, {improved.after}, {_palm_line(found)}")
     for name, trials in improved.trials.items():
         print_line(f"{name}, captures of people that the search did not see, hands not calibrated:")
-        _tell_trials(trials, layout if name == "before" else found)
+        print_table(trial_rows(trials, layout if name == "before" else found), left=6, wraps=True)
     if improved.verdict is not None:
         print_line(improved.verdict)
     for fewer_count, worth in improved.fewer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from handsim.hand.model import HandModel
 
 Size = Literal["XS", "S", "M", "L", "XL"]
-_USUAL_SIZE: Final = "M"
 
 
 def hand(
@@ -76,15 +75,14 @@ def hand(
     }
     print_line(f"{out}: {model.shape.side} hand {words}, {extras[suffix]}")
     if mesh is not None:
-        surface = model.surface
-        counts = f"{len(surface.vertices)} vertices, {len(surface.faces)} triangles"
+        counts = f"{len(model.surface.vertices)} vertices, {len(model.surface.faces)} triangles"
         print_line(f"{mesh}: its skin, {counts}")
 
 
 def _chosen_hand(
     size: Size | None, side: Side | None, shape: Path | None, take: Path | None, glove: str | None
 ) -> tuple[HandModel | GloveFit, str]:
-    """The hand that the options name, in its glove if it has one, and where it is from in words."""
+    """The hand of the options, in its glove if it has one, and its origin in words."""
     from gloves.fit import nominal_fit
     from gloves.takes.take import load_take
     from handsim.hand.model import HandModel
@@ -104,7 +102,6 @@ def _chosen_hand(
         except ArgumentError as error:
             raise ArgumentError(f"{source}: {error}") from error
         return fit, f"of {source}, {User((fit,))}"
-    size = size or _USUAL_SIZE
-    if glove is None:
-        return HandModel.named(size, side=side or "right"), f"of size {size}"
-    return nominal_fit(load_layout(glove), size, side or "right"), f"of size {size}"
+    size, side = size or "M", side or "right"
+    hand = HandModel.named(size, side=side) if glove is None else nominal_fit(load_layout(glove), size, side)
+    return hand, f"of size {size}"

@@ -40,20 +40,15 @@ def label(
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("frames") as bar:
-        take = label_capture(
-            capture,
-            glove=glove,
-            labeler=labeler,
-            progress=bar,
-        )
+        take = label_capture(capture, glove=glove, labeler=labeler, progress=bar)
     points = take.point_list
-    side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # the last one of label -1
-    own = side_of[points.labels]
+    labeled = points.labels >= 0
+    side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # -1 is the last one
+    sides = side_of[points.labels]
     right, left = (
-        np.bincount(points.frames[own == side], minlength=take.num_frames) > 0 for side in ("right", "left")
+        np.bincount(points.frames[sides == side], minlength=take.num_frames) > 0 for side in ("right", "left")
     )
     write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
-    labeled = points.labels >= 0
     sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
         f"{out}: {take.num_frames} frames, {labeled.sum()} of {len(labeled)} points labeled{sure}; "
@@ -62,7 +57,7 @@ def label(
 
 
 def _counts(right: Bool[np.ndarray, "T"], left: Bool[np.ndarray, "T"]) -> str:
-    """How many frames hold how many hands, and which."""
+    """The numbers of frames with two hands, one and none, in words."""
     counts = ((right & left, "two hands"), (right & ~left, "a right hand"), (left & ~right, "a left hand"))
     said = [f"{words} in {there.sum()} frames" for there, words in counts if there.any()]
     none = (~right & ~left).sum()

@@ -23,8 +23,8 @@ from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
-# loads for --help and no package names one above in an import.
+# "module:function", or "module:TABLE" for a dict of sub-commands, and a line of help. Modules are imported
+# when their command runs.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": (
         "handsim.cli.demo:demo",
@@ -84,17 +84,17 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
-    """Run one command of a table; `main` is this with the table of the release."""
+    """Run a command of a table and return its exit code."""
     program = f"handsim {args[0]}" if args and args[0] in commands else "handsim"
     _prepare_streams()
-    # One core solves its small systems faster than several do; a worker has a core of its own.
+    # One core solves our small systems faster than several, and each worker has one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with told_warnings(program), signals_raise():
             code = _dispatch(commands, args)
-        sys.stdout.flush()  # a full disk or a closed pipe must show here, not while Python shuts down
+        sys.stdout.flush()  # a full disk or a closed pipe must fail here, not while Python shuts down
         return code
-    except BrokenPipeError:  # `handsim ... | head` has seen enough
+    except BrokenPipeError:  # `handsim ... | head` ends early
         _abandon_stdout()
         return _BROKEN_PIPE
     except SystemExit as end:
@@ -111,23 +111,23 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
 
 
 def load(target: str) -> Any:
-    """What "module:name" stands for, imported now and not before."""
+    """Import the object that "module:name" stands for."""
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 def _prepare_streams() -> None:
-    """Make the standard streams take any text, and nothing where they are closed."""
+    """Make the standard streams accept any text, and open closed ones to /dev/null."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is None:  # closed; the next file that is opened would else take its place
+        if stream is None:  # the next file to be opened would get its descriptor
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
         elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="backslashreplace")  # names of files need not be text
+            stream.reconfigure(errors="backslashreplace")  # names of files may be invalid text
 
 
 def _leave(end: SystemExit) -> int:
-    """Write out what help or usage printed, and leave; rich leaves a closed pipe with code 1."""
+    """Flush the output of help or usage and exit; rich would exit with code 1 after a closed pipe."""
     pipe: BaseException | None = end
     while pipe is not None and not isinstance(pipe, BrokenPipeError):
         pipe = pipe.__context__
@@ -142,7 +142,7 @@ def _leave(end: SystemExit) -> int:
 
 
 def _complain(line: str) -> None:
-    """Print a line for the user; nobody may be there to read it."""
+    """Print a line on standard error, which may be closed."""
     try:
         print(line, file=sys.stderr, flush=True)
         sys.stdout.flush()
@@ -151,7 +151,7 @@ def _complain(line: str) -> None:
 
 
 def _unexpected(program: str, error: Exception) -> str:
-    """The sentence of the last resort, with the file that the traceback is in."""
+    """A sentence on an unexpected error, with the file of its traceback."""
     what = f"unexpected {type(error).__name__}: {shortened(_one_line(error), 200)}"
     trace = traceback.format_exc()
     try:
@@ -166,7 +166,7 @@ def _unexpected(program: str, error: Exception) -> str:
 
 
 def _sentence(error: Exception) -> str:
-    """One line for a user, out of an error that the user can do something about."""
+    """A sentence on an error that the user can correct."""
     if isinstance(error, MemoryError):
         return "out of memory; ask for fewer frames, a smaller batch or fewer workers"
     if isinstance(error, ImportError):

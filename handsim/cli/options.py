@@ -1,4 +1,4 @@
-"""Options that several commands share: whose hands are tracked, and into which file."""
+"""Options of several commands: a capture or stream, whose hands are tracked, and the take's file."""
 
 from __future__ import annotations
 
@@ -38,16 +38,11 @@ class TrackerOptions:
     """Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when not given."""
 
     def files(self) -> tuple[object, ...]:
-        """What may be files that no output must overwrite."""
+        """Options that may name files, which no output must overwrite."""
         return self.shape, self.glove, self.labeler, *self.body
 
     def settings(self, *, calibrate: bool = False) -> TrackSettings:
-        """The settings of `track_capture`.
-
-        Raises:
-            UserError: The user's file cannot be read.
-            ArgumentError: Size and file are both given, or the file has no such hand.
-        """
+        """The settings of `track_capture`."""
         from track.settings import TrackSettings
         from track.user import load_user
 
@@ -64,13 +59,16 @@ class TrackerOptions:
         return dataclasses.replace(settings, hands=dataclasses.replace(user, notes=self.shape.name))
 
 
-def check_take_file(out: Path, *, live: bool) -> None:
-    """Refuse a file for a take that is named otherwise, or whose take a recording would replace.
+def check_source(noun: str, file: object, live: str | None) -> None:
+    """Refuse a file (called `noun` in messages) together with --live, or neither of them."""
+    if (file is None) == (live is None):
+        both = f"a {noun}, {file}, and --live {live}"
+        given = f"neither a {noun} nor --live" if file is None else both
+        raise ArgumentError(f"given {given}, expected a {noun} or --live natnet://host")
 
-    Args:
-        out: The option --out.
-        live: Whether a stream is recorded; corrections would fit no other recording.
-    """
+
+def check_take_file(out: Path, *, live: bool) -> None:
+    """Refuse an --out that is no .npz, or with --live one whose take has corrections, which would be lost."""
     from gloves.takes.corrections import corrections_path
     from gloves.takes.take import SUFFIX
 

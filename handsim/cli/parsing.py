@@ -1,4 +1,4 @@
-"""How the signatures of commands become options: one reading of types, and of what help says of defaults."""
+"""Parsing of the command line by tyro: rules for types, help texts, presets and shell completion."""
 
 from __future__ import annotations
 
@@ -29,23 +29,22 @@ from tyro.constructors import (
 
 Command = Callable[..., Any]
 _UNIONS: Final = (Union, types.UnionType)
-_SPECIFICATION: Final = "COMPLETION_SPEC = "  # in scripts for completion, of commands and options
+_SPECIFICATION: Final = "COMPLETION_SPEC = "  # begins the line of a completion script with all help texts
 
 
 @dataclass(frozen=True, slots=True)
 class PresetCommand:
-    """A command that reads its arguments once before they are parsed.
+    """A command whose defaults depend on an option, so that its arguments are read before they are parsed.
 
-    A preset must become the default of the other options: compared afterwards, an option that was given and
-    equals the usual default cannot be distinguished from one that was not given.
+    After parsing, a given option that equals the usual default would look like one that was not given.
     """
 
     choose: Callable[[Sequence[str], str], Command]
-    """From the arguments and the program's name for messages to the function that they are parsed for."""
+    """Returns the function to parse for, from the arguments and the program's name."""
 
 
 def given_option(args: Sequence[str], option: str) -> str | None:
-    """The value of one option among arguments, None where it is not given; nothing else is checked."""
+    """The value of one option among arguments; None if it is not given."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument(option, dest="value", nargs="?")
     known, _ = parser.parse_known_args(list(args))
@@ -61,11 +60,7 @@ def run_command(
     args: Sequence[str] | None = None,
     is_silent: bool = False,
 ) -> Any:
-    """Parse arguments for a function, or for one of several by its name, and call it.
-
-    Raises:
-        SystemExit: After help (code 0) or a mistake in the options (code 2).
-    """
+    """Parse arguments for a function, or for one of several by name, and call it; help and mistakes exit."""
     if isinstance(command, PresetCommand):
         command = command.choose(args or (), prog)
     if isinstance(command, dict):
@@ -81,12 +76,13 @@ def run_command(
 def completion_script(
     commands: Mapping[str, Command | PresetCommand | dict[str, Command]], shell: str
 ) -> str:
-    """The script that completes commands and options in a shell, as tyro makes it."""
+    """The script by tyro that completes commands and options in a shell."""
     table = {name: _completed(command) for name, command in commands.items()}
     script, args = io.StringIO(), ["--tyro-print-completion", shell]
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(table, prog="handsim", args=args, registry=registry())
-    lines = script.getvalue().splitlines()  # a line break in a help text would end a proposal
+    lines = script.getvalue().splitlines()
+    # A line break in a help text would end the proposal of the shell.
     return "\n".join(line.replace(r"\n", " ") if line.startswith(_SPECIFICATION) else line for line in lines)
 
 
@@ -107,7 +103,7 @@ def _completed(command: Command | PresetCommand | dict[str, Command]) -> Command
 
 
 def registry() -> ConstructorRegistry:
-    """Rules for the types that commands have."""
+    """Rules for the types of commands' parameters."""
     rules = ConstructorRegistry()
     rules.primitive_rule(_name_or_nothing)
     rules.struct_rule(_settings)
@@ -117,7 +113,7 @@ def registry() -> ConstructorRegistry:
 def _name_or_nothing(
     info: PrimitiveTypeInfo,
 ) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
-    """`X | None` is given as an X; an object that has a name or a path, by these."""
+    """Parse `X | None` as an X, and a union of an object with str or Path as the latter."""
     if get_origin(info.type) not in _UNIONS:
         return None
     given = [one for one in get_args(info.type) if one is not types.NoneType]
@@ -128,23 +124,21 @@ def _name_or_nothing(
     inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(chosen, info.markers))
     if isinstance(inner, UnsupportedTypeAnnotationError):
         return None if named is None else inner
-    return dataclasses.replace(
-        inner,
-        is_instance=lambda _: True,
-        str_from_instance=lambda value: [] if value is None else _text_of(inner, value),
-    )
 
+    def text_of(value: Any) -> list[str]:
+        if value is None:
+            return []
+        return inner.str_from_instance(value) if inner.is_instance(value) else [str(value)]
 
-def _text_of(spec: PrimitiveConstructorSpec[Any], value: Any) -> list[str]:
-    return spec.str_from_instance(value) if spec.is_instance(value) else [str(value)]
+    return dataclasses.replace(inner, is_instance=lambda _: True, str_from_instance=text_of)
 
 
 def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """The fields of a dataclass of settings, with their docstrings as help."""
+    """Parse a dataclass of settings by its fields, with their docstrings as help."""
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
     hints, told = get_type_hints(info.type, include_extras=True), dict[str, str]()
-    for kind in reversed(info.type.__mro__[:-1]):  # fields of a base have their docstrings there
+    for kind in reversed(info.type.__mro__[:-1]):
         told |= _field_docstrings(kind)
     fields = []
     for one in dataclasses.fields(info.type):
@@ -164,7 +158,7 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @functools.lru_cache(maxsize=256)
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """What stands below each field of a class."""
+    """The docstring below each field of a class."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
     told = {}
@@ -181,12 +175,12 @@ def _hint(default: str) -> str:
 
 
 def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
-    """A type whose help tells a default that is one, and nothing where an option may be left out."""
+    """A type whose help shows the default, unless that is None or empty."""
     return Annotated[annotation, tyro.conf.arg(help_behavior_hint=_hint, aliases=aliases)]
 
 
 def _with_hints(command: Command) -> Command:
-    """The same command, with help as `_hinted`."""
+    """A command with the help of `_hinted` for all parameters."""
     function: Any = command.func if isinstance(command, functools.partial) else command
     hints = get_type_hints(function, include_extras=True)
     signature = inspect.signature(command)
@@ -198,7 +192,7 @@ def _with_hints(command: Command) -> Command:
     def wrapped(*args: Any, **options: Any) -> Any:
         return command(*args, **options)
 
-    del wrapped.__wrapped__  # where tyro would read the types again
+    del wrapped.__wrapped__  # tyro would take the types from there
     wrapped.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": Any}
     wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return wrapped

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
 from handsim.app.messages import LiveStatus, print_line
 from handsim.files.signals import interrupt_flag
-from track.streams.natnet import COMMAND_PORT, ReplayServer, ReplaySettings
+from track.streams import COMMAND_PORT, ReplaySettings
 
-_LOOK: Final = 0.1  # [s] between two looks at whether it shall end
+if TYPE_CHECKING:
+    from track.streams.natnet import ReplayServer
+
+_PERIOD: Final = 0.1  # [s] between two status lines
 _USUAL: Final = ReplaySettings(port=COMMAND_PORT)
 
 
@@ -29,12 +32,14 @@ def replay(
             points and IDs are sent.
         settings: How to play it.
     """
+    from track.streams.natnet import ReplayServer
+
     with ReplayServer(capture, settings) as server, interrupt_flag() as ended:
         print_line(f"{capture}: {server.num_frames} frames at {server.rate:g} Hz on {server.url}")
         with LiveStatus() as status:
             while not (ended() or server.finished):
                 status.show(_status_line(server))
-                time.sleep(_LOOK)
+                time.sleep(_PERIOD)
         print_line(f"{server.sent} frames played")
 
 

@@ -20,12 +20,7 @@ from handsim.files.outputs import (
     written_together,
 )
 from handsim.pages import coordinates
-from handsim.space.rig import (
-    CameraRig,
-    list_rigs,
-    load_rig,
-    rig_description,
-)
+from handsim.space.rig import CameraRig, list_rigs, load_rig, rig_description
 from handsim.space.rig_formats import import_cameras
 from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 

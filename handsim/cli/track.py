@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from handsim.app.messages import print_line, progress_bar
-from handsim.cli.options import TrackerOptions, check_take_file
+from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from track.settings import TrackSettings
     from track.sinks import SinkGroup
 
-_TIMED: Final = 100_000  # frames whose computing time is kept
+_TIMED: Final = 100_000  # newest frames whose computing times are kept
 
 
 def track(
@@ -63,7 +63,8 @@ def track(
     from track.settings import TrackerSetup
     from track.sinks import open_sinks
 
-    _check_source(capture, live, seconds, calibrate=calibrate)
+    check_source("capture", capture, live)
+    _check_live(live, seconds, calibrate=calibrate)
     check_take_file(out, live=live is not None)
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
@@ -80,7 +81,7 @@ def track(
         else:
             setup = TrackerSetup.of(settings)
             tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
-            if labeled is not None:  # after the recording, which nobody can make again
+            if labeled is not None:  # last, because a failure must not cost the recording
                 write_capture(labeled, tracked.whole_take(out).labeled_capture())
     assert tracked.take is not None  # it was recorded
     if options.shape is not None and options.glove is None:
@@ -96,7 +97,7 @@ def _track_file(
     sinks: SinkGroup,
     on_frame: OnFrame,
 ) -> LiveTake:
-    """Track a capture, with the corrections beside OUT, and write the take and its labeled points."""
+    """Track a capture with the corrections beside OUT; write the take and the labeled points."""
     from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
     from track.captures import track_capture
@@ -127,7 +128,7 @@ def _track_file(
 
 
 def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], milliseconds: float) -> None:
-    """Print what was tracked, in which time per frame, and warn of what looks wrong."""
+    """Print a summary of a take, and warn of signs of mistakes."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
 
@@ -142,14 +143,10 @@ def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], mill
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
 
 
-def _check_source(capture: Path | None, live: str | None, seconds: float | None, *, calibrate: bool) -> None:
-    """Refuse a capture beside a stream, and options that go with the other one."""
+def _check_live(live: str | None, seconds: float | None, *, calibrate: bool) -> None:
+    """Refuse --seconds without a stream, --calibrate with one, and an invalid address."""
     from track.streams.live_stream import check_address
 
-    if (capture is None) == (live is None):
-        both = f"a capture, {capture}, and --live {live}"
-        given = "neither a capture nor --live" if capture is None else both
-        raise ArgumentError(f"given {given}, expected a capture or --live natnet://host")
     if seconds is not None and live is None:
         raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
     if calibrate and live is not None:
@@ -159,4 +156,4 @@ def _check_source(capture: Path | None, live: str | None, seconds: float | None,
     if seconds is not None and not 0.0 < seconds < np.inf:
         raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
     if live is not None:
-        check_address(live)  # before kernels are compiled
+        check_address(live)  # before kernels are compiled, which takes long

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from handsim.app.messages import print_line, progress_bar
-from handsim.cli.options import TrackerOptions, check_take_file
+from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.files.signals import interrupt_flag
@@ -53,9 +53,7 @@ def view(
     from track.settings import USUAL_SIZE, TrackerSetup
     from track.viewer.contents import open_content
 
-    if (file is None) == (live is None):
-        given = "neither a file nor --live" if file is None else f"a file, {file}, and --live {live}"
-        raise ArgumentError(f"given {given}, expected a file or --live natnet://host")
+    check_source("file", file, live)
     if live is not None:
         if video is not None:
             raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
@@ -80,30 +78,23 @@ def view(
 
 def _draw(name: str, content: Content, video: Path) -> None:
     """Draw the video of a recording."""
+    check_outputs((name,), (video,))
+    from render.illustrations import write_clip
     from track.viewer.contents import first_look
     from track.viewer.recordings import write_video
-
-    check_outputs((name,), (video,))
-    from render.illustrations import write_clip  # OpenCV and the painters
 
     recording = content.recording
     if recording is None:
         raise ArgumentError(f"--video is {video}, but {name} is a {content.kind}: nothing in it moves")
     with progress_bar("pictures") as bar:
-        count = write_video(
-            video,
-            recording,
-            first_look(recording),
-            write_clip=write_clip,
-            progress=bar,
-        )
+        count = write_video(video, recording, first_look(recording), write_clip=write_clip, progress=bar)
     print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
 
 def _view_live(
     url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
 ) -> None:
-    """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
+    """Track a stream and show it until a signal or the stream ends it; record it if `out` is given."""
     from handsim.space.rig import load_rig
     from track.live import track_live
     from track.viewer.timeline import LiveView

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
 _CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
-"""Parent of each bone, and how many joints move it."""
+"""Parent of each bone, and the number of its joints."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +130,7 @@ def build_spec(
     sites: tuple[Site, ...] = (),
     actuators: bool = False,
 ) -> mujoco.MjSpec:
-    """Editable MuJoCo specification of a hand; compile it, or write it with `.to_xml()`.
+    """Editable MuJoCo specification of a hand.
 
     With `actuators` each joint has a position servo of its name: a control is an angle [rad] within the
     joint's range.
@@ -321,7 +321,7 @@ KEYPOINT_BONES: Final[tuple[int, ...]] = (
     PALM,
     *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
 )
-"""Index in `BONES` of the bone that carries each keypoint: the one that begins there, or of a tip ends."""
+"""Index in `BONES` of the bone that begins at each keypoint, or ends at a tip."""
 KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
 """Digit of each keypoint, -1 for the wrist."""
 SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
@@ -329,8 +329,8 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for digit in range(len(DIGITS))
     for part in range(4)
 )
-"""Pairs of keypoints that are joined by a line."""
-_WRIST: Final = 1.3  # thickness of the wrist, in thicknesses of the palm
+"""Pairs of keypoints that a drawing joins by a line."""
+_WRIST_THICKNESS: Final = 1.3  # in thicknesses of the palm
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
@@ -347,9 +347,8 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
 
 
 def keypoint_thickness(shape: HandShape) -> Float[np.ndarray, "21"]:
-    """Thickness of the hand at each keypoint: of the wrist, or of the finger there [m]."""
-    fingers = 2.0 * shape.radii
-    return np.array([_WRIST * shape.palm_thickness, *fingers.ravel()])
+    """Thickness of the wrist or the finger at each keypoint [m]."""
+    return np.array([_WRIST_THICKNESS * shape.palm_thickness, *(2.0 * shape.radii).ravel()])
 
 
 NUM_VELOCITIES: Final = 6 + NUM_JOINTS
@@ -357,7 +356,7 @@ NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 
 
 def _moved_bones() -> NDArray[np.bool_]:
-    """Which bones (J, L) each joint moves: its own and all beyond it."""
+    """Bones (J, L) that each joint moves: its own and its descendants."""
     moved = np.zeros((NUM_JOINTS, NUM_BONES), dtype=bool)
     for number, joint in enumerate(JOINTS):
         for bone in range(NUM_BONES):
@@ -369,7 +368,7 @@ def _moved_bones() -> NDArray[np.bool_]:
 
 
 _MOVED: Final = _moved_bones()
-# The first joint of a bone rotates about an axis fixed in the parent, a second one about its own bone's.
+# The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
 _FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
 _BONE: Final = np.array([joint.bone for joint in JOINTS])
 _PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
@@ -406,7 +405,7 @@ def skinned_jacobian(
     arms = placed - wrist[:, None, :3, 3]
     jacobian[..., 3:6] = np.cross(turning[:, None], arms[:, :, None]).swapaxes(-1, -2)
     axes, anchors = joint_axes(model, T_world_bone)
-    # A joint moves the share of a point that its bones carry: axis x (sum of w (p - anchor)).
+    # derivative by a joint, over the bones that it moves: axis x (sum of w (p - anchor))
     shares = bone_weights * _MOVED[:, bone_indices]  # (J, M, 4)
     lever = np.einsum("jmk,tmki->tmji", shares, carried)
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
@@ -414,10 +413,10 @@ def skinned_jacobian(
     return jacobian
 
 
-_MOST_FRAMES: Final = 1 << 22
-_STEADY: Final = 0.01  # of a frame, by which times may differ from those of a steady rate
-_LONGEST_GAP: Final = 0.1  # [s] that a new frame may bridge,
-_LONGEST_GAP_FRAMES: Final = 2.5  # or so many old frames
+_MAX_FRAMES: Final = 1 << 22
+_STEADY: Final = 0.01  # of a frame: largest deviation of times from a steady rate
+_MAX_GAP: Final = 0.1  # [s] that interpolation bridges
+_MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -482,7 +481,7 @@ class BodyMotion:
 
 
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
-    """A motion from poses some of which (NaN), but not all, are missing: linear from pose to pose."""
+    """A motion with linear interpolation over missing poses (NaN); at least one is present."""
     from scipy.spatial.transform import Rotation, Slerp
 
     there = np.flatnonzero(np.isfinite(qpos[:, 0]))
@@ -510,8 +509,8 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
     if not 0.0 < rate < np.inf:
         raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
     last = (times[-1] - times[0]) * rate + _STEADY
-    if last >= _MOST_FRAMES:
-        raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MOST_FRAMES}")
+    if last >= _MAX_FRAMES:
+        raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MAX_FRAMES}")
     at: NDArray[np.float64] = times[0] + np.arange(int(last) + 1) / rate
     return at
 
@@ -519,12 +518,11 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 def between_poses(
     times: Float[np.ndarray, "T"], new: Float[np.ndarray, "K"], poses: Float[np.ndarray, "T H W"], rate: float
 ) -> Float[np.ndarray, "K H W"]:
-    """Poses at other times: positions and angles linear, rotations on the shortest way.
+    """Poses at new times, interpolated between old ones: position, quaternion (wxyz) and angles, if any.
 
-    A pose is a position, a quaternion (wxyz), then angles, if any. There is none (NaN) where an old one
-    beside it is missing, or where the old ones, whose rate is given, are more than a tenth of a second apart.
+    They are NaN beside a missing old pose, and between old frames more than a tenth of a second apart.
     """
-    longest = max(_LONGEST_GAP, _LONGEST_GAP_FRAMES / rate)
+    longest = max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
     before, share = _brackets(times - times[0], new - times[0], longest)
     between = np.empty((len(new), *poses.shape[1:]))
     for number in range(poses.shape[1]):
@@ -535,7 +533,7 @@ def between_poses(
 def _brackets(
     old: NDArray[np.float64], new: NDArray[np.float64], longest: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """The old frame before each new time, and the share of the next one; NaN in a gap."""
+    """The old frame before each new time, and the weight of the next one; NaN in a gap."""
     if len(old) == 1:
         return np.zeros(len(new), dtype=np.intp), np.zeros(len(new))
     before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
@@ -548,7 +546,7 @@ def _brackets(
 def _between(
     rows: NDArray[np.float64], before: NDArray[np.intp], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rows between each old frame and the next; NaN where one that counts is."""
+    """Rows interpolated between old frames; NaN where one with weight is NaN."""
     from scipy.spatial.transform import Rotation
 
     quaternions = slice(3, 7)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
 _SCATTER: Final = (0.30, 0.13, 0.08)
-"""Of skin: red light travels farthest in it (Jensen et al. 2001: mean free paths of 3.7, 1.4 and 0.7 mm)."""
+"""Scatter of skin; red light travels farthest (Jensen et al. 2001: free paths of 3.7, 1.4 and 0.7 mm)."""
 _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
 
 
@@ -85,7 +85,7 @@ _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm
 def sphere_surface(
     centers: Float[np.ndarray, "N 3"], radius: float, *, level: int
 ) -> tuple[Doubles, Doubles, Integers]:
-    """Vertices [m], normals and faces of balls in a row, each with as many of them as the next."""
+    """Vertices [m], normals and faces of balls, one after the other; all have as many of each."""
     ball = _unit_ball(level)
     count, each = len(centers), len(ball.vertices)
     vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
@@ -139,13 +139,13 @@ class HandFigure:
 
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
-        bony = look.skin.relief if look.glove is None else 0.0  # cloth levels it
+        bony = look.skin.relief if look.glove is None else 0.0  # cloth hides bones
         self.skin = PosableSkin(fit.model, look.forearm, bony)
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
         self.thickness: Float[np.ndarray, "21"] = keypoint_thickness(fit.model.shape)
-        """Of the hand at each keypoint, markers included [m]."""
+        """Thickness of the hand at each keypoint, markers included [m]."""
         if look.glove is not None:
             self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
@@ -165,7 +165,10 @@ class HandFigure:
         )
         drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material, skin.coarse_faces)]
         if self.look.glove is not None:
-            drawn.append(self._drawn_markers(qpos, number))
+            parts = (first_part + self._marker_bones).astype(np.uint8)
+            instances = np.full(len(parts), 1 + number, dtype=np.uint8)
+            radius, markers = self.fit.layout.radius, self.markers(qpos)
+            drawn.append(_drawn_balls(markers, radius, parts, instances, self._marker_numbers))
         return drawn
 
     def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
@@ -180,12 +183,6 @@ class HandFigure:
                 texture = glove_texture(look.glove, texture, look.forearm, side=side)
             self._painted = skin_material(texture)
         return self._painted
-
-    def _drawn_markers(self, qpos: Doubles, number: int) -> Drawn:
-        parts = (1 + PARTS_A_HAND * number + self._marker_bones).astype(np.uint8)
-        instances = np.full(len(parts), 1 + number, dtype=np.uint8)
-        radius = self.fit.layout.radius
-        return _drawn_balls(self.markers(qpos), radius, parts, instances, self._marker_numbers)
 
 
 class BodyFigure:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.kernels import kernel
@@ -36,11 +36,9 @@ from render.painting.shading import (
 )
 from render.scenery.lights import Lighting
 
-_SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
-_SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
-_BLOCK: Final = (
-    1000  # surface points shaded at a time, which stay in the processor's cache; rows of no power of two, too
-)
+_SMOOTH: Final = 0.006  # share of the depth by which samples of one surface in a pixel differ
+_SHADED_AROUND: Final = 0.1  # border whose vertices may have faces in the picture, as a share of its size
+_BLOCK: Final = 1000  # points shaded at a time: they fit into the cache, and rows are no power of two apart
 
 _NO_TEXELS: Final = np.empty((0, 0, 2), dtype=np.uint32)
 
@@ -50,14 +48,14 @@ class _Mesh(NamedTuple):
 
     begin: int  # number of its first face among those of all surfaces
     faces: Integers
-    corners: Doubles  # of `rasterizer.project` (V, 3) at twice the picture's size
+    corners: Doubles  # vertices (V, 3) as `rasterizer.project` has them, at twice the picture's size
     rows: Floats  # position [m], normal, tint and texture coordinates of each vertex (V, 11)
     texels: NDArray[np.uint32]  # two words a texel (h, w, 2); empty where there is no texture
     finish: Doubles  # color, roughness, glow and scatter
 
 
 def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
-    """See `render.painting.painter.paint`; the same bytes on every machine but for rounding."""
+    """Colors and coverage, as `paint` has them, by our own code; machines differ by rounding alone."""
     width, height = camera.size
     meshes = _meshes(camera, drawn)
     counts = np.cumsum([0, *(len(mesh.corners) for mesh in meshes)])
@@ -73,23 +71,16 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
     shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
     covered = _covered(first)
-    sums = np.zeros((len(covered), 4), dtype=np.float32)
+    sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
     for mesh in meshes:
         _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
     painted = np.zeros((height, width, 4), dtype=np.uint8)
-    _as_bytes(sums, covered, painted.reshape(-1, 4))
+    painted.reshape(-1, 4)[covered] = np.rint(np.float32(63.75) * sums)
     return painted
 
 
-@kernel
-def _as_bytes(sums: Floats, covered: NDArray[np.int32], painted: Bytes) -> None:
-    """Write the bytes of covered pixels into a picture (P, 4), of their sums over four samples (N, 4)."""
-    for place, pixel in enumerate(covered):
-        for channel in range(4):
-            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[place, channel]))
-
-
 def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
+    """The surfaces in the camera's axes."""
     rotation = camera.T_world_camera[:3, :3]
     doubled = np.diag([2.0, 2.0, 1.0]) @ camera.K
     meshes, begin = [], 0
@@ -109,8 +100,8 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
     return meshes
 
 
-def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
-    """Rows for `shading.shade`; lamps in one direction share a row."""
+def _lamp_table(lighting: Lighting) -> Doubles:
+    """Rows (L, 9) for `shading.shade`; lamps in one direction share a row."""
     rows: dict[tuple[float, float, float], Doubles] = {}
     for number, lamp in enumerate(lighting.lamps):
         towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
@@ -123,7 +114,7 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 @kernel
 def _covered(first: NDArray[np.int32]) -> Any:
-    """Numbers (N,) of the pixels with a surface in one of their samples (2 H, 2 W), which are -1 for none."""
+    """Numbers (N,) of the pixels with a face in one of their four samples (2 H, 2 W); -1 is none."""
     height, width = first.shape[0] // 2, first.shape[1] // 2
     covered, count = np.empty(height * width, np.int32), 0
     for row in range(height):
@@ -131,11 +122,11 @@ def _covered(first: NDArray[np.int32]) -> Any:
         for column in range(width):
             both = (upper[2 * column] & upper[2 * column + 1]) & (lower[2 * column] & lower[2 * column + 1])
             covered[count] = row * width + column
-            count += both >= 0  # all bits of -1 are set: only four of them are negative
+            count += both >= 0  # all bits of -1 are set, so that only four of them are negative together
     return covered[:count]
 
 
-# Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
+# Arrays are arguments of their own: numba counts references to those in a tuple, which costs too much.
 @kernel
 def _add_surface(
     nearness: Floats,
@@ -156,12 +147,11 @@ def _add_surface(
     to_display: Floats,
     sums: Floats,
 ) -> None:
-    """Add one surface's colors, and how many of four samples per pixel it fills.
+    """Add one surface's colors, and the number of samples that it fills, to `sums` (N, 4) of covered pixels.
 
-    `nearness` is one over the depth (2 H, 2 W) [1/m], `first` the nearest face of each sample, counted over
-    all surfaces from `begin`, -1 for none; `texels` is empty without a texture. `lamps` are the rows (L, 9)
-    of `_lamp_table`, `nearest` and `bias` those of the `ShadowMap` [m]; `sums` (N, 4) of covered pixels is
-    added to.
+    `nearness` (2 H, 2 W) is one over the depth [1/m], `first` the nearest face of each sample, -1 for none.
+    The surface's faces have numbers from `begin` on. `lamps` are `_lamp_table`, `nearest` and `bias` those of
+    the `ShadowMap` [m]; `texels` is empty without a texture.
     """
     width, end = first.shape[1] // 2, begin + len(faces)
     block = np.empty((SPOT, _BLOCK), np.float32)
@@ -194,19 +184,9 @@ def _add_surface(
                 if not 0 <= face < len(faces):
                     continue
                 x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
-                _write_spot(
-                    corners,
-                    rows,
-                    faces[face, 0],
-                    faces[face, 1],
-                    faces[face, 2],
-                    2 * column + x,
-                    2 * row + y,
-                    texels,
-                    finish,
-                    block,
-                    spot,
-                )
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                x, y = 2 * column + x, 2 * row + y
+                _write_spot(corners, rows, a, b, c, x, y, texels, finish, block, spot)
                 places[spot], shares[spot] = place, 4.0 if smooth else 1.0
                 spot += 1
 
@@ -238,9 +218,9 @@ def _write_spot(
     spots: Floats,
     spot: int,
 ) -> None:
-    """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
+    """Write a surface point of the face (a, b, c): its vertices' rows, interpolated with perspective.
 
-    The face has the vertices a, b and c; x and y are column and row in the doubled picture [px].
+    It is behind column x and row y of the picture at twice its size [px].
     """
     ax, ay = corners[a, 0], corners[a, 1]
     bx, by = corners[b, 0] - ax, corners[b, 1] - ay
@@ -270,14 +250,14 @@ def _write_spot(
                 cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
             )
     else:
-        for i in range(4):  # no mirror is perfect
+        for i in range(4):
             spots[COLOR + i, spot] = np.float32(finish[i] if i < 3 else max(finish[i], ROUGHEST))
 
 
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
 _WHITE: Final = np.float32(255.0)
-_STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL reallocate its buffers
+_STEP: Final = 64  # windows' sizes are multiples of it, because OpenGL reallocates buffers for new sizes [px]
 
 
 def choose_painter() -> Painter:
@@ -288,10 +268,7 @@ def choose_painter() -> Painter:
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors over black (sRGB) by a pinhole camera, and fourth the covered share of each pixel.
-
-    Light is in the camera's axes; both painters give nearly the same picture.
-    """
+    """Colors over black (sRGB) by a pinhole camera, and as fourth channel the covered share of each pixel."""
     paint_colors = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
     width, height = camera.size
     picture = np.zeros((height, width, 4), dtype=np.uint8)
@@ -303,26 +280,23 @@ def paint(
 
 
 def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom [px] of the part with surfaces: empty parts cost time too."""
-    width, height = camera.size
+    """Left, top, right and bottom of the part of the picture with surfaces [px]."""
     if not drawn:
         return 0, 0, 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for one in drawn:
         _widen(camera.local(one.triangles.vertices), camera.K, low, high)
     if low[2] < NEAR:
-        return 0, 0, width, height
+        return 0, 0, *camera.size
     low, high = np.floor(low[:2] - 1.0), np.ceil(high[:2] + 1.0)
     left, top = (np.clip(low, 0, camera.size) // _STEP * _STEP).astype(int)
-    right, bottom = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size).astype(
-        int
-    )
-    return int(left), int(top), int(right), int(bottom)
+    ends = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size)
+    return int(left), int(top), int(ends[0]), int(ends[1])
 
 
 @kernel
 def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
-    """Widen a range (3,) of columns, rows [px] and depths [m] to points in the camera's axes (V, 3)."""
+    """Widen a range (3,) of columns, rows [px] and depths [m] to hold points (V, 3) in the camera's axes."""
     for point in range(len(local)):
         depth = local[point, 2]
         low[2], high[2] = min(low[2], depth), max(high[2], depth)

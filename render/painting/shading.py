@@ -25,18 +25,16 @@ from render.painting.rasterizer import NEAR, nearest_faces, project
 from render.scenery.backgrounds import Backdrop
 from render.scenery.lights import Lighting
 
-_TEXELS: Final = (
-    256  # along a side; hands and forearms are half a meter across, edges a few millimeters soft as in rooms
-)
-_FREE: Final = 3.0  # [texels] that reads of neighbors may go beyond what is drawn
-_COARSE: Final = 4  # pixels of the picture a pixel of the shadow's mask: its edges are soft
-_MARGIN: Final = 0.15  # of the picture around it where a hand still counts as being in it
+_TEXELS: Final = 256  # side of a shadow map; edges are a few millimeters soft on half a meter, as in rooms
+_FREE: Final = 3.0  # free border of a shadow map, for reads of neighbors [texels]
+_COARSE: Final = 4  # size of a pixel of the shadow's mask, whose edges are soft, in pixels of the picture
+_MARGIN: Final = 0.15  # border around a picture where a hand still counts as in it, as a share of its size
 _FLATTEST: Final = 0.15  # cosine between a lamp and a backdrop's normal below which there is no shadow
-_SHADED: Final = 0.9  # of the light of a lamp; the rest comes back from the hand and all around
+_SHADED: Final = 0.9  # share of a lamp's light that a shadow takes; the rest is reflected into it
 
 
 class ShadowMap(NamedTuple):
-    """Nearness of the nearest surface to a far lamp."""
+    """How near to a far lamp its first surface is."""
 
     to_map: Float[np.ndarray, "3 4"]
     """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
@@ -50,7 +48,7 @@ def shadow_map(
     towards: Float[np.ndarray, "3"],
     seen: Bool[np.ndarray, "V"],
 ) -> ShadowMap:
-    """The shadows on a surface."""
+    """The shadow map of a surface for a lamp in this unit direction, with room for its seen vertices."""
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
@@ -61,7 +59,7 @@ def shadow_map(
 
 @kernel
 def _onto_map(points: Floats, rotation: Doubles, seen: Flags) -> Any:
-    """Points in a map that has room for those seen (V, 3), `ShadowMap.to_map`, and its texels a meter."""
+    """Points (V, 3) in a map with room for those seen, `ShadowMap.to_map`, and the map's texels per meter."""
     corners = np.empty((len(points), 3))
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for point in range(len(points)):
@@ -84,10 +82,7 @@ def _onto_map(points: Floats, rotation: Doubles, seen: Flags) -> Any:
 
 @kernel
 def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float, z: float) -> float:
-    """Visible share of the lamp at (x, y, z) [m]: the mean over a square of three texels around it.
-
-    The map is that of a `ShadowMap`, by its fields.
-    """
+    """Visible share of the lamp at (x, y, z) [m]: the mean over 3 x 3 texels of a `ShadowMap`'s fields."""
     across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
     near = to_map[2, 0] * x + to_map[2, 1] * y + to_map[2, 2] * z + to_map[2, 3] + bias
@@ -108,10 +103,7 @@ def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float,
 def light_behind(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, backdrop: Backdrop
 ) -> Float32[np.ndarray, "H W"] | None:
-    """Share of its light that a backdrop keeps at each pixel; None where no shadow falls on it.
-
-    The drawn surfaces cast the shadow of the first lamp, in the axes of a pinhole camera.
-    """
+    """Share of its light that a backdrop keeps beside the first lamp's shadows; None without shadows."""
     if not drawn or not lighting.lamps:
         return None
     normal = np.array([*backdrop.recedes, -1.0]) / np.linalg.norm([*backdrop.recedes, 1.0])
@@ -120,8 +112,8 @@ def light_behind(
         return None
     surfaces = [one.triangles for one in drawn]
     points = camera.local(np.concatenate([surface.vertices for surface in surfaces]))
-    first = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
-    faces = np.concatenate([one.casting + start for one, start in zip(drawn, first, strict=False)])
+    starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    faces = np.concatenate([one.casting + start for one, start in zip(drawn, starts, strict=False)])
     size = np.array(camera.size, dtype=np.float64)
     fallen, distance = np.full_like(points, np.nan), np.zeros(2)
     _fall(points, normal, towards, backdrop.gap, camera.K, size, fallen, distance)
@@ -136,7 +128,12 @@ def light_behind(
         return None
     blur = backdrop.softness * distance[0] / distance[1] * camera.K[0, 0] / _COARSE
     mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
-    light = 1.0 - np.float32(_SHADED * _key_share(lighting, normal)) * mask
+    falls = []  # light of each lamp on the backdrop
+    for lamp in lighting.lamps:
+        direction = np.array(lamp.direction)
+        falls.append(lamp.strength * max(0.0, float(direction @ normal)) / float(np.linalg.norm(direction)))
+    first_share = falls[0] / max(sum(falls) + float(np.mean(lighting.ambient)), 1e-6)
+    light = 1.0 - np.float32(_SHADED * first_share) * mask
     whole = cv2.resize(light, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole[: camera.size[1], : camera.size[0]])
 
@@ -152,12 +149,11 @@ def _fall(
     fallen: Doubles,
     distance: Doubles,
 ) -> None:
-    """Write where the shadows of points (V, 3) [m] fall on a backdrop, placed by those in the picture.
+    """Write where the shadows of points (V, 3) fall on a backdrop, in the camera's axes [m].
 
-    All is in the camera's axes; `normal` is the backdrop's, towards the camera, and `gap` its distance from
-    the nearest point in the picture [m]. Points behind the backdrop cast none and keep what stands there.
-    `distance` (2,) gets the mean distance from the points to the backdrop, and the backdrop's mean depth
-    there [m]; zeros where no point is in the picture.
+    The backdrop's normal looks towards the camera, and the gap separates it from the nearest point in the
+    picture. Points behind it have no shadow, and their rows are not written. `distance` (2,) gets the points'
+    mean distance from the backdrop and its mean depth behind them, or zeros if no point is in the picture.
     """
     seen = np.zeros(len(points), dtype=np.bool_)
     nearest = np.inf
@@ -185,19 +181,10 @@ def _fall(
         distance /= count
 
 
-def _key_share(lighting: Lighting, normal: Doubles) -> float:
-    """Share of the first lamp in the light that falls on a plane."""
-    falls = []
-    for lamp in lighting.lamps:
-        direction = np.array(lamp.direction)
-        falls.append(lamp.strength * max(0.0, float(direction @ normal)) / float(np.linalg.norm(direction)))
-    return falls[0] / max(sum(falls) + float(np.mean(lighting.ambient)), 1e-6)
-
-
 GAMMA: Final = 2.2
 _FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
-_LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces, against self-shadowing [bias]
-_UNDER: Final = 0.012  # depth that scattered light passes at a scatter of 1 [m]
+_LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces over the map's bias
+_UNDER: Final = 0.012  # depth in the skin that scattered light passes at a scatter of 1 [m]
 _PI: Final = np.float32(np.pi)
 _ZERO: Final = np.float32(0.0)
 _ONE: Final = np.float32(1.0)
@@ -206,9 +193,9 @@ _TINY: Final = np.float32(1e-12)
 _LEAST: Final = np.float32(1e-30)
 ROUGHEST: Final = np.float32(0.04)
 """Roughness of the smoothest mirror."""
-_EDGE: Final = np.float32(0.001)  # cosine of the flattest view that is told apart
-_LEVELS: Final = 2048
-_PARTS: Final = np.float32(8.0)
+_EDGE: Final = np.float32(0.001)  # least cosine between a view and a normal
+_LEVELS: Final = 2048  # entries of the table of display values
+_PARTS: Final = np.float32(8.0)  # entries of the table of linear light per sRGB level
 _SRGB = np.arange(255 * int(_PARTS) + 1) / (255.0 * _PARTS)
 TO_LINEAR: Final = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
     np.float32
@@ -308,8 +295,9 @@ def shade(
 
     Args:
         spots: Table (23, N); see `SPOT`. Normals become unit normals of the relief.
-        mapped: Whether the surface has a texture with a relief.
+        texels: Texture (h, w, 2), two words a texel; empty for a surface without one.
         finish: Linear color (3), roughness, glow, scatter (3); see `Material`.
+        table: `TO_LINEAR`.
         lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
         ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
@@ -328,30 +316,17 @@ def shade(
     light = np.empty((3, count), np.float32)
     for i in range(3):
         _add_ambient(spots, ambient[:, i].astype(np.float32), np.float32(finish[4]), i, light[i])
-    cosine, fresnel, mirrored = (
-        np.empty(count, np.float32),
-        np.empty(count, np.float32),
-        np.empty_like(light[0]),
-    )
-    lit = np.ones(count, np.float32)
+    cosine, fresnel = np.empty(count, np.float32), np.empty(count, np.float32)
+    mirrored, lit = np.empty(count, np.float32), np.ones(count, np.float32)
     for lamp in range(len(lamps)):
         x, y, z = np.float32(lamps[lamp, 0]), np.float32(lamps[lamp, 1]), np.float32(lamps[lamp, 2])
         _reflect(spots, x, y, z, cosine, fresnel, mirrored)
         if lamp == 0:
             _cast_shadows(spots, lamps[0], finish[5], cosine, to_map, nearest, bias, lit)
         for i in range(3):
+            color, scatter = spots[COLOR + i], np.float32(finish[5 + i])
             hard, soft = np.float32(lamps[lamp, 3 + i]), np.float32(lamps[lamp, 6 + i])
-            _add_lamp(
-                spots[COLOR + i],
-                np.float32(finish[5 + i]),
-                hard,
-                soft,
-                cosine,
-                fresnel,
-                mirrored,
-                lit,
-                light[i],
-            )
+            _add_lamp(color, scatter, hard, soft, cosine, fresnel, mirrored, lit, light[i])
     return light
 
 
@@ -374,7 +349,7 @@ def _add_scaled(target: Floats, vectors: Floats, factor: Floats) -> None:
 
 @kernel
 def _normalize(vectors: Floats) -> None:
-    """Scale vectors (3, N) to unit length; what has no length stays."""
+    """Scale vectors (3, N) to unit length; zeros stay zeros."""
     length = np.empty_like(vectors[0])
     _dot(vectors, vectors, length)
     for n in range(len(length)):
@@ -389,8 +364,8 @@ def _normalize(vectors: Floats) -> None:
 def _map_normals(normals: Floats, tangents: Floats, bumps: Floats) -> None:
     """Replace unit normals (3, N) by those of a relief.
 
-    Tangents are any vectors on the side of the way in which u grows, and are made unit tangents; bumps are
-    the relief's normals along the tangent, normal x tangent, and the normal.
+    Tangents (3, N) point where u grows and become unit tangents. Bumps (3, N) are the relief's normals along
+    the tangent, along normal x tangent, and along the normal.
     """
     along = np.empty_like(normals[0])
     _dot(normals, tangents, along)
@@ -400,13 +375,8 @@ def _map_normals(normals: Floats, tangents: Floats, bumps: Floats) -> None:
     _normalize(tangents)
     across = np.empty_like(normals)
     for i in range(3):
-        ny, nz, ty, tz = (
-            normals[(i + 1) % 3],
-            normals[(i + 2) % 3],
-            tangents[(i + 1) % 3],
-            tangents[(i + 2) % 3],
-        )
-        row = across[i]
+        ny, nz = normals[(i + 1) % 3], normals[(i + 2) % 3]
+        ty, tz, row = tangents[(i + 1) % 3], tangents[(i + 2) % 3], across[i]
         for n in range(len(along)):
             row[n] = ny[n] * tz[n] - nz[n] * ty[n]
     for i in range(3):
@@ -420,7 +390,7 @@ def _map_normals(normals: Floats, tangents: Floats, bumps: Floats) -> None:
 
 @kernel
 def _add_ambient(spots: Floats, around: Floats, glow: np.float32, i: int, light: Floats) -> None:
-    """Write what one color of light from everywhere (9,) and a glow give to surface points (N,)."""
+    """Write the light (N,) of one color that surface points send by ambient light (9,) and by a glow."""
     x, y, z, color = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2], spots[COLOR + i]
     a, b, c, d, e = around[0], around[1], around[2], around[3], around[4]
     f, g, h, k = around[5], around[6], around[7], around[8]
@@ -441,7 +411,7 @@ def _reflect(
     fresnel: Floats,
     mirrored: Floats,
 ) -> None:
-    """Write how surface points reflect a lamp at (x, y, z): cosine, Schlick's term and mirrored share."""
+    """Write cosine, Schlick's term and mirrored share (N,) of surface points for a lamp at (x, y, z)."""
     nx, ny, nz = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2]
     vx, vy, vz = spots[VIEW], spots[VIEW + 1], spots[VIEW + 2]
     facing, roughness = spots[FACING], spots[ROUGH]
@@ -483,15 +453,12 @@ def _cast_shadows(
     bias: float,
     lit: Floats,
 ) -> None:
-    """Write the share (N,) of the first lamp that surface points see.
-
-    `scatter` is how far red light travels under the surface; the map is a `ShadowMap` in its fields.
-    """
+    """Write the share (N,) of the first lamp that surface points see; `scatter` is that of red light."""
     for n in range(len(lit)):
         if cosine[n] <= -scatter:
             continue
         lift = _LIFT * bias * np.sqrt(max(1.0 - cosine[n] * cosine[n], 0.0))
-        # Light under the surface passes what is this thick before it.
+        # Under the surface, light passes through flesh of this thickness.
         under = scatter * _UNDER * (1.0 - cosine[n])
         x = spots[POSITION, n] + lift * spots[NORMAL, n] + under * lamp[0]
         y = spots[POSITION + 1, n] + lift * spots[NORMAL + 1, n] + under * lamp[1]
@@ -513,8 +480,8 @@ def _add_lamp(
 ) -> None:
     """Add one color of a lamp's light to `light` (N,).
 
-    `hard` is the lamp's light that objects hide, of which points see the share `lit`, and `soft` its light
-    without shadows; `scatter` is the cosine beyond grazing at which it still lights them.
+    The `hard` light reaches the share `lit` of each point, the `soft` light all of it. `scatter` is the
+    cosine beyond grazing at which the lamp still lights a point.
     """
     diffuse = (_ONE - _FACING) / (_PI * (_ONE + scatter))
     for n in range(len(light)):

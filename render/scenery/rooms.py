@@ -7,58 +7,57 @@ from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Float32, Int8
 from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from render.fields import normal_numbers
 from render.frames import Doubles, Flags, Floats, Integers
 
-_FURNITURE: Final = (4, 14)
-_PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
-_WALLS: Final = (0.12, 0.08, 0.12, 0.68)  # how often a wall has each of these
-_FLOORS: Final = (0.25, 0.4, 0.35)  # likewise a floor, without stripes; ceilings are plain
-_FLOOR: Final = 4  # number of that side
-_CONTRAST: Final = (0.15, 0.7)  # of a pattern, as a share of the difference of any two paints
+_FURNITURE: Final = (4, 14)  # range of the number of boxes
+_PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # patterns of walls
+_WALLS: Final = (0.12, 0.08, 0.12, 0.68)  # probabilities of stripes, tiles, boards and no pattern on a wall
+_FLOORS: Final = (0.25, 0.4, 0.35)  # probabilities of tiles, boards and no pattern on a floor
+_FLOOR: Final = 4  # number of the floor among the six sides
+_CONTRAST: Final = (0.15, 0.7)  # contrast of a pattern over that of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
-_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] from an edge's middle
-_STEP: Final = 0.04  # of the root of light between neighbors, where four rays are cast for one
-_WEIGHTS: Final = np.array([0.2, 0.6, 0.2], dtype=np.float32)  # of red, green and blue in that light
-_FRAME: Final = 0.06  # of a picture or window, as a share of its sides
+_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # four rays of a pixel
+_STEP: Final = 0.04  # least difference of the root of light between neighbors that makes an edge
+_WEIGHTS: Final = np.array([0.2, 0.6, 0.2], dtype=np.float32)  # weights of red, green and blue in this light
+_FRAME: Final = 0.06  # width of the frame of a picture or window, as a share of its sides
 
 
 class _Walls(NamedTuple):
-    """What is painted on the six sides: from the room's origin and from its far corner, for x, y and z."""
+    """Paint of the six sides, two for each of x, y and z: at the room's origin and at its far corner."""
 
     patterns: Integers
-    pitches: Doubles  # of stripes, tiles and boards (6,) [m]
-    colors: Doubles  # two of each (6, 2, 3), linear
+    pitches: Doubles  # widths of stripes, tiles and boards (6,) [m]
+    colors: Doubles  # two linear colors of each side (6, 2, 3)
     boards: Doubles  # tones of boards (512,)
     frames: Doubles
-    """Pictures and windows (6, 3, 11): left, low, width, height, colors of frame and glass, slope; width 0:
-    none."""
+    """Three pictures or windows of each side (6, 3, 11): left, low, width (0: none), height [m], colors of
+    frame and glass, slope of the light on the glass."""
 
 
 class RoomLight(NamedTuple):
-    """What N rays meet in a room."""
+    """Light, distance and normal of the surfaces in a room that N rays meet."""
 
-    light: Float32[np.ndarray, "N 3"]  # linear
-    distances: Float32[np.ndarray, "N"]  # [m]
+    light: Float32[np.ndarray, "N 3"]  # linear light
+    distances: Float32[np.ndarray, "N"]  # distance [m]
     axes: Int8[np.ndarray, "N"]  # axis of the surface's normal, which faces the ray
 
 
 class _Boxes(NamedTuple):
     """Furniture: B boxes."""
 
-    corners: Doubles  # low and high (B, 2, 3) [m]
-    colors: Doubles  # linear (B, 2, 3)
-    bands: Doubles
-    """How many drawers or shelves, and what share of each has the second color (B, 2)."""
-    shades: Doubles  # of the faces along x, y and z (B, 3)
+    corners: Doubles  # low and high corners (B, 2, 3) [m]
+    colors: Doubles  # two linear colors of each box (B, 2, 3)
+    bands: Doubles  # number of drawers or shelves, and the share of each with the second color (B, 2)
+    shades: Doubles  # brightness of the faces along x, y and z (B, 3)
 
 
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
-    """A random room from a random position, linear light."""
+    """A random room from a random position, in linear light."""
     width, height = size
     scene = _scene(seed)
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
@@ -68,11 +67,11 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # rays have no width, pixels have
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # because rays have no width, but pixels do
 
 
 def _seen(scene: _Scene, size: tuple[int, int], across: Floats, down: Floats) -> Floats:
-    """Light (N, 3) at places (N,) [px] of a picture."""
+    """Light (N, 3) at columns and rows (N,) of a picture [px]."""
     width, height = size
     rays = np.empty((len(across), 3), dtype=np.float32)
     _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
@@ -83,16 +82,9 @@ def _seen(scene: _Scene, size: tuple[int, int], across: Floats, down: Floats) ->
 def _aim(
     across: Floats, down: Floats, middle: float, center: float, focal: float, axes: Doubles, rays: Floats
 ) -> None:
-    """Write the directions (N, 3) in which a camera sees places of its picture, no component 0.
+    """Write the directions (N, 3), without zeros, of columns and rows (N,) of a picture [px].
 
-    Args:
-        across: Columns (N,) [px].
-        down: Rows (N,) [px].
-        middle: Column of the camera's axis [px].
-        center: Row of it [px].
-        focal: Focal length [px].
-        axes: The camera's axes in the room (3, 3), a row each: right, down, ahead.
-        rays: Written.
+    `middle` and `center` are the column and the row of the camera's axis; `axes` are `_Scene.axes`.
     """
     for n in range(len(rays)):
         x, y = (across[n] - middle) / focal, (down[n] - center) / focal
@@ -103,7 +95,7 @@ def _aim(
 
 
 def _edges(picture: Floats) -> Flags:
-    """Where (H W,) a picture differs from its neighbors to the right or below, on both sides of that."""
+    """Pixels (H W,) on both sides of edges."""
     roots = np.sqrt(picture @ _WEIGHTS)
     edges = np.zeros(roots.shape, dtype=bool)
     right = np.abs(np.diff(roots, axis=1)) > _STEP
@@ -116,20 +108,21 @@ def _edges(picture: Floats) -> Flags:
 
 
 class _Scene(NamedTuple):
-    """A room and who looks into it."""
+    """A room and a camera in it."""
 
-    room: Doubles  # far corner [m]; the other one is at the origin, z up
-    eye: Doubles
+    room: Doubles  # far corner [m]; the near one is at the origin, z up
+    eye: Doubles  # position of the camera [m]
     focal: float  # focal length [picture heights]
-    axes: Doubles  # the camera's axes (3, 3), a row each: right, down, ahead
-    lamp: Doubles  # lamps and windows leave some parts darker than others
-    strength: float
+    axes: Doubles  # the camera's axes as rows (3, 3): right, down, ahead
+    lamp: Doubles  # position of the lamp [m]
+    strength: float  # strength of the lamp
     walls: _Walls
     boxes: _Boxes
 
 
-@functools.lru_cache(maxsize=2)  # drawn twice: small for its light, then behind the hands
+@functools.lru_cache(maxsize=2)  # each is drawn twice: small for its light, then behind the hands
 def _scene(seed: int) -> _Scene:
+    """A random room and camera."""
     rng = np.random.default_rng(seed)
     room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))
     eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
@@ -137,46 +130,35 @@ def _scene(seed: int) -> _Scene:
     yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls = _paint_walls(room, rng)
-    axes, boxes = _turned(yaw, pitch, roll), _place_boxes(room, eye, rng)
+    (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
+    aside, upright, level = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([-sy, cy, 0.0])
+    ahead, down = cp * level + sp * upright, sp * level - cp * upright
+    axes = np.stack([cr * aside + sr * down, cr * down - sr * aside, ahead])
+    boxes = _place_boxes(room, eye, rng)
     return _Scene(room, eye, focal, axes, lamp, strength, walls, boxes)
 
 
 def cast_room(
-    rays: Float32[np.ndarray, "N 3"],
-    eye: Float[np.ndarray, "3"],
-    room: Float[np.ndarray, "3"],
-    free: Float[np.ndarray, "2 3"],
-    *,
-    rng: np.random.Generator,
+    rays: Floats, eye: Doubles, room: Doubles, free: Doubles, *, rng: np.random.Generator
 ) -> RoomLight:
-    """A random room of a given size, seen from a position; an equal rng gives the same from another."""
+    """A random room of this size (3,) along rays (N, 3) from an eye, without furniture in the box `free`.
+
+    An equal `rng` gives the same room for every eye.
+    """
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)
-    outside = (boxes.corners[:, 1] < free[0]) | (boxes.corners[:, 0] > free[1])
-    kept = outside.any(axis=1)
+    kept = ((boxes.corners[:, 1] < free[0]) | (boxes.corners[:, 0] > free[1])).any(axis=1)
     return _cast_all(rays, eye, room, walls, _Boxes(*(part[kept] for part in boxes)), lamp, strength)
 
 
 def _cast_all(
     rays: Floats, eye: Doubles, room: Doubles, walls: _Walls, boxes: _Boxes, lamp: Doubles, strength: float
 ) -> RoomLight:
-    count = len(rays)
-    seen = RoomLight(
-        np.empty((count, 3), dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.int8),
-    )
+    """Cast all rays (N, 3) from an eye."""
+    shape = rays.shape[:1]
+    seen = RoomLight(np.empty_like(rays), np.empty(shape, np.float32), np.empty(shape, np.int8))
     _cast(rays, eye, room, *walls, *boxes, lamp, strength, *seen)
     return seen
-
-
-def _turned(yaw: float, pitch: float, roll: float) -> Doubles:
-    """Axes (3, 3), a row each, of a camera that looks into the room, a little up or down and askew [rad]."""
-    (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
-    aside, upright = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0])
-    level = np.array([-sy, cy, 0.0])
-    ahead, down = cp * level + sp * upright, sp * level - cp * upright
-    return np.stack([cr * aside + sr * down, cr * down - sr * aside, ahead])
 
 
 def _paint_walls(room: Doubles, rng: np.random.Generator) -> _Walls:
@@ -212,7 +194,7 @@ def _place_boxes(room: Doubles, eye: Doubles, rng: np.random.Generator) -> _Boxe
     )
 
 
-# Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
+# Arrays are arguments of their own: numba counts references to those in a tuple, which costs too much.
 @kernel
 def _cast(
     rays: Floats,
@@ -233,7 +215,7 @@ def _cast(
     distances: Floats,
     axes: NDArray[np.int8],
 ) -> None:
-    """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
+    """Write the light (N, 3) along each ray, its distance (N,) [m], and the normal's axis (N,) there."""
     position, color, inverse = np.empty(3), np.empty(3), np.empty(3)
     offsets = corners - eye
     cones = _cones(offsets)
@@ -279,7 +261,7 @@ def _cones(offsets: Doubles) -> Any:
                 along, square = along + place * axis[i], square + place * place
             least = min(least, along / np.sqrt(square))
         cones[box, :3] = axis
-        cones[box, 3] = least - 1e-5 if least > 0.0 else -2.0  # wider than half of all ways is no cone
+        cones[box, 3] = least - 1e-5 if least > 0.0 else -2.0  # without a limit beyond a right angle
     return cones
 
 
@@ -347,11 +329,7 @@ def _paint(rng: np.random.Generator, count: int) -> Doubles:
 
 
 def paint_tints(rng: np.random.Generator, count: int) -> Doubles:
-    """Logarithms (count, 3) of paints' red, green and blue over their gray.
-
-    They are warm or cool, seldom green or magenta. Most walls, floors and cloths are nearly gray; some have a
-    strong color.
-    """
+    """Logarithms (count, 3) of paints' colors over their gray; few are strong, green or magenta."""
     strong = rng.random(count) < _COLORED
     warm = rng.normal(0.08, np.where(strong, 0.32, 0.10))
     green = rng.normal(0.0, np.where(strong, 0.10, 0.04))

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
-from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from handsim._checks import check_choice, check_type
@@ -108,12 +107,12 @@ def check_tones(tones: Sequence[float]) -> None:
 
 
 def tone_name(angle: float) -> str:
-    """The class of `TONES` that an individual typology angle [deg] is in; beyond all, the outer one."""
+    """The class of `TONES` of an individual typology angle [deg]; beyond all classes, the outer one."""
     return next((name for name, (low, _) in TONES.items() if angle > low), "dark")
 
 
 def hyphened(tone: str) -> str:
-    """The name of a class of `TONES` as options have it."""
+    """The name of a class of `TONES` in options."""
     return tone.replace(" ", "-")
 
 
@@ -177,26 +176,25 @@ def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
 _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
 _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
-"""Girths there [hand breadths]."""
+"""Girths of the arm at these places [hand breadths]."""
 CUFF: Final = 0.0004
-"""Length of the arm along which a sleeve becomes wider than it: a step, between two rings [m]."""
-_HEM: Final = 0.004  # [m] between the rings of the step and the next ones, so that shading does not round it
-_SQUARE: Final = 0.8
-"""Power of the cosine and sine of an arm's section: wrists are squarer than an ellipse, of power 1,"""
-_LONGER: Final = 1.04  # and longer around at the same width
+"""Length of the step from an arm to its sleeve, between two rings [m]."""
+_HEM: Final = 0.004  # distance of this step from the next rings, so that shading does not round it [m]
+_SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
+_LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 _BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
 ELBOW: Final = _PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
-_ELBOW_BEND: Final = 0.07  # [m] on either side of the elbow that bend with it
+_ELBOW_BEND: Final = 0.07  # length on either side of the elbow that bends with it [m]
 REACH: Final = 1.8
-"""Where arms that leave a picture end, behind the elbow [m]."""
+"""Length behind the elbow of arms that leave a picture [m]."""
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
-_TILTS: Final = (0.0, 0.4)  # of an upper arm towards the cameras that are tried
-_DOWN: Final = np.array([0.0, 0.0, -0.5])  # of the way to a body, beside the forearms' level way
-_MOST_BENT: Final = np.cos(np.deg2rad(130.0))
-_CLEAR: Final = 0.12  # [m] between an upper arm and a camera, at least
-_MARGIN: Final = 0.1  # of a picture around it where no arm ends
+_TILTS: Final = (0.0, 0.4)  # slopes of an upper arm towards the cameras that are tried
+_DOWN: Final = np.array([0.0, 0.0, -0.5])  # downward part of the direction from the elbows to the body
+_MOST_BENT: Final = np.cos(np.deg2rad(130.0))  # cosine of the largest angle of an elbow
+_CLEAR: Final = 0.12  # least distance between an upper arm and a camera [m]
+_MARGIN: Final = 0.1  # border around a picture where no arm may end, as a share of its size
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,10 +231,8 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     )
 
 
-def forearm_rings(
-    shape: HandShape, forearm: Forearm, wrist: Float[np.ndarray, "R 3"], rings: int
-) -> Float[np.ndarray, "rings R 3"]:
-    """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m]."""
+def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int) -> Doubles:
+    """Rings of skin (rings, R, 3) behind the wrist's (R, 3), nearest first, in the wrist's frame [m]."""
     mirror = MIRROR if shape.side == "left" else np.eye(3)
     right = wrist @ mirror
     center = right.mean(axis=0)
@@ -259,10 +255,10 @@ def forearm_rings(
     return points @ mirror
 
 
-def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
-    """Places of the wrist's ring and those behind it along the arm [m].
+def arm_places(forearm: Forearm, rings: int) -> Doubles:
+    """Places (rings + 1,) of the wrist's ring and those behind it along the arm [m].
 
-    Rings lie closer together near the wrist, where all the bending is, and two pairs at the edge of a sleeve.
+    Rings are denser near the wrist, which bends, and two pairs of them lie at the edge of a sleeve.
     """
     places: Doubles = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
     if forearm.sleeve < forearm.length:
@@ -270,17 +266,14 @@ def arm_places(forearm: Forearm, rings: int) -> Float[np.ndarray, "rings+1"]:
         first = int(np.clip(np.abs(places - forearm.sleeve).argmin() - 1, 1, rings - 4))
         places[: first + 1] *= edge[0] / places[first]
         last = first + len(edge) - 1
-        places[last:] = np.interp(
-            places[last:], [places[last], forearm.length], [edge[-1], max(forearm.length, edge[-1] + _HEM)]
-        )
+        ends = [edge[-1], max(forearm.length, edge[-1] + _HEM)]
+        places[last:] = np.interp(places[last:], [places[last], forearm.length], ends)
         places[first : last + 1] = edge
     return places
 
 
-def bent_rings(
-    rings: Float[np.ndarray, "K R 3"], elbow: float, towards: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "K R 3"]:
-    """Rings of an arm that bends at its elbow and ends `REACH` behind it [m]."""
+def bent_rings(rings: Doubles, elbow: float, towards: Doubles) -> Doubles:
+    """Rings (K, R, 3) of an arm that bends at its elbow to this direction and ends `REACH` behind it [m]."""
     middles = rings.mean(axis=1)
     ahead = middles[-1] - middles[-2]
     ahead /= np.linalg.norm(ahead)
@@ -309,12 +302,10 @@ def bent_rings(
     return bent
 
 
-def upper_arms(
-    elbows: Float[np.ndarray, "H 3"], forearms: Float[np.ndarray, "H 3"], cameras: Sequence[Camera]
-) -> Float[np.ndarray, "H 3"]:
-    """Unit directions from elbows in which arms leave the pictures of all cameras, where that is possible."""
+def upper_arms(elbows: Doubles, forearms: Doubles, cameras: Sequence[Camera]) -> Doubles:
+    """Unit directions (H, 3) from elbows in which arms leave the pictures of all cameras, if possible."""
     axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
-    if np.linalg.norm(axis) < 0.2:  # they look at the arms from all around
+    if np.linalg.norm(axis) < 0.2:  # the cameras stand all around the arms
         axis = cameras[0].T_world_camera[:3, 2]
     axis = axis / np.linalg.norm(axis)
     body = forearms.mean(axis=0) * [1.0, 1.0, 0.0] + _DOWN
@@ -335,7 +326,7 @@ def upper_arms(
 def _out_of_pictures(
     elbow: Doubles, forearm: Doubles, way: Doubles, axis: Doubles, cameras: Sequence[Camera]
 ) -> Doubles:
-    """The direction nearest to `way`, turned about `axis`, in which an arm ends in no picture."""
+    """The direction nearest to `way`, rotated about `axis`, in which an arm ends in no picture."""
     aside = np.cross(axis, way)
     flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
     tried = np.concatenate([flat - tilt * axis for tilt in _TILTS])
@@ -359,7 +350,7 @@ def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Dou
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
     girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
     flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
-    # Ramanujan's ellipse: its girth over its half width
+    # Ramanujan's formula for the girth of an ellipse over its half width
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
     around *= _LONGER
@@ -370,7 +361,7 @@ def _course(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Double
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
     fine = np.linspace(0.0, behind[-1], 200)
     share = smooth(fine, 0.0, _BEND * shape.length)
-    # A hand that bends towards its palm (-z) or thumb (y) has its arm go there too, seen from the hand.
+    # Seen from a hand that bends towards its palm (-z) or thumb (y), the arm bends there, too.
     up, aside = forearm.flexion * share, forearm.deviation * share
     ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)
     way = np.concatenate([np.zeros((1, 3)), np.cumsum(-ahead[:-1] * np.diff(fine)[:, None], axis=0)])

@@ -50,18 +50,17 @@ _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
 
 
 class Atlas(NamedTuple):
-    """Numbers only; vertices are `HandSurface`'s, then the forearm's rings, then the end's middle."""
+    """Topology of every drawn skin: vertices of the hand, of the forearm's rings, and of its end's middle."""
 
-    used: Integers  # vertices (U,) of the base surface that are drawn: those from the wrist's ring on
-    wrist: Integers
-    """The wrist's ring (R,), indices of the drawn vertices, from the index side over the back."""
+    used: Integers  # vertices (U,) of `HandSurface` that are drawn: those from the wrist's ring on
+    wrist: Integers  # the wrist's ring (R,) of drawn vertices, from the index side over the back
     faces: Integers
     """Triangles (F, 3) of the drawn vertices, closed, counter-clockwise from outside on a right hand."""
     corners: Integers
-    """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
+    """Drawn vertex of each corner (D,); a vertex on borders of tiles has a corner in each of them."""
     corner_faces: Integers  # the same triangles (F, 3) as indices of `corners`
     coarse_faces: Integers
-    """A quarter as many triangles (G, 3) of the same corners: the surface to a few tenths of a millimeter."""
+    """A quarter as many triangles (G, 3) of the same corners, within a few tenths of a millimeter."""
     uv: Floats  # texture coordinates (D, 2), the origin at the bottom left
     tiles: Integers  # drawn vertices (K, 5, 5) of each tile's grid
     size: tuple[int, int]  # width and height of the texture [texels]
@@ -79,7 +78,7 @@ class Atlas(NamedTuple):
 
 @functools.cache
 def skin_atlas() -> Atlas:
-    """The atlas; cached."""
+    """The atlas of all hands; cached."""
     topology = cage_topology()
     quads, count = topology.quads, topology.num_vertices
     loop = topology.palm[WRIST]
@@ -91,18 +90,15 @@ def skin_atlas() -> Atlas:
         step, quads = catmull_clark(quads, count)
         count = step.shape[0]
         coordinates = _child_coordinates(coordinates)
-    # The stump behind the wrist goes: its strip of the palm and the faces that close it.
-    behind = np.isin(topology.quads, topology.palm[:WRIST]).any(axis=1)
-    kept = np.flatnonzero(~behind)
+    # Left out are the stump behind the wrist, that is a strip of the palm, and the faces that close it.
+    kept = ~np.isin(topology.quads, topology.palm[:WRIST]).any(axis=1)
     grids = _grids(quads, coordinates, len(topology.quads))[kept]
     used = np.unique(grids)
-    tiles = np.searchsorted(used, grids)
-    wrist = np.searchsorted(used, loop)
-    return _assemble(used, tiles, wrist)
+    return _assemble(used, np.searchsorted(used, grids), np.searchsorted(used, loop))
 
 
 def _child_coordinates(coordinates: Doubles) -> Doubles:
-    """Coordinates (4 Q, 4, 2) in their tile of the four children's corners, in `catmull_clark`'s order."""
+    """Coordinates (4 Q, 4, 2) of the children's corners in their tiles, in the order of `catmull_clark`."""
     following, before = np.roll(coordinates, -1, axis=1), np.roll(coordinates, 1, axis=1)
     middle = np.broadcast_to(coordinates.mean(axis=1, keepdims=True), coordinates.shape)
     children = np.stack(
@@ -120,10 +116,18 @@ def _grids(quads: Integers, coordinates: Doubles, count: int) -> Integers:
     return grids
 
 
+def ring_vertices(wrist: Integers, num_hand: int) -> Integers:
+    """Drawn vertices (RINGS + 1, R + 1) of the wrist's ring and the forearm's, each closed by its first."""
+    around = len(wrist)
+    rings = np.concatenate([wrist[None], num_hand + np.arange(RINGS * around).reshape(RINGS, around)])
+    return np.concatenate([rings, rings[:, :1]], axis=1)
+
+
 def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
+    """The atlas of the hand's tiles (K, 5, 5) and of a forearm behind the wrist."""
     tile_rows = -(-len(tiles) // COLUMNS)
     width, height = COLUMNS * TILE, tile_rows * TILE + ARM_ROWS
-    # The hand's tiles: node (row, column) of a tile stands on the center of a texel of its border or inside.
+    # Each node of a tile lies on the center of a texel, the outer nodes on those of the tile's border.
     step = np.linspace(0.5, TILE - 0.5, _SIDE + 1)
     number = np.arange(len(tiles))
     across = (number % COLUMNS * TILE)[:, None, None] + step[None, None, :]
@@ -133,13 +137,10 @@ def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     nodes = np.arange(tiles.size).reshape(tiles.shape)
     faces, coarse = [_squares(nodes)], [_squares(nodes[:, ::2, ::2])]
     corners = [tiles.ravel()]
-    # The forearm: a grid of rings, its first column once more at the end.
-    around, first = len(wrist), len(used)
-    rings = np.concatenate([wrist[None], first + np.arange(RINGS * around).reshape(RINGS, around)])
-    end = first + RINGS * around
-    rings = np.concatenate([rings, rings[:, :1]], axis=1)
+    around, rings = len(wrist), ring_vertices(wrist, len(used))
+    end = len(used) + RINGS * around
     node = tiles.size + np.arange(rings.size).reshape(rings.shape)
-    # Rings come in the palm's order, index side over the back: outwards is from a ring to the wrist.
+    # Rings run from the index side over the back, so rows go towards the wrist for faces to look outwards.
     faces.append(_squares(node[None, ::-1]))
     coarse.append(_squares(node[None, ::-2, ::2]))
     corners += [rings.ravel(), np.array([end])]
@@ -175,36 +176,36 @@ def _squares(nodes: Integers) -> Integers:
     return np.concatenate([first, second])
 
 
-_REFERENCE: Final = 0.0118  # radius of an average finger at its knuckle, for which the lengths below are [m]
-_NEAR: Final = 0.018  # [m] from a thumb's axis that only its own skin is
+_REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
+_THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
 _FINGERS: Final = ("index", "middle", "ring", "little")
 
 
 class _Hill(NamedTuple):
     """A shape of the skin."""
 
-    joint: int  # whose angle decides the height; -1 for a shape that is always there
+    joint: str | None  # joint whose angle raises the hill; None for a hill that is always there
     start: float  # angle without height [deg]
     full: float  # angle with full height [deg]
     heights: Doubles  # full height at each vertex (U,) along the normal [m]
 
 
 class Flexion:
-    """The shapes of one hand."""
+    """The hills that the joints of one hand raise on its skin."""
 
     def __init__(self, model: HandModel, rest: Doubles, normals: Doubles, bony: float) -> None:
         hills = list(_hills(model, rest, normals))
-        self._joints = np.array([hill.joint for hill in hills])
+        self._joints = np.array(
+            [-1 if hill.joint is None else JOINT_NAMES.index(hill.joint) for hill in hills]
+        )
         self._start = np.deg2rad([hill.start for hill in hills])
         self._full = np.deg2rad([hill.full for hill in hills])
         heights = bony * np.stack([hill.heights for hill in hills], axis=1)
         self._rows = np.flatnonzero(np.abs(heights).max(axis=1) > 1e-6)
         self._heights, self._normals = heights[self._rows], normals[self._rows]
 
-    def shaped(
-        self, rest: Float[np.ndarray, "U 3"], angles: Float[np.ndarray, "20"]
-    ) -> Float[np.ndarray, "U 3"]:
-        """Vertices at rest as the angles [rad] shape them [m]."""
+    def shaped(self, rest: Doubles, angles: Doubles) -> Doubles:
+        """Vertices (U, 3) at rest with the hills of joint angles (20,) [m, rad]."""
         angle = np.where(self._joints < 0, self._full, angles[self._joints])
         share = smooth(angle, self._start, self._full)
         shaped: Doubles = rest.copy()
@@ -213,19 +214,40 @@ class Flexion:
 
 
 def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]:
-    """All shapes, on the right hand that the hand is a mirror image of."""
+    """All hills of a hand, computed on a right hand."""
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
-    points, outward = rest @ mirror, normals @ mirror
     frames = model.rest_transforms.copy()
     frames[:, :3, :3] = mirror @ frames[:, :3, :3] @ mirror
     frames[:, :3, 3] = frames[:, :3, 3] @ mirror
-    skin = _Skin(points, outward, frames, model.shape.radii[1:, 0].mean() / _REFERENCE)
+    scale = model.shape.radii[1:, 0].mean() / _REFERENCE
+    skin = _Skin(rest @ mirror, normals @ mirror, frames, scale)
     for number, digit in enumerate(_FINGERS, 1):
         yield from _finger(skin, number, digit, model.shape.radii[number, 0] / _REFERENCE)
-    yield from _valleys(skin)
-    yield from _thumb(skin)
-    yield from _palm(skin)
-    yield from _ulna(skin)
+    for number in (1, 2, 3):  # hollows between the knuckles of a fist, down to where the fingers part
+        first, second = 1 + 3 * number, 4 + 3 * number
+        here = 0.5 * (frames[first, :2, 3] + frames[second, :2, 3])
+        parted = here + 0.45 * (0.5 * (frames[first + 1, :2, 3] + frames[second + 1, :2, 3]) - here)
+        along, aside = along_segment(skin.points[:, :2], here, parted)
+        hollow = -0.0042 * bump(aside, scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
+        hollow *= 1.0 - 0.4 * along
+        yield _Hill(f"{_FINGERS[number]}_MCP_flexion", 10.0, 85.0, scale * hollow)
+    # The thumb's knuckles, its waist and pad, and the muscle between it and the index when they close.
+    yield _Hill("thumb_MCP_flexion", 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
+    yield _Hill("thumb_IP_flexion", 5.0, 70.0, skin.knob(3, 0.0020, 0.0060, 0.0065))
+    middle = 0.5 * float(np.linalg.norm(frames[3, :3, 3] - frames[2, :3, 3]))
+    yield _Hill(None, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
+    yield _Hill(None, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * scale, 0.0075))
+    muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
+    yield _Hill("thumb_CMC_abduction", 15.0, -25.0, muscle)
+    # The balls of thumb and little finger, and the hollow between them.
+    for joint, start, full, center, height, width in (
+        ("thumb_CMC_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
+        ("little_MCP_flexion", 10.0, 80.0, (0.035, -0.028), 0.0028, 0.0140),
+        ("ring_MCP_flexion", 10.0, 80.0, (0.055, -0.004), -0.0025, 0.0120),
+    ):
+        yield _Hill(joint, start, full, skin.ball(center, height, width, back=False))
+    # The head of the ulna, on the little finger's side of the wrist's back.
+    yield _Hill(None, 0.0, 1.0, skin.ball((-0.016, -0.021), 0.0040, 0.0085, back=True))
 
 
 class _Skin(NamedTuple):
@@ -234,17 +256,17 @@ class _Skin(NamedTuple):
     points: Doubles
     normals: Doubles
     frames: Doubles  # transforms of the bones (16, 4, 4)
-    scale: float  # of the hand against the reference
+    scale: float  # size of the hand over that of the reference
 
     def local(self, bone: int) -> tuple[Doubles, Doubles]:
-        """Points (U, 3) [m] in a bone's frame, and how far they face its back, -1 to 1 (U,)."""
+        """Points (U, 3) in a bone's frame [m], and cosines (U,) of their normals with its back."""
         frame = self.frames[bone]
         return (self.points - frame[:3, 3]) @ frame[:3, :3], self.normals @ frame[:3, 2]
 
     def knob(
         self, bone: int, height: float, along: float, aside: float, *, at: tuple[float, float] = (0.0, 0.0)
     ) -> Doubles:
-        """A hill on the back of a bone, `at` its x and y; `along` and `aside` are its half widths [m]."""
+        """A hill on a bone's back at these x and y, with half widths along and across the bone [m]."""
         place, facing = self.local(bone)
         size = self.scale
         hill = bump(place[:, 0] - size * at[0], size * along) * bump(place[:, 1] - size * at[1], size * aside)
@@ -252,36 +274,32 @@ class _Skin(NamedTuple):
         return np.asarray(size * height * hill)
 
     def girth(self, bone: int, height: float, at: float, along: float) -> Doubles:
-        """A hill around the thumb but for its back, `at` a place along a bone, of this half width [m]."""
+        """A hill around the thumb, except on its back, at a place along a bone, of this half width [m]."""
         place, facing = self.local(bone)
-        near = np.linalg.norm(place[:, 1:], axis=1) < _NEAR * self.scale
+        near = np.linalg.norm(place[:, 1:], axis=1) < _THUMB_RADIUS * self.scale
         hill = near * bump(place[:, 0] - at, self.scale * along) * smooth(-facing, -0.8, -0.2)
         return np.asarray(self.scale * height * hill)
 
     def ball(self, center: tuple[float, float], height: float, width: float, *, back: bool) -> Doubles:
-        """A hill on the back or the palm, around a place of the wrist's frame [m]."""
+        """A hill on the back or the palm, around an x and y of the wrist's frame [m]."""
         size = self.scale
         distance = np.linalg.norm(self.points[:, :2] - size * np.array(center), axis=1)
         facing = self.normals[:, 2] if back else -self.normals[:, 2]
         return np.asarray(size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6))
 
 
-def _joint(name: str) -> int:
-    return JOINT_NAMES.index(name)
-
-
 def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
-    """Three knuckles of a finger, its tendon, and the pad that its bending pushes out."""
+    """Hills of a finger's knuckles, its tendon, its shaft, its neck, and the pad that bending pushes out."""
     first = 1 + 3 * number
-    bent, straight = _joint(f"{digit}_MCP_flexion"), (15.0, -22.0)
+    bent = f"{digit}_MCP_flexion"
     yield _Hill(bent, 5.0, 85.0, skin.knob(first, 0.0042 * wide, 0.0075, 0.0062, at=(-0.001, 0.0)))
-    yield _Hill(_joint(f"{digit}_PIP_flexion"), 5.0, 95.0, skin.knob(first + 1, 0.0019, 0.0058, 0.0056))
-    yield _Hill(_joint(f"{digit}_DIP_flexion"), 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
+    yield _Hill(f"{digit}_PIP_flexion", 5.0, 95.0, skin.knob(first + 1, 0.0019, 0.0058, 0.0056))
+    yield _Hill(f"{digit}_DIP_flexion", 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
     along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
-    yield _Hill(bent, *straight, skin.scale * ridge)
+    yield _Hill(bent, 15.0, -22.0, skin.scale * ridge)
     place, facing = skin.local(first)
     middle = 0.5 * np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])
     shaft = skin.knob(first, -0.0018 * wide, 0.0095, 0.0075, at=(float(middle) / skin.scale, 0.0))
@@ -289,54 +307,16 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
     neck = skin.knob(first, -0.0014 * wide, 0.0090, 0.0085, at=(-0.021, 0.0))
     yield _Hill(bent, 10.0, 85.0, neck)
     pad = 0.0018 * bump(place[:, 0] - middle, 0.009) * bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7)
-    yield _Hill(_joint(f"{digit}_PIP_flexion"), 20.0, 100.0, skin.scale * pad * (place[:, 2] < 0.004))
+    yield _Hill(f"{digit}_PIP_flexion", 20.0, 100.0, skin.scale * pad * (place[:, 2] < 0.004))
 
 
-def _valleys(skin: _Skin) -> Iterator[_Hill]:
-    """Hollows between the knuckles of a fist, down to where the fingers part."""
-    for number in (1, 2, 3):
-        first, second = 1 + 3 * number, 4 + 3 * number
-        here = 0.5 * (skin.frames[first, :2, 3] + skin.frames[second, :2, 3])
-        parted = here + 0.45 * (0.5 * (skin.frames[first + 1, :2, 3] + skin.frames[second + 1, :2, 3]) - here)
-        along, aside = along_segment(skin.points[:, :2], here, parted)
-        hollow = -0.0042 * bump(aside, skin.scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
-        hollow *= 1.0 - 0.4 * along
-        yield _Hill(_joint(f"{_FINGERS[number]}_MCP_flexion"), 10.0, 85.0, skin.scale * hollow)
-
-
-def _thumb(skin: _Skin) -> Iterator[_Hill]:
-    """Its knuckles, its waist and pad, and the muscle that lies between it and the index when they close."""
-    yield _Hill(_joint("thumb_MCP_flexion"), 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
-    yield _Hill(_joint("thumb_IP_flexion"), 5.0, 70.0, skin.knob(3, 0.0020, 0.0060, 0.0065))
-    middle = 0.5 * float(np.linalg.norm(skin.frames[3, :3, 3] - skin.frames[2, :3, 3]))
-    yield _Hill(-1, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
-    yield _Hill(-1, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * skin.scale, 0.0075))
-    muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
-    yield _Hill(_joint("thumb_CMC_abduction"), 15.0, -25.0, muscle)
-
-
-def _palm(skin: _Skin) -> Iterator[_Hill]:
-    """The balls of thumb and little finger, and the hollow between them."""
-    for name, start, full, center, height, width in (
-        ("thumb_CMC_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
-        ("little_MCP_flexion", 10.0, 80.0, (0.035, -0.028), 0.0028, 0.0140),
-        ("ring_MCP_flexion", 10.0, 80.0, (0.055, -0.004), -0.0025, 0.0120),
-    ):
-        yield _Hill(_joint(name), start, full, skin.ball(center, height, width, back=False))
-
-
-def _ulna(skin: _Skin) -> Iterator[_Hill]:
-    """Its head, on the little finger's side of the wrist's back."""
-    yield _Hill(-1, 0.0, 1.0, skin.ball((-0.016, -0.021), 0.0040, 0.0085, back=True))
-
-
-_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's
-_DARKEST: Final = 0.12  # even the deepest folds receive some light
+_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
+_DARKEST: Final = 0.12  # share of the ambient light that the deepest folds receive
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnSkin:
-    """One hand in one pose, with the vertices that OpenGL needs."""
+    """One hand in one pose, with the vertices that textures and OpenGL need."""
 
     vertices: Float32[np.ndarray, "D 3"]
     """In the world [m]; vertices on borders of texture tiles are repeated for each tile."""
@@ -360,7 +340,7 @@ class PosableSkin:
         hand = surface.vertices[atlas.used]
         arm = forearm_rings(model.shape, self.forearm, hand[atlas.wrist], RINGS)
         end = arm[-1].mean(axis=0, keepdims=True)
-        self._elbow = ELBOW * model.shape.length  # behind the first ring, nearly the wrist
+        self._elbow = ELBOW * model.shape.length  # distance from the first ring to the elbow [m]
         self.rest: Float[np.ndarray, "U 3"] = np.concatenate([hand, arm.reshape(-1, 3), end])
         """Rest positions in the wrist's frame [m]: the hand, the forearm's rings, the middle of its end."""
         beyond = len(self.rest) - len(hand)
@@ -377,10 +357,8 @@ class PosableSkin:
         self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
         self._rest_occluded = self._rest_occlusion()
 
-    def forearm_line(
-        self, qpos: Float[np.ndarray, "27"]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """The elbow [m], and the unit direction to it from the wrist, in the world."""
+    def forearm_line(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
+        """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world."""
         middles = self._rings(self.rest).mean(axis=1)
         ahead = middles[-1] - middles[-2]
         ahead /= np.linalg.norm(ahead)
@@ -392,10 +370,8 @@ class PosableSkin:
         """The arm's rings (K, R, 3)."""
         return rest[skin_atlas().num_hand : -1].reshape(RINGS, -1, 3)
 
-    def posed(
-        self, qpos: Float[np.ndarray, "27"], upper_arm: Float[np.ndarray, "3"] | None = None
-    ) -> DrawnSkin:
-        """The skin in one pose; the arm is straight and short without an upper arm's direction."""
+    def posed(self, qpos: Doubles, upper_arm: Doubles | None = None) -> DrawnSkin:
+        """The skin in one pose; without the upper arm's direction (3,) the arm is straight and short."""
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
         shaped = self._flexion.shaped(self.rest, qpos[7:])
@@ -417,18 +393,14 @@ class PosableSkin:
             self._coarse_faces,
         )
 
-    def merged(
-        self, transforms: Float[np.ndarray, "1 L 4 4"], rest: Float[np.ndarray, "U 3"] | None = None
-    ) -> Float[np.ndarray, "U 3"]:
-        """Posed vertices of `rest`, or of its changed form, in the frame of the bones' transforms [m]."""
+    def merged(self, transforms: Doubles, rest: Doubles | None = None) -> Doubles:
+        """Vertices (U, 3), of `rest` or given, in a pose of the bones' transforms (1, L, 4, 4) [m]."""
         still = self.rest if rest is None else rest
-        points: Doubles = skin_frames(
-            still, self._bones, self._weights, self.model.rest_transforms, transforms
-        )[0]
-        return points
+        moved = skin_frames(still, self._bones, self._weights, self.model.rest_transforms, transforms)
+        return np.asarray(moved[0])
 
     def _rest_occlusion(self) -> Floats:
-        """Occlusion in the flat hand by capsules of the same flesh: a digit's other neighbors do shade it."""
+        """Occlusion of the flat hand; of a digit, only by itself and the palm, not by its neighbors."""
         normals = vertex_normals(self.rest, self.faces)
         occluded = self._occluded(self.model.rest_transforms[None], self.rest, normals)
         capsules, digits = self.model.capsules, np.array([bone.digit for bone in BONES])
@@ -438,28 +410,26 @@ class PosableSkin:
             share = (self._weights * (of_digit == digit)).sum(axis=1)
             mine = np.flatnonzero(share > 0.0)
             near = np.isin(digits[capsules.bones], (digit, digits[PALM]))
-            own = _occluded_share(
-                self.rest[mine], normals[mine], segments[near], capsules.radii[near] * _FLESH
-            )
+            radii = capsules.radii[near] * _FLESH
+            own = _occluded_share(self.rest[mine], normals[mine], segments[near], radii)
             occluded[mine] += share[mine].astype(np.float32) * (own - occluded[mine])
         return occluded
 
     def _occluded(self, transforms: Doubles, points: Doubles, normals: Doubles) -> Floats:
+        """Share (U,) of each vertex's hemisphere that the hand's capsules hide."""
         capsules = self.model.capsules
-        occluded: Floats = _occluded_share(
-            points, normals, capsules.posed(transforms)[0], capsules.radii * _FLESH
-        )
-        return occluded
+        segments = capsules.posed(transforms)[0]
+        return np.asarray(_occluded_share(points, normals, segments, capsules.radii * _FLESH))
 
 
 @functools.cache
 def face_parts() -> UInt8[np.ndarray, "F"]:
-    """Bone of each triangle of `DrawnSkin.faces`: the one with the largest share in it, or `FOREARM`."""
-    atlas, surface = skin_atlas(), HandModel.named("M").surface  # weights are the same for every hand
+    """Bone of each triangle of `DrawnSkin.faces`: the one with the largest weight in it, or `FOREARM`."""
+    atlas, surface = skin_atlas(), HandModel.named("M").surface  # all hands have the same weights
     shares = np.zeros((atlas.num_vertices, NUM_BONES + 1))
     rows = np.arange(atlas.num_hand)[:, None]
     shares[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
-    shares[atlas.num_hand :, FOREARM] = 1e3  # one vertex of the forearm makes a triangle the forearm's
+    shares[atlas.num_hand :, FOREARM] = 1e3  # a triangle with one vertex of the forearm is the forearm's
     parts: Bytes = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
     parts.setflags(write=False)
     return parts

@@ -1,8 +1,8 @@
 """Textures of skin and glove: colors, roughness and a fine relief, painted on a map of the anatomy.
 
 The anatomy at each texel is computed once per process, on a right hand of size M with its fingers straight.
-The relief is a normal map of nails, tendons, knuckles, creases and grain; depth and silhouettes stay as
-they are.
+The relief is a normal map of nails, tendons, knuckles, creases and grain; it changes neither depth nor
+silhouettes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from handsim.kernels import kernel
 from render.fields import along_segment, bump, noise, smooth
 from render.frames import Bytes, Doubles, Floats, Integers
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
-from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, skin_atlas
+from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, ring_vertices, skin_atlas
 
 if TYPE_CHECKING:
     from handsim.hand.shape import Side
@@ -44,24 +44,21 @@ _WRIST_LINES: Final = (-0.001, -0.009)  # across the palm's side of the wrist [m
 class DigitTexels(NamedTuple):
     """The texels (K,) of one digit."""
 
-    texels: Integers  # indices (K,) of the texture's N texels
+    texels: Integers  # indices of the texture's N texels
     along: Doubles  # distance from the digit's first joint [m]
-    angle: Doubles
-    """Angle about the digit from the middle of its back [rad], positive towards the thumb's side."""
+    angle: Doubles  # angle about the digit from the middle of its back [rad], positive towards the thumb
     share: Doubles  # share of the skin that moves with the digit
-    lengths: Doubles  # lengths of the three bones [m]
-    radius: float  # of the skin behind the tip [m]
+    joints: Doubles  # distances of the digit's other two joints and its tip from the first joint (3,) [m]
 
 
 class Texels(NamedTuple):
     """All N = width x height texels, row by row from the texture's top; unused ones repeat a used one."""
 
-    positions: Doubles  # on the reference hand's skin, in the wrist's frame [m] (N, 3)
+    positions: Doubles  # positions (N, 3) on the reference hand's skin, in the wrist's frame [m]
     normals: Doubles  # outward unit normals (N, 3)
     dorsal: Doubles  # from -1 in the middle of the palm or of a finger's pad to 1 on the back (N,)
     back: Doubles  # 1 on the back of the hand, 0 on the palm, smooth between (N,)
-    facing: Doubles
-    """From -1 to 1 likewise, before that: how far the skin faces the way of the back (N,)."""
+    facing: Doubles  # cosine between the skin's normal and the back's, of the hand or the digit (N,)
     palm: Doubles  # share of the skin that moves with the palm and no digit (N,)
     digits: tuple[DigitTexels, ...]
 
@@ -77,17 +74,25 @@ def skin_texels() -> Texels:
     rows = np.arange(atlas.num_hand)[:, None]
     weights[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
     weights[atlas.num_hand :, 0] = 1.0
-    backs = model.rest_transforms[:, :3, 2]
-    dorsal = np.einsum("vi,vi->v", normals, weights @ backs)
-    # The thumb's metacarpal is flesh of the palm: its skin is colored as the palm's
+    dorsal = np.einsum("vi,vi->v", normals, weights @ model.rest_transforms[:, :3, 2])
     values = np.concatenate([mesh.rest, normals, dorsal[:, None], weights], axis=1)
     grid = _spread(values)
     positions, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    digits = tuple(_digit_texels(model, digit, positions, weights) for digit in range(len(DIGITS)))
+    digits = []
+    for digit in range(len(DIGITS)):
+        first = 1 + 3 * digit
+        share = weights[:, first : first + 3].sum(axis=1)
+        mine = np.flatnonzero(share > 0.02)
+        frame = model.rest_transforms[first]
+        local = (positions[mine] - frame[:3, 3]) @ frame[:3, :3]
+        angle, joints = np.arctan2(local[:, 1], local[:, 2]), np.cumsum(model.shape.bone_lengths[digit])
+        digits.append(DigitTexels(mine, local[:, 0], angle, share[mine], joints))
     # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
     facing = np.maximum(dorsal, normals[:, 2])
-    return Texels(positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], digits)
+    return Texels(
+        positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], tuple(digits)
+    )
 
 
 def _spread(values: Doubles) -> Doubles:
@@ -101,17 +106,14 @@ def _spread(values: Doubles) -> Doubles:
     filler = np.repeat(tiles[-1:], rows * COLUMNS - len(tiles), axis=0)
     tiles = np.concatenate([tiles, filler]).reshape(rows, COLUMNS, TILE, TILE, -1)
     hand = tiles.swapaxes(1, 2).reshape(rows * TILE, width, -1)
-    around = len(atlas.wrist)
-    first = atlas.num_hand
-    rings = np.concatenate([atlas.wrist[None], first + np.arange(RINGS * around).reshape(RINGS, around)])
-    rings = np.concatenate([rings, rings[:, :1]], axis=1)
-    along, about = _between(RINGS + 1, ARM_ROWS), _between(around + 1, width)
+    along, about = _between(RINGS + 1, ARM_ROWS), _between(len(atlas.wrist) + 1, width)
+    rings = ring_vertices(atlas.wrist, atlas.num_hand)
     arm = np.einsum("ri,cj,ijn->rcn", along, about, values[rings], optimize=True)
     return np.concatenate([hand, arm]).reshape(width * height, -1)
 
 
 def _between(nodes: int, texels: int) -> Doubles:
-    """Matrix (texels, nodes) of linear interpolation between nodes, the outer texels on the outer nodes."""
+    """Matrix (texels, nodes) that interpolates linearly between nodes; the first and last are texels, too."""
     position = np.linspace(0.0, nodes - 1.0, texels)
     low = np.minimum(position.astype(int), nodes - 2)
     matrix = np.zeros((texels, nodes))
@@ -120,19 +122,8 @@ def _between(nodes: int, texels: int) -> Doubles:
     return matrix
 
 
-def _digit_texels(model: HandModel, digit: int, positions: Doubles, weights: Doubles) -> DigitTexels:
-    first = 1 + 3 * digit
-    share = weights[:, first : first + 3].sum(axis=1)
-    texels = np.flatnonzero(share > 0.02)
-    frame = model.rest_transforms[first]
-    local = (positions[texels] - frame[:3, 3]) @ frame[:3, :3]
-    angle = np.arctan2(local[:, 1], local[:, 2])
-    lengths = model.shape.bone_lengths[digit]
-    return DigitTexels(texels, local[:, 0], angle, share[texels], lengths, float(model.shape.radii[digit, 3]))
-
-
 def behind_wrist(forearm: Forearm) -> Doubles:
-    """How far behind the wrist each texel (N,) is along this forearm [m]; negative on the hand."""
+    """Distance (N,) of each texel behind the wrist along this forearm [m]; negative on the hand."""
     width, _ = skin_atlas().size
     behind = -skin_texels().positions[:, 0]
     along = _between(RINGS + 1, ARM_ROWS) @ arm_places(forearm, RINGS)
@@ -140,32 +131,17 @@ def behind_wrist(forearm: Forearm) -> Doubles:
     return behind
 
 
-@functools.cache
-def _palm_distances() -> tuple[Integers, Doubles]:
-    """Texels of the palm (K,), and the distance of each palm line from them (3, K) [m]."""
-    texels = skin_texels()
-    near = np.flatnonzero((texels.dorsal < 0.1) & (texels.positions[:, 0] > -0.02))
-    points = texels.positions[near, :2]
-    distances = np.full((len(_PALM_LINES), len(near)), np.inf)
-    for number, line in enumerate(_PALM_LINES):
-        knots = 1e-3 * np.array(line)
-        fine = np.linspace(0.0, len(knots) - 1.0, 10 * len(knots))
-        knots = np.stack([np.interp(fine, np.arange(len(knots)), knots[:, i]) for i in range(2)], axis=1)
-        knots = ndimage.gaussian_filter1d(knots, 4.0, axis=0, mode="nearest")
-        for a, b in itertools.pairwise(knots):
-            distances[number] = np.minimum(distances[number], along_segment(points, a, b)[1])
-    return near, distances
-
-
 def line_depth(rng: np.random.Generator) -> Floats:
-    """Depth of each texel (N,) in a palm line, finger crease or knuckle wrinkle; 1 for a deep line."""
-    near, palm_lines, depth = _lines_of_all()
-    depth = depth.copy()
+    """Depth (N,) of palm lines, finger creases and knuckle wrinkles at each texel; 1 for a deep line."""
+    near, palm_lines, wrist_lines = _lines_of_all()
+    depth = wrist_lines.copy()
     for line in palm_lines:
         depth[near] = np.maximum(depth[near], np.float32(rng.uniform(1.0, 1.5)) * line)
     for number, digit in enumerate(_digit_lines()):
         joints = digit.joints
-        waves = digit.wave(rng.uniform(0.0, 6.0))
+        phase = rng.uniform(0.0, 6.0)
+        waves = np.float32(0.0006 * np.cos(phase)) * digit.sine
+        waves += np.float32(0.0006 * np.sin(phase)) * digit.cosine
         # Palmar creases lie off the joints: Bugbee and Botte 1993, Clin. Orthop. Relat. Res. 296:122.
         creases = [(joints[0] - 0.0025, 1.0), (joints[0] + 0.0004, 0.5)]
         if number:
@@ -192,10 +168,10 @@ def _draw_line(
     texels: Integers,
     depth: Floats,
 ) -> None:
-    """Draw a line of this width [m] and depth across a digit.
+    """Draw a line of this position and width [m] across a digit into the `depth` (N,) of all texels.
 
-    `along` are the distances of its K texels from its first joint, `bent` how far the line is from its
-    position there [m], `share` factors on its depth; `depth` is that of all texels.
+    Of the digit's K texels, `along` is the distance from the first joint, `bent` the offset of the line
+    there [m], and `share` a factor on the line's strength.
     """
     for n in range(len(texels)):
         away = (along[n] - position - bent[n]) / width
@@ -205,22 +181,16 @@ def _draw_line(
 
 
 class _DigitLines(NamedTuple):
-    """The texels (K,) of a digit and where on it lines are drawn."""
+    """The K texels of a digit that lines are drawn on."""
 
     texels: Integers
     along: Floats  # distance from its first joint [m]
-    sine: Floats
-    cosine: Floats  # of three times the angle about it
-    arch: Floats  # how far wrinkles bow [m]
-    pad: Floats  # share of creases on the palm's side
-    back: Floats  # share of wrinkles on its back
-    joints: Doubles  # distance of its two other joints [m]
-
-    def wave(self, phase: float) -> Floats:
-        """How far a crease waves from its position (K,) [m]."""
-        wave: Floats = np.float32(0.0006 * np.cos(phase)) * self.sine
-        wave += np.float32(0.0006 * np.sin(phase)) * self.cosine
-        return wave
+    sine: Floats  # sine of three times the angle about it
+    cosine: Floats  # cosine of three times the angle about it
+    arch: Floats  # offset of curved wrinkles [m]
+    pad: Floats  # factor on the strength of creases, on the palm's side
+    back: Floats  # factor on the strength of wrinkles, on the back
+    joints: Doubles  # distances of its other joints [m]
 
 
 @functools.cache
@@ -238,7 +208,7 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
                 arch=(0.0015 * np.cos(digit.angle)).astype(np.float32),
                 pad=((1.0 - back) * digit.share).astype(np.float32),
                 back=on_back.astype(np.float32),
-                joints=np.cumsum(digit.lengths)[:2],
+                joints=digit.joints,
             )
         )
     return tuple(lines)
@@ -246,10 +216,19 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
 
 @functools.cache
 def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
-    """Texels of the palm (K,), its lines there (K,) each, and the depth (N,) of the wrist's lines."""
+    """Texels of the palm (K,), its lines' depths (K,) there, and the depth (N,) of the wrist's lines."""
     texels = skin_texels()
     back = texels.back
-    near, distances = _palm_distances()
+    near = np.flatnonzero((texels.dorsal < 0.1) & (texels.positions[:, 0] > -0.02))
+    points = texels.positions[near, :2]
+    distances = np.full((len(_PALM_LINES), len(near)), np.inf)
+    for number, line in enumerate(_PALM_LINES):
+        knots = 1e-3 * np.array(line)
+        fine = np.linspace(0.0, len(knots) - 1.0, 10 * len(knots))
+        knots = np.stack([np.interp(fine, np.arange(len(knots)), knots[:, i]) for i in range(2)], axis=1)
+        knots = ndimage.gaussian_filter1d(knots, 4.0, axis=0, mode="nearest")
+        for a, b in itertools.pairwise(knots):
+            distances[number] = np.minimum(distances[number], along_segment(points, a, b)[1])
     shares = np.zeros((len(texels.digits), len(back)))
     for share, digit in zip(shares, texels.digits, strict=True):
         share[digit.texels] = digit.share
@@ -261,29 +240,19 @@ def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
     return near, lines, depth.astype(np.float32)
 
 
-_STEEPEST: Final = 0.9  # height over distance
-
-
-class _TangentScales(NamedTuple):
-    """Scales (N,) from height differences of neighboring texels to gradients along the tangents [1/m]."""
-
-    across: Doubles  # scale of the difference along the row, for the first tangent
-    skew: Doubles  # share of the first gradient in the second tangent: tiles are not rectangles
-    down: Doubles  # scale of the difference along the column, for the second tangent
+_STEEPEST: Final = 0.9  # largest slope of the relief
 
 
 def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
     """Normal map in the tangent frame of pyrender's shader: along u, and normal x that."""
     width, rows = skin_atlas().size
     across, down = _differences(height.reshape(rows, width, 1))
-    scales = _tangent_scales()
-    first = scales.across * across.ravel()
-    second = scales.down * down.ravel() - scales.skew * first
-    if side == "left":
-        second = -second
-    tilt = np.stack([-first, -second], axis=1)
-    steep = np.linalg.norm(tilt, axis=1, keepdims=True)
-    tilt *= np.minimum(1.0, _STEEPEST / np.maximum(steep, 1e-12))
+    row_scale, skew, column_scale = _tangent_scales()
+    first = row_scale * across.ravel()
+    second = column_scale * down.ravel() - skew * first
+    tilt = np.stack([-first, second if side == "left" else -second], axis=1)
+    slope = np.linalg.norm(tilt, axis=1, keepdims=True)
+    tilt *= np.minimum(1.0, _STEEPEST / np.maximum(slope, 1e-12))
     normals = np.concatenate([tilt, np.ones((len(tilt), 1))], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     encoded: Bytes = np.rint(127.5 * (normals + 1.0)).astype(np.uint8)
@@ -291,7 +260,7 @@ def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _differences(grid: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Differences a texel to the right and down within each tile, one-sided on its border."""
+    """Differences per texel to the right and down within each tile, one-sided on its border."""
     rows, width, channels = grid.shape
     hand = rows - ARM_ROWS
     across, down = np.empty_like(grid), np.empty_like(grid)
@@ -307,7 +276,7 @@ def _differences(grid: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 def relief() -> Doubles:
     """Height (N,) [m] of the relief of every hand: tendons, knuckles, and hollows between them."""
     texels, shape = skin_texels(), named_shape("M")
-    back = smooth(texels.dorsal, -0.25, 0.35)  # of each digit; the thumb's faces sideways
+    back = smooth(texels.dorsal, -0.25, 0.35)  # the back of each digit, also of the thumb
     positions = texels.positions[:, :2]
     height = np.zeros(len(positions))
     knuckles = shape.knuckles[1:, :2]
@@ -320,16 +289,19 @@ def relief() -> Doubles:
         height -= 0.0004 * bump(np.linalg.norm(positions - hollow, axis=1), 0.0055)
     height *= back * texels.palm
     for digit in texels.digits:
-        for joint, high, wide in zip(
-            np.cumsum(digit.lengths)[:2], (0.0005, 0.0003), (0.006, 0.0045), strict=True
-        ):
+        for joint, high, wide in zip(digit.joints, (0.0005, 0.0003), (0.006, 0.0045), strict=False):
             knob = high * bump(digit.along - joint, wide) * bump(digit.angle, 1.0)
             height[digit.texels] += knob * back[digit.texels] * digit.share
     return height
 
 
 @functools.cache
-def _tangent_scales() -> _TangentScales:
+def _tangent_scales() -> tuple[Doubles, Doubles, Doubles]:
+    """Factors (N,) that turn height differences between texels into slopes along the tangents.
+
+    They are the factor of differences along rows [1/m], the share of the first slope in the second one (tiles
+    are not rectangles), and the factor of differences along columns [1/m].
+    """
     width, rows = skin_atlas().size
     texels = skin_texels()
     along_row, along_column = (
@@ -342,19 +314,19 @@ def _tangent_scales() -> _TangentScales:
     second = np.cross(normals, first)
     aside, ahead = (along_column * first).sum(axis=1), (along_column * second).sum(axis=1)
     ahead = np.where(np.abs(ahead) < 2e-5, np.copysign(2e-5, ahead), ahead)
-    return _TangentScales(1.0 / length, aside / ahead, 1.0 / ahead)
+    return 1.0 / length, aside / ahead, 1.0 / ahead
 
 
-_SHADED: Final = 0.006  # [m] of skin before a sleeve that lie in its shadow
-_SHADE: Final = 0.4  # of the lightness that is missing in it
-_FOLD: Final = 0.002  # [m] high folds of a sleeve
-_CREASE: Final = (-0.012, 0.035)  # [m] behind the wrist, where the palm's skin ends
-_VEIN: Final = 0.0017  # [m] half as wide as a vein
-_UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
-_GRAIN: Final = 4.5e-5  # [m] of the skin's own relief, which breaks its gloss: furrows are 20 to 100 um deep
-_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # [m]
-_MATT_GRAIN: Final = np.float32(0.05)  # of the roughness: ridges are drier than furrows
-_INNER_ARM: Final = 0.8  # pigment of the inner forearm, where the back of the hand has 1
+_SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
+_SHADE: Final = 0.4  # share of the lightness that this shadow takes
+_FOLD: Final = 0.002  # height of a sleeve's folds [m]
+_CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
+_VEIN: Final = 0.0017  # half width of a vein [m]
+_UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
+_GRAIN: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
+_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # lengths of its waves [m]
+_MATT_GRAIN: Final = np.float32(0.05)  # additional roughness of its ridges, which are drier than furrows
+_INNER_ARM: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
 
 
 class SkinTexture(NamedTuple):
@@ -367,27 +339,11 @@ class SkinTexture(NamedTuple):
 
 
 class _Paint(NamedTuple):
-    """Color, roughness and height of each texel; all three are written."""
+    """Color, roughness and height of each texel, to be painted on."""
 
-    lab: Floats  # CIELAB
+    lab: Floats  # CIELAB (N, 3)
     roughness: Floats
     height: Floats  # height of the relief (N,) [m]
-
-
-class _Blood(NamedTuple):
-    """What blood in the skin adds to CIELAB (N, 3) at a flush of 1."""
-
-    fixed: Floats
-    knuckles: Floats  # where knuckles are darker (N,), which depends on the skin
-
-
-class _Nail(NamedTuple):
-    """The texels (K,) of a nail and its fold."""
-
-    texels: Integers
-    plate: Floats  # share of the nail (K,)
-    fold: Floats  # depth of the fold around it (K,)
-    moon: Floats  # what its moon and its free edge add to CIELAB (K, 3)
 
 
 def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side = "right") -> SkinTexture:
@@ -412,9 +368,9 @@ def _painted(
     bare = np.array([look.palm_lightness, 15.0, 16.0])
     whole = np.array([look.lightness, look.redness, look.yellowness])
     lab = bare.astype(np.float32) + pigment[:, None] * (whole - bare).astype(np.float32)
-    blood = _blood()
-    lab += np.float32(look.flush) * blood.fixed
-    lab[:, 0] += np.float32(look.flush * (-1.5 - 0.06 * max(0.0, 60.0 - look.lightness))) * blood.knuckles
+    blood, knuckles = _blood()
+    lab += np.float32(look.flush) * blood
+    lab[:, 0] += np.float32(look.flush * (-1.5 - 0.06 * max(0.0, 60.0 - look.lightness))) * knuckles
     veins = _veins(rng)
     _add(lab, look.veins * veins, (-1.6, -1.6, -2.2))
     blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
@@ -438,7 +394,7 @@ def _painted(
 
 
 def _add(lab: Floats, share: NDArray[Any], color: tuple[float, float, float]) -> None:
-    """Add a share (N,) of a color to each texel's (N, 3)."""
+    """Add a color to that of each texel (N, 3), times a factor (N,)."""
     for channel, value in enumerate(color):
         lab[:, channel] += np.float32(value) * share
 
@@ -450,13 +406,13 @@ def lab_to_srgb(lab: NDArray[Any]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 @functools.cache
-def _blood() -> _Blood:
-    """Blood in the finger tips, knuckles and balls of the hand; knuckles are darker, too."""
+def _blood() -> tuple[Floats, Floats]:
+    """The color that blood adds to CIELAB (N, 3) at a flush of 1, and the darkness of knuckles (N,)."""
     texels = skin_texels()
     back = texels.back
     lab, knuckles = np.zeros((len(back), 3)), np.zeros(len(back))
     for number, digit in enumerate(texels.digits):
-        first, middle, end = np.cumsum(digit.lengths)
+        first, middle, end = digit.joints
         mine = digit.texels
         tips = smooth(digit.along, middle, end) * digit.share
         lab[mine] += tips[:, None] * [-1.0, 4.0, 0.0]
@@ -473,11 +429,11 @@ def _blood() -> _Blood:
     balls = np.exp(-(((x - 88.0) / 9.0) ** 2)) * palm
     balls += np.exp(-(((x - 35.0) / 22.0) ** 2) - (((y + 30.0) / 11.0) ** 2)) * palm
     lab += balls[:, None] * [-0.5, 2.2, 0.0]
-    return _Blood(lab.astype(np.float32), knuckles.astype(np.float32))
+    return lab.astype(np.float32), knuckles.astype(np.float32)
 
 
 def _veins(rng: np.random.Generator) -> Floats:
-    """Visibility of veins at each texel (N,): three of them wind along the back of hand and forearm."""
+    """Visibility (N,) of three veins that wind along the back of hand and forearm."""
     near, x, y, back = _vein_texels()
     veins = np.zeros(len(skin_texels().back), dtype=np.float32)
     for start in (0.016, -0.004, -0.022):
@@ -492,7 +448,7 @@ def _veins(rng: np.random.Generator) -> Floats:
 
 @functools.cache
 def _vein_texels() -> tuple[Integers, Floats, Floats, Floats]:
-    """Texels (K,) that may have veins, their x and y [m] and how far they are on the back (K,)."""
+    """Texels (K,) that may have veins, their x and y [m], and their share of the back (K,)."""
     texels = skin_texels()
     x, y, back = (values.astype(np.float32) for values in (*texels.positions[:, :2].T, texels.back))
     near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
@@ -500,11 +456,14 @@ def _vein_texels() -> tuple[Integers, Floats, Floats, Floats]:
 
 
 @functools.cache
-def _nails() -> tuple[_Nail, ...]:
-    """The nails: where they are, and what does not depend on the skin."""
+def _nails() -> tuple[tuple[Integers, Floats, Floats, Floats], ...]:
+    """The texels (K,) of each nail, and there its plate (K,), its fold (K,), and its moon's color (K, 3).
+
+    Plate and fold are from 0 to 1. The color is added to CIELAB and includes that of the free edge.
+    """
     nails = []
     for number, digit in enumerate(skin_texels().digits):
-        joint, tip = np.cumsum(digit.lengths)[1:]
+        joint, tip = digit.joints[1:]
         start, end = joint + 0.34 * (tip - joint), tip - 0.0012
         middle, half = 0.5 * (start + end), 0.5 * (end - start)
         wide = 1.0 if number else 1.12
@@ -517,13 +476,13 @@ def _nails() -> tuple[_Nail, ...]:
         moon = (bump(a + 1.0, 0.42) * bump(b, 0.55))[:, None] * [4.0, -4.0, -1.0]
         moon += smooth(a, 0.72, 0.86)[:, None] * [8.0, -7.0, 1.0]
         near = np.flatnonzero((plate > 0.0) | (fold > 1e-4))
-        parts = (part[near].astype(np.float32) for part in (plate, fold, moon))
-        nails.append(_Nail(digit.texels[near], *parts))
+        parts = [part[near].astype(np.float32) for part in (plate, fold, moon)]
+        nails.append((digit.texels[near], parts[0], parts[1], parts[2]))
     return tuple(nails)
 
 
 def _paint_nails(paint: _Paint, look: SkinLook) -> None:
-    """Nail plates: pinker and smoother than the skin, a pale moon, a whiter free edge, and a dark fold."""
+    """Paint nails: plates pinker and smoother than the skin, pale moons, whiter free edges, dark folds."""
     bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.6, 0.5, 0.6]
     bed += np.array([68.0, 12.0, 13.0]) * [0.4, 0.5, 0.4]  # beds hold little pigment, as palms do
     for mine, plate, fold, moon in _nails():
@@ -539,7 +498,7 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
 
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
-    """Cloth from some way behind the wrist on, with folds as darker and lighter bands."""
+    """Paint a sleeve over the forearm, with folds as darker and lighter bands."""
     behind = behind_wrist(forearm).astype(np.float32) - np.float32(forearm.sleeve)
     cloth = smooth(behind, 0.0, CUFF)
     color = cv2.cvtColor(np.array([[forearm.sleeve_color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
@@ -554,7 +513,7 @@ def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
 
 
 GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
-"""Of an average glove, sRGB in [0, 1]."""
+"""Color of an average glove, sRGB in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True)

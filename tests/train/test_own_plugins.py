@@ -17,7 +17,7 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from poses.shapes import load_sampler
 from train import Dataset, load_labeler
-from train.data.batches import own_cloud
+from train.data.batches import draw_cloud
 
 SOURCE = '''
 import numpy as np
@@ -154,7 +154,7 @@ def test_a_run_learns_from_the_corruption_and_is_not_continued_with_another(data
 
 def test_clouds_are_what_the_corruption_returns(folder):
     markers = np.random.default_rng(0).uniform(-0.1, 0.1, (6, 5, 3))
-    cloud = own_cloud("own_ideas:half", markers, rng=np.random.default_rng(1))
+    cloud = draw_cloud("own_ideas:half", markers, rng=np.random.default_rng(1))
     assert cloud.points.shape == (6, 3, 3) and cloud.present.all()
     for points, truth, row in zip(cloud.points, cloud.truth, markers, strict=True):
         assert sorted(truth) == [-1, 1, 3]
@@ -175,7 +175,7 @@ def test_clouds_are_what_the_corruption_returns(folder):
 )
 def test_corruptions_that_fail_are_told(folder, name, message):
     with pytest.raises(HandSimError, match=message):
-        own_cloud(f"own_ideas:{name}", np.full((2, 5, 3), 0.05), rng=np.random.default_rng(0))
+        draw_cloud(f"own_ideas:{name}", np.full((2, 5, 3), 0.05), rng=np.random.default_rng(0))
 
 
 def test_a_labeler_of_ones_own(folder):

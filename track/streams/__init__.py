@@ -1,14 +1,32 @@
-"""Live streams of points, and the addresses of the command line: `scheme://host:port?option=value`."""
+"""Live streams of points: their addresses `scheme://host:port?option=value`, and the settings of a replay."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from handsim.errors import ArgumentError, choices
+from handsim.settings import Limits, Settings
 
 LOOPBACK: Final = "127.0.0.1"
+COMMAND_PORT: Final = 1510
+"""NatNet's port for commands."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySettings(Settings):
+    """How a capture is played: keyword arguments of `ReplayServer`, and options of `handsim replay`."""
+
+    loop: bool = False
+    """Start again at the end, with later numbers and times, and with points of new IDs."""
+    rate: Annotated[float | None, Limits(0.0, above=True)] = None
+    """Frames per second [Hz]; the capture's own when not given."""
+    host: str = LOOPBACK
+    """Address of this machine to listen at; other machines do not reach the default."""
+    port: Annotated[int, Limits(0, 65535)] = 0
+    """UDP port to listen at; 0 takes a free one."""
 
 
 class NetworkAddress(NamedTuple):

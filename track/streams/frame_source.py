@@ -1,4 +1,4 @@
-"""Frames of points, and what delivers them: a capture, or a source that runs in a thread of its own."""
+"""Sources of frames: the user's own protocol, and the threads and queues that read them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from track.frames import LATEST_TIME, StreamedFrame
 LEAVE: Final = 1.0
 """Time for a source to end after `close` [s]."""
 _MOST_WAITING: Final = 1 << 14  # frames that may wait for a reader
-_WAITING: Final = 256  # frames that may wait of a source that is faster than its times; it waits after that
+_WAITING: Final = 256  # waiting frames after which a source that is not live is made to wait
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
-_FEWEST_PACE: Final = 5  # of them
-_SAME_PACE: Final = 1.0  # [s], the longest step of their times, beyond which it begins anew
-_FASTER: Final = 1.5  # times as fast as its frames' times, from which a source is not live
+_FEWEST_PACE: Final = 5  # frames that the pace needs
+_SAME_PACE: Final = 1.0  # [s], the longest step in time within one pace
+_FASTER: Final = 1.5  # a source that is so many times as fast as its frames' times is not live
 _SHORT: Final = 0.01  # [s] by which any source may be ahead
-_MOST_ID: Final = 1 << 31  # as takes store them
+_MOST_ID: Final = 1 << 31  # IDs of takes are smaller
 
 
 class FrameSource(Protocol):
@@ -48,7 +48,7 @@ class FrameSource(Protocol):
 
 
 class ArrivingFrames(ABC):
-    """Frames as they arrive, in any order; those that wait for too long for a reader are left out."""
+    """Frames as they arrive, in any order; the oldest are left out when too many wait."""
 
     is_live = True
     """Whether frames come at their own pace, however slow their reader is."""
@@ -62,7 +62,7 @@ class ArrivingFrames(ABC):
 
     @property
     def counts(self) -> dict[str, int]:
-        """What became of other packets so far, by name."""
+        """Numbers of packets that were left out, by name."""
         return {}
 
     @property
@@ -72,15 +72,15 @@ class ArrivingFrames(ABC):
 
     @abstractmethod
     def poll(self, seconds: float) -> list[StreamedFrame]:
-        """Wait for a frame, so long at most [s]; returns all that have arrived."""
+        """Return the frames that have arrived; wait up to `seconds` for one."""
 
     @abstractmethod
     def end(self) -> None:
-        """No frame is wanted but those that have arrived."""
+        """Take no frame that arrives from now on."""
 
     @abstractmethod
     def close(self) -> None:
-        """No frame is wanted."""
+        """End the source; no frame is wanted any more."""
 
     def _add(self, frame: StreamedFrame) -> None:
         self._arrived.append(frame)
@@ -96,15 +96,7 @@ class ArrivingFrames(ABC):
 class SourceStream(ArrivingFrames):
     """The checked frames of a source, which is iterated in a thread of its own.
 
-    A source that is faster than the times of its frames is made to wait.
-
-    Args:
-        source: Delivers the frames.
-        name: What messages call it.
-        waits: Whether it may be made to wait; a system that measures goes on.
-
-    Raises:
-        ArgumentError: The source is not a `FrameSource`.
+    With `waits`, a source that is faster than the times of its frames is made to wait.
     """
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
@@ -128,7 +120,7 @@ class SourceStream(ArrivingFrames):
             return (self._read_all or self._closed) and not self._arrived
 
     def poll(self, seconds: float) -> list[StreamedFrame]:
-        """Wait for a frame, so long at most [s]; returns all that have arrived."""
+        """Return the frames that have arrived; wait up to `seconds` for one."""
         with self._changed:
             self._changed.wait_for(lambda: self._arrived or self._read_all or self._closed, seconds)
             self._changed.notify_all()
@@ -141,7 +133,7 @@ class SourceStream(ArrivingFrames):
         self._ended = True
         try:
             self._source.close()
-        except Exception as error:  # of the user's code: any; what came before is kept
+        except Exception as error:  # the user's code may raise anything; earlier frames are kept
             warnings.warn(
                 f"{self._name}: close failed ({type(error).__name__}: {error})", HandSimWarning, stacklevel=3
             )
@@ -152,16 +144,16 @@ class SourceStream(ArrivingFrames):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._thread.join(LEAVE)  # a source that does not listen ends with the process
+        self._thread.join(LEAVE)  # a source that does not end now ends with the process
 
     def _read(self) -> None:
-        """Take every frame as it arrives."""
+        """Take frames from the source until it ends or is closed."""
         try:
             for frame in self._source:
                 if self._ended or not self._put(_checked(frame)):
                     break
-        except Exception as error:  # of the user's code: any
-            if not self._ended:  # one that is closed while it waits may fail
+        except Exception as error:  # the user's code may raise anything
+            if not self._ended:  # a source that is closed while it waits may fail
                 self.error = CaptureError(
                     f"{self._name}: the stream failed ({type(error).__name__}: {error})"
                 )
@@ -171,7 +163,7 @@ class SourceStream(ArrivingFrames):
             self._changed.notify_all()
 
     def _put(self, frame: StreamedFrame) -> bool:
-        """Let a frame wait for the reader; returns whether the reader is still there."""
+        """Queue a frame for the reader; returns whether the reader still listens."""
         with self._changed:
             while len(self._arrived) >= _WAITING and not self.is_live and not self._closed:
                 self._changed.wait()
@@ -180,7 +172,7 @@ class SourceStream(ArrivingFrames):
             if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
                 self._pace.clear()
             self._pace.append(frame)
-            if self._waits and len(self._pace) >= _FEWEST_PACE:  # after a restart it is as before until then
+            if self._waits and len(self._pace) >= _FEWEST_PACE:
                 first, last = self._pace[0], self._pace[-1]
                 span = last.arrived - first.arrived
                 self.is_live = last.time - first.time <= _FASTER * span + _SHORT
@@ -190,7 +182,7 @@ class SourceStream(ArrivingFrames):
 
 
 def _checked(frame: StreamedFrame) -> StreamedFrame:
-    """The frame with arrays of the right types, without points that are missing."""
+    """A frame with arrays of the right types and without missing points; `ArgumentError` if it is invalid."""
     if not isinstance(frame, StreamedFrame):
         raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
     points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)

@@ -1,17 +1,16 @@
-"""Live streams as a tracker takes them: in order, on a clock that never goes back, and now.
+"""Live streams as a tracker takes them: in order, on a clock that never goes back, without old frames.
 
-Order. Every frame that arrived goes on once, in order; the rest is counted. A frame that continues the stream
-goes on at once. Only behind a gap in the numbers frames are held, until the gap is closed, eight frames are
-held, or their time is up: 30 ms, or five frames of a slower stream; a tenth of a second where others were
-out of order in the last ten seconds. What is then still missing is counted.
+Each frame that arrives is passed on once, in order, or counted. A frame that continues the stream is passed
+on at once. Behind a gap in the numbers frames are held until the gap is closed, eight frames are held, or
+30 ms have passed (five intervals of a slower stream; 0.1 s if frames were out of order in the last ten
+seconds).
 
-A frame continues the stream when its time and its number go on by no more than they explain each other, and
-its time by no more than its arrival and sixteen frames explain. Any other frame is a jump, which is believed
-only when five frames in a row fit together, as those of a recording or a server that starts again. Fewer are
-wild, and left out.
+A frame continues the stream if its steps in time and number agree, and its time is at most sixteen frames
+ahead of its arrival. Any other frame is a jump, which is believed only when five frames in a row fit
+together, as those of a recording or server that starts again. Fewer such frames are wild, and left out.
 
-Time. When the stream's time begins anew, it continues here. What the reader does not keep up with is dropped,
-oldest first, and counted.
+When the stream's time begins anew, it continues here. Frames that the reader is too slow for are dropped and
+counted, oldest first.
 """
 
 from __future__ import annotations
@@ -43,32 +42,32 @@ VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host
 GROUP: Final = "handsim.frame_sources"
 """Entry points of packages that bring frame sources."""
 MOST_LAG: Final = 0.03
-"""Time [s] for which a frame waits for a reader that was held up, before it is dropped."""
+"""Longest time that a frame waits for a reader that was held up [s]."""
 _SILENCE: Final = 2.0  # [s]
-_LEAST_LAG: Final = 0.01  # [s] for which it waits where the reader is too slow
-_TOO_SLOW: Final = 0.1  # [s] for which frames have waited all the time, from which the reader is too slow
-_FORGIVEN: Final = 2.0  # [s] of a lag that are forgiven, at most
+_LEAST_LAG: Final = 0.01  # [s], the longest time that a frame waits for a slow reader
+_TOO_SLOW: Final = 0.1  # [s]: a reader for which frames have waited so long without a break is slow
+_FORGIVEN: Final = 2.0  # [s], the largest lag that is forgiven
 _CATCHING_UP: Final = 1.0  # [s] per second by which a forgiven lag has to shrink
-_LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and its first, when it starts again
-_STOP: Final = 0.1  # [s] between two looks at whether the stream shall end
-_WINDOW: Final = 8  # frames that are held behind a gap, at most
-_REACH: Final = 16  # frames by which a stream may go on at once, beside what the arrival explains
-_LASTING: Final = 5  # frames in a row from which a jump is believed
+_LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and the first one of its repetition
+_STOP: Final = 0.1  # [s], the longest wait before `ended` is asked again
+_WINDOW: Final = 8  # most frames that are held behind a gap
+_REACH: Final = 16  # frames by which a frame's time may be ahead of its arrival
+_LASTING: Final = 5  # frames in a row that make a jump believed
 _WAIT: Final = 0.03  # [s] for which a frame is held behind a gap
-_WAIT_FRAMES: Final = 5  # or so many frames, if they take longer
-_LONGEST_WAIT: Final = 0.1  # [s], the most of either, and where frames come out of order
-_REMEMBERED: Final = 10.0  # [s] for which a stream that was out of order is taken to be so
-_OLD: Final = 1.0  # [s]: a frame that is older by more belongs to a recording that starts again
-_BURST: Final = 0.5  # [s] from the last frame, within which frames of the same recording may arrive late
-_GOES_ON: Final = 1.0  # [s] by which a jump that lasts may go on with the same recording
+_WAIT_FRAMES: Final = 5  # intervals for which it is held if they take longer
+_LONGEST_WAIT: Final = 0.1  # [s], the longest time behind a gap, and the time in a disordered stream
+_REMEMBERED: Final = 10.0  # [s] for which a stream counts as disordered
+_OLD: Final = 1.0  # [s]: frames that are older by more belong to a recording that starts again
+_BURST: Final = 0.5  # [s] after the last frame in which late frames of the same recording may arrive
+_GOES_ON: Final = 1.0  # [s], the longest jump within the same recording
 _FIRST_SLACK: Final = 0.05  # [s]: tolerance of a frame's time while the interval is unknown
 _FIRST_WAIT: Final = 0.1  # [s] for which the first frame is held
 _SLACK: Final = 0.001  # [s]: tolerance of time stamps beside half an interval
-_DRIFT: Final = 0.01  # by which two clocks may run at another pace
-_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
-_MOST_CHANGE: Final = 2.0  # factor by which an interval differs from the usual one, at most, as it counts
-_MOST_JUMPING: Final = 4 * _WINDOW  # frames of jumps that are held
-_RECENT: Final = 256  # frames among which one that comes twice is found
+_DRIFT: Final = 0.01  # largest relative difference between two clocks' rates
+_SMOOTHING: Final = 0.1  # weight of the newest interval in the mean
+_MOST_CHANGE: Final = 2.0  # largest ratio of a counted interval to the mean
+_MOST_JUMPING: Final = 4 * _WINDOW  # most frames of jumps that are held
+_RECENT: Final = 256  # frames among which doubled ones are found
 _STRIDES: Final = 16  # frames whose numbers show the server's step
 
 
@@ -81,7 +80,7 @@ class StreamSettings(Settings):
 
 
 def check_address(address: str) -> None:
-    """Refuse by an `ArgumentError` what is not an address of a stream; no server is asked."""
+    """Raise an `ArgumentError` unless it is an address of a stream; no server is asked."""
     check_type("address", address, str, f"one of {', '.join(VALID)}")
     scheme, _, rest = address.rpartition("://")
     name = rest.partition("?")[0]
@@ -166,8 +165,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self._frames, self._silence, self._ended = frames, silence, ended
         self._ahead = 0.0  # [s] of this time over the stream's
         self._last: StreamedFrame | None = None  # on this clock
-        self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, and since when [s]
-        self._kept_up = time.monotonic()  # [s], when the reader had to wait for a frame
+        self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, with times of arrival [s]
+        self._kept_up = time.monotonic()  # [s], when the reader last waited for a frame
         self._end_at = math.inf  # [s], when the stream was ended from here
         self._over = self._closed = self._failed = False
 
@@ -244,7 +243,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self._frames.close()
 
     def _line_up(self, seconds: float) -> None:
-        """Put what has arrived in order; wait for it, so long at most [s]."""
+        """Put the frames that have arrived in order; wait up to `seconds` for one."""
         if self._over or (self._ready and not self._frames.is_live):
             return
         for frame in self._frames.poll(min(max(seconds, 0.0), _STOP)):
@@ -256,7 +255,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self._ready.extend((one, now) for one in waited)
 
     def _drop_old(self) -> None:
-        """Leave out what has waited for too long while newer frames came."""
+        """Drop frames that have waited for too long while newer ones came."""
         if self._over or not self._frames.is_live:
             return
         now = time.monotonic()
@@ -270,7 +269,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
                 self._ready[0] = (dataclasses.replace(frame, restarted=True), waits_since)
 
     def _continue(self, frame: StreamedFrame) -> StreamedFrame:
-        """A frame on this clock, with the points that are in range."""
+        """A frame on this clock, with only the points in range."""
         now, last = frame.time + self._ahead, self._last
         if last is not None and (now <= last.time or frame.restarted):
             begin = last.time + max(_LOOP_GAP, frame.arrived - last.arrived)
@@ -294,31 +293,22 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
 
 
 class FrameOrder:
-    """Decides which frames go on, in which order, and counts what becomes of the others."""
+    """Passes frames on in order, and counts the others.
+
+    Frames are `received`, and then `passed` on (some of them `reordered`), `doubled`, too `late`, or `wild`:
+    with a time or number that the stream did not follow. `missed` frames never arrived, by the numbers of the
+    others; `restarts` are those of the stream's time.
+    """
 
     def __init__(self) -> None:
-        self.received = 0
-        """Number of frames that came."""
-        self.passed = 0
-        """Number of frames that went on."""
-        self.reordered = 0
-        """Number of those that came after one that they precede."""
-        self.doubled = 0
-        """Number of frames that came again."""
-        self.late = 0
-        """Number of frames that came too late to go on in order."""
-        self.wild = 0
-        """Number of frames with a time or a number that the stream did not follow."""
-        self.missed = 0
-        """Number of frames that never arrived, by the frame numbers."""
-        self.restarts = 0
-        """How often the time of the stream began anew."""
+        self.received = self.passed = self.reordered = self.doubled = 0
+        self.late = self.wild = self.missed = self.restarts = 0
         self._last: StreamedFrame | None = None
         self._first: StreamedFrame | None = None  # since the time began
-        self._held: list[StreamedFrame] = []  # behind a gap, by their times
-        self._jumping: dict[StreamedFrame, int] = {}  # as they came, and how many had gone on by then
-        self._in_a_row = 0  # of them
-        self._recent: dict[tuple[int, float], float] = {}  # number and time of those that went on: arrival
+        self._held: list[StreamedFrame] = []  # behind a gap, ordered by time
+        self._jumping: dict[StreamedFrame, int] = {}  # in order of arrival, with `passed` at that moment
+        self._in_a_row = 0  # jumping frames
+        self._recent: dict[tuple[int, float], float] = {}  # arrival by number and time
         self._strides: deque[int] = deque(maxlen=_STRIDES)
         self._interval: float | None = None  # [s] per frame number
         self._disordered = -math.inf  # [s], when a frame came out of order
@@ -329,7 +319,7 @@ class FrameOrder:
         return math.nan if self._interval is None else self._interval * self._stride
 
     def missing_at_end(self, end: float) -> int:
-        """How many frames could have been sent after the last one, until some time [s]; 0 for one or two."""
+        """Number of frames that could have been sent between the last one and `end` [s]; 0 for one or two."""
         if self._last is None or self._interval is None:
             return 0
         missing = math.floor((end - self._last.arrived) / self.interval)
@@ -337,7 +327,7 @@ class FrameOrder:
 
     @property
     def deadline(self) -> float:
-        """When `expire` is to be called [s]; infinite when nothing waits."""
+        """Time at which `expire` is to be called [s]; infinite while no frame is held."""
         if self._held:
             return min(frame.arrived for frame in self._held) + self._wait
         if self._last is None and self._jumping:
@@ -345,7 +335,7 @@ class FrameOrder:
         return math.inf
 
     def add(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
-        """The frames that go on now that another has arrived."""
+        """Take on a frame that arrived; returns the frames to pass on now."""
         self.received += 1
         last = self._last
         if not abs(frame.time) < LATEST_TIME:
@@ -358,7 +348,7 @@ class FrameOrder:
         elif last is not None and self._is_late(last, frame):
             self.late += 1
             if self._first is not None and frame.time > self._first.time:
-                self.missed -= self.missed > 0  # it was missing when others went on
+                self.missed -= self.missed > 0  # it was counted when later frames were passed on
             self._remember(frame)
             self._disordered = frame.arrived
         elif last is not None and self._is_next(last, frame):
@@ -369,7 +359,7 @@ class FrameOrder:
             yield from self._doubt(frame)
 
     def expire(self, now: float) -> Iterator[StreamedFrame]:
-        """The held frames whose time is up, because what they waited for did not come."""
+        """The held frames that have waited long enough for the missing ones."""
         if not self.deadline <= now:
             return
         if self._last is None:
@@ -380,7 +370,7 @@ class FrameOrder:
         yield from self._release()
 
     def end(self) -> Iterator[StreamedFrame]:
-        """All frames that are held; a jump that has not lasted is left out."""
+        """All frames that are held, without those of a short jump."""
         if self._last is None and self._jumping:
             yield from self._begin(self._largest_group())
         yield from self._flush()
@@ -388,7 +378,7 @@ class FrameOrder:
 
     @property
     def _wait(self) -> float:
-        """For how long a frame is held behind a gap [s]."""
+        """Time for which a frame is held behind a gap [s]."""
         newest = max(frame.arrived for frame in self._held)
         if newest - self._disordered < _REMEMBERED or self._interval is None:
             return _LONGEST_WAIT
@@ -396,38 +386,36 @@ class FrameOrder:
 
     @property
     def _stride(self) -> int:
-        """By how much numbers go on from frame to frame; some servers send every other frame only."""
+        """Step of the numbers from frame to frame; some servers send only every other frame."""
         return max(1, min(self._strides)) if len(self._strides) == _STRIDES else 1
 
     def _hold(self, frame: StreamedFrame) -> None:
-        """Put a frame among those that are held."""
+        """Add a frame to those that are held."""
         if self._held and frame.time < self._held[-1].time:
             self.reordered += 1
             self._disordered = frame.arrived
         bisect.insort(self._held, frame, key=lambda one: one.time)
 
     def _release(self) -> Iterator[StreamedFrame]:
-        """Pass on what nothing is missing before, or too much is held behind."""
+        """Pass on held frames until one is behind a gap and no more than the window are held."""
         while self._held and (len(self._held) > _WINDOW or not self._is_behind_gap()):
             yield self._pass(self._held.pop(0))
 
     def _flush(self) -> Iterator[StreamedFrame]:
-        """Pass on all that is held."""
+        """Pass on all held frames."""
         while self._held:
             yield self._pass(self._held.pop(0))
 
     def _is_behind_gap(self) -> bool:
-        """Whether a frame is missing before the first one that is held.
-
-        Where a later one has the number that it should have, its own number is wrong, not the order.
-        """
+        """Whether a frame is missing before the first one that is held."""
         last = self._last
         if last is None or not self._missing(last, self._held[0]):
             return False
+        # If a later frame has the expected number, the first one's number is wrong, and nothing is missing.
         return all(one.number - last.number > place for place, one in enumerate(self._held, start=1))
 
     def _pass(self, frame: StreamedFrame) -> StreamedFrame:
-        """Let a frame go on."""
+        """Count a frame that is passed on, and learn the interval from it."""
         last, self._last = self._last, frame
         self.passed += 1
         self._remember(frame)
@@ -444,7 +432,7 @@ class FrameOrder:
         return frame
 
     def _doubt(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
-        """Hold a frame that jumps, or believe it and those that it fits to."""
+        """Hold a frame that jumps, or pass its group on if the jump has lasted."""
         self._jumping[frame] = self.passed
         group = self._group_of(frame)
         self._in_a_row = min(self._in_a_row + 1, len(group))
@@ -454,7 +442,7 @@ class FrameOrder:
             self._leave_out_jumping(1)
 
     def _settle(self, last: StreamedFrame, frame: StreamedFrame) -> None:
-        """The stream goes on: of the frames that jump, those before this one were right."""
+        """Hold the jumping frames that the next frame of the stream confirms; leave out old ones."""
         self._in_a_row = 0
         right = [
             one for one in self._jumping if last.time < one.time < frame.time and self._continues(one, frame)
@@ -465,13 +453,13 @@ class FrameOrder:
         self._leave_out_jumping(sum(self.passed - passed > _WINDOW for passed in self._jumping.values()))
 
     def _leave_out_jumping(self, count: int) -> None:
-        """The oldest of the frames that jump were wild."""
+        """Count the oldest `count` jumping frames as wild."""
         self.wild += count
         for one in list(self._jumping)[:count]:
             del self._jumping[one]
 
     def _group_of(self, frame: StreamedFrame) -> list[StreamedFrame]:
-        """The frames that jump to the same place as one of them, as they came."""
+        """The jumping frames of the same recording as one of them, in order of arrival."""
         group = [one for one in self._jumping if one is frame or self._fit(one, frame)]
         ordered = _increasing(sorted(group, key=lambda one: one.time))
         return [one for one in group if one in ordered]
@@ -480,7 +468,7 @@ class FrameOrder:
         return max((self._group_of(one) for one in self._jumping), key=len)
 
     def _begin(self, group: list[StreamedFrame], *, restarted: bool | None = None) -> Iterator[StreamedFrame]:
-        """Go on with frames that jumped: with the same recording, or with another one."""
+        """Continue the stream with frames that jumped, of the same recording or of another one."""
         for one in group:
             self._jumping.pop(one, None)
         self._leave_out_jumping(len(self._jumping))
@@ -504,34 +492,34 @@ class FrameOrder:
         yield from self._release()
 
     def _is_again(self, new: StreamedFrame) -> bool:
-        """Whether a frame is one that came before."""
+        """Whether a frame came before."""
         key = new.number, new.time
         came = [one.arrived for one in (*self._held, *self._jumping) if (one.number, one.time) == key]
         came.append(self._recent.get(key, -math.inf))
         return any(abs(arrived - new.arrived) < _BURST for arrived in came)
 
     def _remember(self, frame: StreamedFrame) -> None:
-        """Know a frame that went on, or was too late, when it comes again."""
+        """Store a frame that was passed on or too late, to recognize it when it comes again."""
         self._recent[frame.number, frame.time] = frame.arrived
         if len(self._recent) > _RECENT:
             del self._recent[next(iter(self._recent))]
 
     def _is_late(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether a frame precedes one that has gone on."""
+        """Whether a frame precedes one that was passed on."""
         return -_OLD < new.time - last.time <= 0.0 and new.arrived - last.arrived < _BURST
 
     def _is_next(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether a frame follows the last one, or is one of those that are held behind a gap."""
+        """Whether a frame follows the last one, or fits to those that are held behind a gap."""
         if new.time <= last.time:
             return False
         return self._continues(last, new) or bool(self._held and self._fit(self._held[-1], new))
 
     def _continues(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether a frame follows another: time and number go on by no more than is explained."""
+        """Whether a frame follows another: its steps in time and number agree and are short enough."""
         return new.time - last.time <= self._reach(new.arrived - last.arrived) and self._agrees(last, new)
 
     def _fit(self, one: StreamedFrame, other: StreamedFrame) -> bool:
-        """Whether two frames are of the same recording, in any order."""
+        """Whether two frames in any order may be of the same recording."""
         first, second = sorted((one, other), key=lambda frame: frame.time)
         span, steps = second.time - first.time, second.number - first.number
         if not 0.0 < span <= self._reach(abs(one.arrived - other.arrived)):
@@ -540,12 +528,12 @@ class FrameOrder:
         return 0 <= steps <= rate * (span + _SLACK) + 1.0
 
     def _reach(self, waited: float) -> float:
-        """By how much a frame's time may go on that came so much later than another [s]."""
+        """Largest step in time of a frame that arrived `waited` seconds after another [s]."""
         ahead = _FIRST_SLACK if self._interval is None else (_REACH + 0.5) * self.interval + _SLACK
         return waited + ahead
 
     def _agrees(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether time and number go on by no more than they explain each other, or the arrival the time."""
+        """Whether the steps in time and number agree, or the step in time and that in arrival."""
         span, waited = new.time - last.time, new.arrived - last.arrived
         steps = new.number - last.number
         if self._interval is None:
@@ -554,10 +542,7 @@ class FrameOrder:
         return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
 
     def _goes_on(self, new: StreamedFrame) -> bool:
-        """Whether a jump that lasts goes on with the recording, of which frames are missing.
-
-        As many as could have been sent since the recording began, by when they arrived.
-        """
+        """Whether a lasting jump continues the recording, as far as the time since its start allows."""
         last, first = self._last, self._first
         if last is None or first is None:
             return True
@@ -567,7 +552,7 @@ class FrameOrder:
         return 0.0 < new.time - last.time <= _GOES_ON or self._agrees(last, new)
 
     def _missing(self, last: StreamedFrame, new: StreamedFrame) -> int:
-        """The number of frames between two, as far as their times agree with their numbers."""
+        """Number of frames missing between two, as far as their times agree with their numbers."""
         steps = new.number - last.number
         if self._interval is not None:
             steps = min(steps, round(1.5 * (new.time - last.time) / self._interval))
@@ -575,7 +560,7 @@ class FrameOrder:
 
 
 def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
-    """As many of some frames, by their times, as have numbers that do not go back."""
+    """The longest chain of frames, ordered by time, whose numbers do not decrease."""
     longest: list[list[StreamedFrame]] = []
     for frame in ordered:
         before = [chain for chain in longest if chain[-1].number <= frame.number]
@@ -584,7 +569,7 @@ def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
 
 
 def _usual_interval(ordered: list[StreamedFrame]) -> float | None:
-    """Time per number of frames in order [s]; None where their numbers do not go on."""
+    """Median time per frame number [s]; None where the numbers do not increase."""
     intervals = [
         (second.time - first.time) / (second.number - first.number)
         for first, second in pairwise(ordered)

@@ -1,8 +1,7 @@
 """NatNet, the protocol in which OptiTrack servers (Motive) stream markers: packets, a client and a server.
 
-Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. A
-tracker needs a frame's list of markers with IDs, which holds labeled and unlabeled ones; all other sections
-are skipped. Every count is checked against the number of remaining bytes before it is used.
+Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Of a
+frame only the lists of markers are read. Every count is checked against the remaining bytes before use.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import time
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,20 +28,18 @@ from gloves.optics.reconstruction import number_runs
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
-from handsim.settings import Limits, Settings
 from track.frames import StreamedFrame, read_points
-from track.streams import LOOPBACK, split_address
+from track.streams import COMMAND_PORT, ReplaySettings, split_address
 from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
-COMMAND_PORT: Final = 1510
 LARGEST: Final = 65507  # bytes of a UDP datagram
 OLDEST: Final[Version] = (3, 0)
 NEWEST: Final[Version] = (4, 1)
-"""The newest known layout; servers are asked for it."""
+"""The newest known layout, which servers are asked for."""
 _SIZED: Final[Version] = (4, 1)
-"""The first version whose sections have a size, and with assets and a finer clock."""
-_LOST: Final = 9e6  # [m]: a lost marker is sent as a point beyond
+"""The first version with sizes of sections, assets and a finer clock."""
+_LOST: Final = 9e6  # [m]: Motive sends lost markers farther away than this
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
 _NAME: Final = 256  # bytes of a program's name
 _BODY: Final = 38  # bytes of a rigid body: ID, position, orientation, error, flags
@@ -56,22 +53,22 @@ _MARKER: Final = np.dtype(
 )
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
-_KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
-_ATTENDED: Final = 0.1  # [s] between two looks at whether the reader is busy and packets wait for it
-_BUFFER: Final = 1 << 22  # bytes of frames that may wait in the socket
+_KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets
+_ATTENDED: Final = 0.1  # [s] without a read, after which the thread empties the socket
+_BUFFER: Final = 1 << 22  # bytes of the socket's receive buffer
 _STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
 _STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
-_LONGEST_STAY: Final = 60.0  # [s] in the socket; more is a clock that was set
+_LONGEST_STAY: Final = 60.0  # [s] in the socket; a longer stay means that the clock was set
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
-_MOST_POINTS: Final = 1500  # in a datagram
+_MOST_POINTS: Final = 1500  # points that fit into a datagram
 _MOST_CLIENTS: Final = 8
-_CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet from a client
-_WAIT: Final = 0.05  # [s] for a client's packet, after which the end is looked at
-_NUMBERS: Final = 1 << 31  # of frames and of IDs in a packet
+_CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet, after which a client is gone
+_WAIT: Final = 0.05  # [s], the longest wait for a client's packet
+_NUMBERS: Final = 1 << 31  # frame numbers and IDs wrap around here
 
 
 class Kind(IntEnum):
-    """Kinds of packets that are used here."""
+    """The used kinds of packets."""
 
     CONNECT = 0
     SERVER_INFO = 1
@@ -90,10 +87,10 @@ class ServerInfo:
 
     application: str
     version: Version
-    """Its NatNet version."""
+    """NatNet version of its packets."""
     data_port: int
     group: str | None
-    """Multicast address of its frames; None if it sends them to each client."""
+    """Multicast address of its frames; None with unicast."""
 
 
 def pack(kind: Kind, payload: bytes = b"") -> bytes:
@@ -120,7 +117,7 @@ def pack_connect() -> bytes:
 
 
 def pack_server_info(info: ServerInfo) -> bytes:
-    """A server's answer to it; its clock has a million ticks per second."""
+    """A server's description of itself; its clock has a million ticks per second."""
     group = bytes(int(part) for part in info.group.split(".")) if info.group else bytes(4)
     name = info.application.encode()[: _NAME - 1].ljust(_NAME, b"\0")
     versions = bytes((1, 0, 0, 0, *info.version, 0, 0))
@@ -129,11 +126,7 @@ def pack_server_info(info: ServerInfo) -> bytes:
 
 
 def parse_server_info(payload: bytes) -> ServerInfo:
-    """Read a server's answer.
-
-    Raises:
-        DamagedPacket: It is truncated.
-    """
+    """Read a server's description of itself."""
     reader = _Reader(payload)
     application = reader.take(_NAME).split(b"\0")[0].decode(errors="replace")
     reader.take(4)
@@ -145,7 +138,7 @@ def parse_server_info(payload: bytes) -> ServerInfo:
 
 
 def pack_frame(frame: StreamedFrame, version: Version) -> bytes:
-    """A packet with the markers of a frame: those with IDs in the labeled list, all in the older one."""
+    """Pack a frame: markers with IDs into the list of labeled markers, all points into the older list."""
     known = frame.ids >= 0
     markers = np.zeros(int(known.sum()), dtype=_MARKER)
     markers["id"], markers["position"] = frame.ids[known], frame.points[known]
@@ -165,31 +158,31 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> StreamedFrame:
-    """Read the observed markers of a frame; markers that the server filled in are left out."""
-    reader, sized = _Reader(payload), version >= _SIZED
-    number = reader.integer()
-    for _ in range(reader.section(5, sized)):  # marker sets: names, and markers once more
-        reader.skip_text()
-        reader.skip(12, reader.count(12))
-    older = np.frombuffer(reader.take(12 * reader.section(12, sized)), dtype="<f4").reshape(-1, 3)
-    reader.skip(_BODY, reader.section(_BODY, sized))
-    for _ in range(reader.section(8, sized)):  # skeletons
-        reader.integer()
-        reader.skip(_BODY, reader.count(_BODY))
-    for _ in range(reader.section(12, sized) if sized else 0):  # assets
-        reader.integer()
-        reader.skip(_BODY, reader.count(_BODY))
-        reader.skip(_MARKER.itemsize, reader.count(_MARKER.itemsize))
+    """Read the observed markers of a frame, without those that the server filled in."""
+    reader, extra = _Reader(payload), 4 if version >= _SIZED else 0
     size = _MARKER.itemsize
-    markers = np.frombuffer(reader.take(size * reader.section(size, sized)), dtype=_MARKER)
+    number = reader.integer()
+    for _ in range(reader.count(5, extra)):  # marker sets: names, and markers once more
+        reader.skip_text()
+        reader.items(12)
+    older = np.frombuffer(reader.items(12, extra), dtype="<f4").reshape(-1, 3)
+    reader.items(_BODY, extra)
+    for _ in range(reader.count(8, extra)):  # skeletons
+        reader.integer()
+        reader.items(_BODY)
+    for _ in range(reader.count(12, extra) if extra else 0):  # assets
+        reader.integer()
+        reader.items(_BODY)
+        reader.items(size)
+    markers = np.frombuffer(reader.items(size, extra), dtype=_MARKER)
     for _ in range(2):  # force plates, other devices
-        for _ in range(reader.section(8, sized)):
+        for _ in range(reader.count(8, extra)):
             reader.integer()
             for _ in range(reader.count(4)):
-                reader.skip(4, reader.count(4))
+                reader.items(4)
     reader.take(8)  # time code
     (time,) = struct.unpack("<d", reader.take(8))
-    reader.take(24 + (8 if sized else 0) + 2)  # clocks, flags
+    reader.take(24 + 2 * extra + 2)  # clocks, flags
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
     points, ids = _seen(markers, older)
@@ -199,7 +192,7 @@ def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> St
 def _seen(
     markers: NDArray[np.void], older: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (N, 3) [m] and IDs (N,), each once: the older list repeats points, two assets may share one."""
+    """Points (N, 3) [m] and IDs (N,), without repetitions: both lists and two assets may hold one point."""
     filled_in = (markers["flags"] & _OCCLUDED != 0) | (markers["flags"] & (_SEEN | _FILLED) == _FILLED)
     points = np.concatenate([markers["position"], older])
     ids = np.concatenate([markers["id"], np.full(len(older), -1)]).astype(np.int64)
@@ -213,7 +206,7 @@ def _seen(
 
 
 class _Reader:
-    """Reads values from bytes, never beyond their end."""
+    """Reads values from bytes; `DamagedPacket` beyond their end."""
 
     def __init__(self, content: bytes) -> None:
         self._content, self._at = content, 0
@@ -232,20 +225,17 @@ class _Reader:
         number: int = struct.unpack("<i", self.take(4))[0]
         return number
 
-    def count(self, least: int, between: int = 0) -> int:
-        """A number of items of at least `least` bytes each, with so many other bytes between."""
+    def count(self, least: int, extra: int = 0) -> int:
+        """A number of items of at least `least` bytes each, with `extra` bytes between number and items."""
         count = self.integer()
-        self.take(between)
+        self.take(extra)
         if not 0 <= count * least <= self.left:
             raise DamagedPacket("counts more than there is")
         return count
 
-    def section(self, least: int, sized: bool) -> int:
-        """The number of items of a section; its size, if it has one, is not needed to skip it."""
-        return self.count(least, 4 if sized else 0)
-
-    def skip(self, size: int, count: int) -> None:
-        self.take(size * count)
+    def items(self, size: int, extra: int = 0) -> bytes:
+        """The bytes of a list of items of `size` bytes each."""
+        return self.take(size * self.count(size, extra))
 
     def skip_text(self) -> None:
         end = self._content.find(b"\0", self._at)
@@ -255,10 +245,7 @@ class _Reader:
 
 
 def open_stream(url: str, *, local: str | None = None) -> PointStream:
-    """Connect to the server at `natnet://host:port`, the port for commands.
-
-    It listens at the network card of the address `local`, or at the one that leads to the host.
-    """
+    """Connect to the server at `natnet://host:port`; `local` is the address of the network card to use."""
     host, port, _ = split_address(url, options={}, port=COMMAND_PORT)
     try:
         server = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
@@ -276,12 +263,11 @@ def open_stream(url: str, *, local: str | None = None) -> PointStream:
 
 
 class PointStream(ArrivingFrames):
-    """The frames of a server as they arrive; one that is gone may come again.
+    """The frames of a server as they arrive, also after a restart of the server.
 
-    Packets are taken from the server's address, and its ports for commands and for data, only. They wait in
-    the socket, and whoever asks takes them out of it: a thread that reads would contend with the tracker for
-    the interpreter at every packet. While nobody asks for long, as when hands are measured, a thread keeps
-    the socket from running over.
+    Only packets from the server's address and its two ports count. `poll` reads the socket in the tracker's
+    thread: a reading thread would contend with it for the interpreter at every packet. While nobody polls, as
+    when hands are measured, a thread empties the socket before it overflows.
     """
 
     def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
@@ -289,9 +275,9 @@ class PointStream(ArrivingFrames):
         self.server = server
         """The server's description of itself."""
         self.damaged = 0
-        """Number of damaged packets, which were left out."""
+        """Number of damaged packets."""
         self.foreign = 0
-        """Number of packets of other senders, which were left out."""
+        """Number of packets of other senders."""
         self._sockets, self._address = sockets, address
         self._version = min(server.version, NEWEST)
         self._asked = self._kept_alive = self._heard = time.monotonic()
@@ -303,7 +289,7 @@ class PointStream(ArrivingFrames):
 
     @property
     def counts(self) -> dict[str, int]:
-        """What became of other packets so far, as a take records it."""
+        """Numbers of packets that were left out, as a take records them."""
         return {"damaged_packets": self.damaged, "foreign_packets": self.foreign}
 
     @property
@@ -312,7 +298,7 @@ class PointStream(ArrivingFrames):
         return self._closed.is_set() or (self._ending and not self._arrived)
 
     def poll(self, seconds: float) -> list[StreamedFrame]:
-        """Wait for packets, so long at most [s]; returns the frames of all that have arrived."""
+        """Return the frames that have arrived; wait up to `seconds` for one."""
         if self._closed.is_set():
             return []
         if seconds > 0.0 and not (self._arrived or self._ending):
@@ -323,7 +309,7 @@ class PointStream(ArrivingFrames):
             return self._take_all()
 
     def end(self) -> None:
-        """No frame is wanted but those that have arrived."""
+        """Take no frame that arrives from now on."""
         with self._reading:
             self._drain()
             self._ending = True
@@ -339,7 +325,7 @@ class PointStream(ArrivingFrames):
             one.close()
 
     def _attend(self) -> None:
-        """Keep the server sending, and the socket from running over while the reader is busy."""
+        """Send keep-alive packets, and empty the socket while the reader is busy."""
         while not self._closed.wait(_ATTENDED):
             now = time.monotonic()
             if now >= self._kept_alive + _KEEP_ALIVE:
@@ -352,14 +338,14 @@ class PointStream(ArrivingFrames):
                     self._drain()
 
     def _drain(self) -> None:
-        """Take what has arrived until now out of the sockets."""
+        """Take the packets that have arrived until now out of the sockets."""
         begin = time.monotonic()
         for one in () if self._ending or self._closed.is_set() else self._sockets:
             while (received := _receive(one)) is not None:
                 frame = self._parse(*received)
                 if frame is not None:
                     self._add(frame)
-                if received.arrived > begin:  # others keep coming
+                if received.arrived > begin:
                     break
 
     def _parse(self, packet: bytes, sender: tuple[str, int], arrived: float) -> StreamedFrame | None:
@@ -376,7 +362,7 @@ class PointStream(ArrivingFrames):
                 return None
             try:
                 frame = parse_frame(payload, self._version, arrived)
-            except DamagedPacket:  # some servers send another layout than they say
+            except DamagedPacket:  # some servers send another version than they announce
                 other: Version = OLDEST if self._version == NEWEST else NEWEST
                 frame = parse_frame(payload, other, arrived)
                 self._version = other
@@ -388,7 +374,7 @@ class PointStream(ArrivingFrames):
 
 
 def _own_address(server: tuple[str, int]) -> str:
-    """Address of the network card that leads to the server, the only one to listen at. No packet is sent."""
+    """Address of the network card that leads to the server; no packet is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(server)
         own: str = probe.getsockname()[0]
@@ -399,7 +385,7 @@ def _bind(address: str, port: int) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        if port:  # of a multicast: other programs on this machine may listen too
+        if port:  # other programs on this machine may listen to the same multicast
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if _STAMPS is not None:
             one.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
@@ -418,8 +404,15 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
         until = time.monotonic() + _RETRY
         while (seconds := until - time.monotonic()) > 0.0:
             ready, _, _ = select.select([commands], [], [], seconds)
-            info = _server_info(_receive(commands), server) if ready else None
-            if info is None:
+            received = _receive(commands) if ready else None
+            if received is None or received.sender != server:
+                continue
+            try:
+                kind, payload = unpack(received.packet)
+                if kind != Kind.SERVER_INFO:
+                    continue
+                info = parse_server_info(payload)
+            except DamagedPacket:
                 continue
             if info.version < OLDEST:
                 major, minor = info.version
@@ -429,16 +422,6 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
         f"{url}: no NatNet server answers; in Motive, switch streaming on and choose the network that this "
         "machine is in"
     )
-
-
-def _server_info(received: _Received | None, server: tuple[str, int]) -> ServerInfo | None:
-    if received is None or received.sender != server:
-        return None
-    try:
-        kind, payload = unpack(received.packet)
-        return parse_server_info(payload) if kind == Kind.SERVER_INFO else None
-    except DamagedPacket:
-        return None
 
 
 def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:
@@ -462,24 +445,24 @@ def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
     try:
         one.sendto(packet, address)
     except OSError:
-        pass  # the network is down for now: the stream yields silent frames
+        pass  # the network is down or a buffer is full, and the packet is lost as any other may be
 
 
 class _Received(NamedTuple):
     packet: bytes
     sender: tuple[str, int]
     arrived: float
-    """Monotonic time at which it came to this machine [s], which may be long before it is read."""
+    """Monotonic time of its arrival on this machine [s]."""
 
 
 def _receive(one: socket.socket) -> _Received | None:
-    """A packet; None if there is none."""
+    """The next packet in a socket; None if there is none."""
     try:
         if _STAMPS is None:
             packet, (host, port) = one.recvfrom(LARGEST)
             return _Received(packet, (host, port), time.monotonic())
         packet, told, _, (host, port) = one.recvmsg(LARGEST, socket.CMSG_SPACE(_STAMP.size))
-    except OSError:  # no packet, or a message that a port is closed
+    except OSError:
         return None
     arrived = time.monotonic()
     for level, kind, data in told:
@@ -495,7 +478,7 @@ class PointFrames(Protocol):
 
     @property
     def points(self) -> Float[np.ndarray, "T N 3"]:
-        """Points of all frames [m]; NaN where there is no point."""
+        """Points of all frames [m]; NaN for a missing point."""
 
     @property
     def ids(self) -> Int[np.ndarray, "T N"]:
@@ -504,20 +487,6 @@ class PointFrames(Protocol):
     @property
     def rate(self) -> float:
         """Frames per second [Hz]."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReplaySettings(Settings):
-    """How a capture is played: keyword arguments of `ReplayServer`, and options of `handsim replay`."""
-
-    loop: bool = False
-    """Start again at the end, with later numbers and times, and with points of new IDs."""
-    rate: Annotated[float | None, Limits(0.0, above=True)] = None
-    """Frames per second [Hz]; the capture's own when not given."""
-    host: str = LOOPBACK
-    """Address of this machine to listen at; other machines do not reach the default."""
-    port: Annotated[int, Limits(0, 65535)] = 0
-    """UDP port to listen at; 0 takes a free one."""
 
 
 class ReplayServer(Closing):
@@ -566,7 +535,7 @@ class ReplayServer(Closing):
         self._ids_of_round = int(ids.max(initial=-1)) + 1
         self._host, self._socket = settings.host, _listen(settings.host, settings.port)
         self._port: int = self._socket.getsockname()[1]
-        self._clients: dict[tuple[str, int], float] = {}  # and the time of their last packets
+        self._clients: dict[tuple[str, int], float] = {}  # times of their last packets [s]
         self.sent = 0
         """Number of frames that were sent so far."""
         self._ended = threading.Event()
@@ -610,7 +579,12 @@ class ReplayServer(Closing):
             due = np.inf if self.finished else start + number / self.rate
             self._answer(min(_WAIT, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
-                self._send_all(pack_frame(self._frame(number), self._version))
+                packet, now = pack_frame(self._frame(number), self._version), time.monotonic()
+                self._clients = {
+                    client: heard for client, heard in self._clients.items() if now - heard < _CLIENT_TIMEOUT
+                }
+                for client in self._clients:
+                    _send(self._socket, packet, client)
                 self.sent += 1
 
     def _frame(self, number: int) -> StreamedFrame:
@@ -633,31 +607,17 @@ class ReplayServer(Closing):
         if kind == Kind.CONNECT and (client in self._clients or len(self._clients) < _MOST_CLIENTS):
             self._clients[client] = time.monotonic()
             info = ServerInfo("handsim replay", self._version, self._port, None)
-            self._send(pack_server_info(info), client)
+            _send(self._socket, pack_server_info(info), client)
         elif kind == Kind.KEEP_ALIVE and client in self._clients:
             self._clients[client] = time.monotonic()
         elif kind == Kind.DISCONNECT:
             self._clients.pop(client, None)
 
-    def _send_all(self, packet: bytes) -> None:
-        now = time.monotonic()
-        self._clients = {
-            client: heard for client, heard in self._clients.items() if now - heard < _CLIENT_TIMEOUT
-        }
-        for client in self._clients:
-            self._send(packet, client)
-
-    def _send(self, packet: bytes, client: tuple[str, int]) -> None:
-        try:
-            self._socket.sendto(packet, client)
-        except OSError:
-            pass  # the client is gone, or its buffer is full
-
 
 def _point_frames(
     source: Capture | PointFrames | str | Path,
 ) -> tuple[Float[np.ndarray, "T N 3"], Int[np.ndarray, "T N"], float]:
-    """Points [m], IDs and rate [Hz] of what is to be played."""
+    """Points [m], IDs and rate [Hz] of the source of a `ReplayServer`."""
     if isinstance(source, str | Path):
         source = read_points(source)
     if not all(hasattr(source, name) for name in ("rate", "ids")):

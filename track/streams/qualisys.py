@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 
 from handsim._plugins import import_extra
 from handsim.errors import CaptureError
@@ -22,27 +21,20 @@ _PATIENCE: Final = 3.0  # [s] to wait for an answer
 _RETRY: Final = 1.0  # [s] between attempts to reach a QTM that went away
 _COMPONENTS: Final = ["3d", "3dnolabels"]
 _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStarted")
-_FIRST_ID: Final = 1 << 16  # of unidentified markers, beyond the places of the identified ones
+_FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; identified ones have smaller IDs
 _IDS: Final = 1 << 30
-_LOST, _CLOSED = "lost", "closed"  # what arrives after the last frame of a connection, and of the source
+_LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, and of the source
 
 
 class QualisysSource:
-    """A `FrameSource` of the 3D points that QTM computes in real time; it connects again when QTM went away.
+    """A `FrameSource` of QTM's real-time 3D points, which reconnects when QTM was away.
 
-    The ID of an identified marker is its place in QTM's list; those of the others are QTM's, and lie beyond.
-
-    Args:
-        host: The machine that QTM runs on.
-
-    Raises:
-        ArgumentError: The package qtm-rt is missing.
-        CaptureError: No QTM answers there.
+    The ID of an identified marker is its index in QTM's list; other markers have QTM's IDs plus 65536.
     """
 
     def __init__(self, host: str, port: int = PORT) -> None:
         self._qtm: Any = import_extra("qtm_rt", "qtm://", "qualisys")
-        logging.getLogger("qtm_rt").setLevel(logging.CRITICAL + 1)  # its errors are told by ours
+        logging.getLogger("qtm_rt").setLevel(logging.CRITICAL + 1)  # our errors say the same
         self._host, self._port = host, port
         self._arrived: asyncio.Queue[StreamedFrame | str] = asyncio.Queue()
         self._subscribing: asyncio.Task[None] | None = None
@@ -94,9 +86,9 @@ class QualisysSource:
         return connection
 
     async def _reconnect(self) -> bool:
-        """Connect as soon as QTM is there again; returns whether before `close`."""
+        """Connect as soon as QTM is there again; returns False if `close` was called before."""
         while True:
-            while not self._arrived.empty():  # an attempt that failed is told as lost, too
+            while not self._arrived.empty():  # a failed attempt queues "lost", too
                 if self._arrived.get_nowait() == _CLOSED:
                     return False
             try:
@@ -108,7 +100,7 @@ class QualisysSource:
             return True
 
     def _react(self, event: Any) -> None:
-        """QTM's frames end with a measurement: ask for those of the next one."""
+        """Ask for the frames of the next measurement: a subscription ends with its measurement."""
         if event.name in _STARTS:
             self._subscribe()
 
@@ -119,7 +111,7 @@ class QualisysSource:
         try:
             await self._connection.stream_frames(components=_COMPONENTS, on_packet=self._take)
         except (TimeoutError, self._qtm.QRTCommandException):
-            pass  # nothing is measured now; an event tells when that begins
+            pass  # no measurement runs; an event announces the next one
 
     def _take(self, packet: Any) -> None:
         self._arrived.put_nowait(frame_of(packet))
@@ -129,14 +121,10 @@ def frame_of(packet: Any) -> StreamedFrame:
     """The frame of a data packet of qtm-rt."""
     _, identified = packet.get_3d_markers() or (None, [])
     _, others = packet.get_3d_markers_no_label() or (None, [])
-    points = _points(identified + others)
+    positions = [(one.x, one.y, one.z) for one in identified + others]  # [mm], NaN if not seen
+    points = 1e-3 * np.array(positions, dtype=np.float64).reshape(-1, 3)
     ids = [*range(len(identified)), *(_FIRST_ID + other.id % _IDS for other in others)]
     there = np.isfinite(points[:, 0])
     return StreamedFrame(
         packet.framenumber, 1e-6 * packet.timestamp, points[there], np.array(ids, dtype=np.int64)[there]
     )
-
-
-def _points(markers: list[Any]) -> Float[np.ndarray, "N 3"]:
-    """Positions of markers [m]; NaN for identified ones that are not seen."""
-    return 1e-3 * np.array([(one.x, one.y, one.z) for one in markers], dtype=np.float64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The web server of the viewer: on this machine's own address, without a tunnel to the outside."""
+"""The web server of the viewer, which listens on this machine's own address and opens no public tunnel."""
 
 from __future__ import annotations
 
@@ -17,42 +17,31 @@ from handsim.errors import ArgumentError, HandSimError
 if TYPE_CHECKING:
     from viser import ViserServer
 
-"""The address that only this machine reaches."""
-_HINT: Final = "install it with: pip install 'handsim[view]'"
+# The page at `/` forwards to viser's dark or light address, because only the browser knows its theme.
 _DARK_OR_LIGHT: Final = """<!doctype html><html><script>
 location.replace("/?" + (matchMedia("(prefers-color-scheme: dark)").matches ? "darkMode" : "light"))
 </script></html>
 """
-"""What `/` answers: only a browser knows whether it is dark, and viser reads that from the address."""
-_PORTS: Final = range(8080, 8100)
-"""Ports that are tried in this order where none is named."""
+_PORTS: Final = range(8080, 8100)  # tried in this order when --port is not given
 
 
 @contextmanager
 def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServer]:
-    """A running web server; the end of the block closes it and its pages.
-
-    Args:
-        port: Port to listen at; the first free one from 8080 on when None, any free one when 0.
-        title: Title of the page's panel.
-
-    Raises:
-        HandSimError: The package viser is not installed.
-        ArgumentError: There is no such address here, or the port is taken or not allowed.
-    """
+    """Run a web server in the block; port None is the first free one from 8080 on, 0 any free one."""
     try:
         import viser
     except ImportError as error:
-        raise HandSimError(f"the viewer needs the package viser; {_HINT}") from error
+        hint = "install it with: pip install 'handsim[view]'"
+        raise HandSimError(f"the viewer needs the package viser; {hint}") from error
 
     class Server(viser.ViserServer):
-        """A server that never opens viser's public tunnel: any page could ask for it."""
+        """A server that never opens viser's public tunnel, which any page could ask for."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
     free = _free_port(host, port)
-    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):  # viser prints a panel of its own
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):  # hide viser's own messages
         server = Server(host=host, port=free, label=title, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -72,22 +61,16 @@ def address_of(server: ViserServer) -> str:
 
 
 def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
-    """Whether a connection comes from the page itself, or from a program that is no browser.
+    """Whether a connection with the headers Origin and Host (`asked`) comes from our page or from no browser.
 
-    A browser tells which page opens a connection, and any page may open one to this machine. A page that has
-    a name of its own for this machine's address (DNS rebinding) gives that name twice, so at a loopback
-    address only names of loopback count.
-
-    Args:
-        origin: The header Origin, such as `http://127.0.0.1:8080`; None from what is no browser.
-        asked: The header Host, such as `127.0.0.1:8080`.
-        host: Address that the server listens at.
+    Any page may connect to this machine, and browsers send its origin along; other programs send none.
     """
     if origin is None:
         return True
     parts = urlsplit(origin)
     if asked is None or parts.netloc.lower() != asked.lower():
         return False
+    # A foreign page's own name for our address (DNS rebinding) is in both headers, but is no loopback name.
     return not _is_loopback(host) or _is_loopback(parts.hostname or "")
 
 
@@ -102,10 +85,7 @@ def _is_loopback(host: str) -> bool:
 
 @contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Servers of websockets that are started in the block refuse other pages, and follow a dark browser.
-
-    viser passes nothing on that could do this.
-    """
+    """Make websockets servers that start in the block refuse other pages; viser has no option for it."""
     import websockets.asyncio.server as websockets_server
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
@@ -135,7 +115,7 @@ def _guarded(host: str) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int | None) -> int:
-    """A port that can be listened at; viser itself would search on without a word."""
+    """The port to listen at; viser itself would silently take another one than the given."""
     if port is not None and not 0 <= port <= 65535:
         raise ArgumentError(f"--port is {port}, expected 0 to 65535")
     reason = ""

@@ -1,7 +1,8 @@
-"""What a file or folder is, found by its content, and the page that shows it."""
+"""Pages for everything that can be viewed: the kind of a file or folder is found by its content."""
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+import gloves.layout
 from gloves.captures.formats import READABLE, read_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import list_layouts, load_layout
@@ -36,26 +38,25 @@ ACCEPTED: Final = (
     "a marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture "
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
-"""What can be viewed."""
-_ROUNDED: Final = 0.01  # [s] by which a time may lie outside
+"""The kinds of files that can be viewed."""
+_ROUNDED: Final = 0.01  # [s] by which --time may lie outside
 _LOOKED_AT: Final = 30  # frames that decide where the first look goes
 
 Run = Callable[[Callable[[], bool]], None]
-"""Serves a page until the function that it is given says that it shall end."""
-_SPACING: Final = 0.14  # [m] between the middles of two hands
+"""Serves a page until the given function returns True."""
+_SPACING: Final = 0.14  # [m] between the centers of two hands
 _HEIGHT: Final = 0.06  # [m] above the ground
-_BEFORE: Final = (150, 150, 150)
+_BEFORE_COLOR: Final = (150, 150, 150)
 
 
 class Content(NamedTuple):
-    """What was found, ready to be shown."""
+    """The content of a file, ready to be shown."""
 
     kind: str
-    """In words."""
     show: Callable[[ViserServer], Run]
-    """Puts it into a page; the result serves that page."""
+    """Puts the content into a page; returns the function that serves the page."""
     recording: Recording | None = None
-    """Its frames, where there are some."""
+    """Frames, of what changes over time."""
 
 
 def open_content(
@@ -66,19 +67,7 @@ def open_content(
     rig: CameraRig | str | None = None,
     time: float | None = None,
 ) -> Content:
-    """Read what shall be shown.
-
-    Args:
-        name: A path, or the name of a shipped layout or rig.
-        out: Where a changed layout is saved; a new name beside it when None.
-        size: Size of the hand that wears a layout.
-        rig: Cameras of a capture or take: a rig, a shipped name or the path of a .toml file.
-        time: Which of its frames is shown first [s].
-
-    Raises:
-        ArgumentError: It is nothing that can be viewed, or an option is for something else.
-        FileError: It cannot be read.
-    """
+    """Read a file, folder or shipped layout or rig; parameters are those of `handsim view`."""
     content = _open(name, out, size, rig, time)
     if time is not None and content.recording is None:
         raise ArgumentError(f"--time is {time:g}, but {name} is a {content.kind}: nothing in it moves")
@@ -108,21 +97,17 @@ def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, t
         return Content("user", lambda server: _still(UserView(server, hands)))
     recording, corrector = _recording(path, None if rig is None else load_rig(rig))
     kind = type(recording).__name__.removesuffix("Recording").lower()
-    first = 0 if time is None else _frame_at(recording, time, name)
+    first = 0
+    if time is not None:
+        begin, end = float(recording.times[0]), float(recording.times[-1])
+        if not begin - _ROUNDED <= time <= end + _ROUNDED:
+            raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
+        first = int(np.argmin(np.abs(recording.times - time)))
     return Content(kind, lambda server: show_recording(server, recording, corrector, first), recording)
 
 
-def _frame_at(recording: Recording, time: float, name: str) -> int:
-    """The frame that is nearest to a time [s]; an `ArgumentError` if it lies outside."""
-    begin, end = float(recording.times[0]), float(recording.times[-1])
-    nearest = int(np.argmin(np.abs(recording.times - time)))
-    if not begin - _ROUNDED <= time <= end + _ROUNDED:
-        raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
-    return nearest
-
-
 def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector | None]:
-    """What is shown over time, and where its labels can be corrected."""
+    """The frames of a file or folder, and the corrector of a tracked take."""
     if path.is_dir():
         return DatasetRecording(Dataset(path), rig), None
     if path.suffix.lower() in READABLE:
@@ -141,7 +126,7 @@ def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector 
 def _layout(name: str | Path, path: Path | None, out: Path | None, size: str) -> Content:
     layout = load_layout(name)
     model = HandModel.named(size, side=layout.sides[-1])
-    given = shipped_file(str(name)) if path is None else path
+    given = Path(gloves.layout.__file__).parent / "layouts" / f"{name}.toml" if path is None else path
     if out is not None:
         check_outputs((given,), (out,))
         if out.exists():
@@ -170,15 +155,7 @@ def _rig(name: str | Path) -> Content:
 def show_recording(
     server: ViserServer, recording: Recording, corrector: Corrector | None = None, first: int = 0
 ) -> Run:
-    """Put a recording into a page, with its timeline.
-
-    Args:
-        corrector: Where its labels can be corrected: the tracked take that the recording shows.
-        first: The frame that is shown first.
-
-    Returns:
-        What serves the page.
-    """
+    """Put a recording into a page, opened at the frame `first`; returns the function that serves the page."""
 
     def show(index: int) -> None:
         frame = recording.frame(index)
@@ -214,7 +191,7 @@ def show_recording(
 
 
 def first_look(recording: Recording) -> np.ndarray:
-    """Points [m] that the first look shall show: wrists and labeled points, or all points, of some frames."""
+    """Points [m] for the first look: wrists and labeled points, or all points, of some frames."""
     indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
     frames = [recording.frame(int(index)) for index in indices]
     wrists = [frame.qpos[:, :3] for frame in frames]
@@ -225,19 +202,10 @@ def first_look(recording: Recording) -> np.ndarray:
     return np.concatenate([frame.points for frame in frames])
 
 
-def shipped_file(name: str) -> Path:
-    """The file of a shipped layout."""
-    import gloves.layout
-
-    return Path(gloves.layout.__file__).parent / "layouts" / f"{name}.toml"
-
-
 def _still(_shown: object) -> Run:
-    """Serves a page that does nothing by itself."""
+    """Serve a page that only reacts; the page's handlers live as long as `_shown`."""
 
     def run(ended: Callable[[], bool]) -> None:
-        import time
-
         while not ended():
             time.sleep(0.2)
 
@@ -251,18 +219,16 @@ class UserView:
         self.before = [nominal_hand(hand) for hand in hands]
         """The hands of the nearest named sizes, in gloves as designed."""
         self.skins: list[HandSkin] = []
-        """Skin of each hand after and before calibration, in turn."""
+        """Skins of the first hand after and before calibration, then those of the second one."""
         gui, scene = server.gui, server.scene
-        for node in ("/after", "/before"):
+        for node, words in (("/after", "calibrated hands"), ("/before", "hands of the nearest size")):
             root = scene.add_frame(node, show_axes=False)
-            words = "calibrated hands" if node == "/after" else "hands of the nearest size"
-            switch = gui.add_checkbox(words, True)
-            switch.on_update(partial(_switch, root))
+            gui.add_checkbox(words, True).on_update(partial(_switch, root))
         corners = []
         for number, (hand, before) in enumerate(zip(hands, self.before, strict=True)):
             shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
             self._add_hand(server, f"/after/{hand.side}", hand, shift, None)
-            self._add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE)
+            self._add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR)
             ends = np.stack([before.attachment.points, hand.attachment.points], axis=1) + shift
             scene.add_line_segments(
                 f"/moved/{hand.side}",
@@ -299,13 +265,13 @@ def _switch(node: FrameHandle, event: GuiEvent[GuiCheckboxHandle]) -> None:
 
 
 def nominal_hand(hand: GloveFit) -> GloveFit:
-    """The hand of the named size whose length is nearest, in the same glove as designed."""
+    """The hand of the named size with the nearest length, in the same glove as designed."""
     fits = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
     return min(fits, key=lambda fit: abs(fit.shape.length - hand.shape.length))
 
 
 def describe(hand: GloveFit, before: GloveFit) -> str:
-    """A hand's measures beside those of the named size, in words."""
+    """A sentence on a hand's measures and those of the nearest size."""
     moved = np.linalg.norm(hand.attachment.points - before.attachment.points, axis=1)
     return (
         f"**{hand.side}**: {1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm, "

@@ -1,4 +1,4 @@
-"""Labels of a take and markers of a layout, corrected by a person in the page and saved."""
+"""Editors in the page: a person corrects labels of a take or moves markers of a layout, and saves them."""
 
 from __future__ import annotations
 
@@ -36,31 +36,23 @@ if TYPE_CHECKING:
     from viser import SceneNodePointerEvent, ViserServer
 
 _NOTHING: Final = "choose"
-_HALO: Final = 2.5  # radius around the chosen point, in radii of a marker
+_HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
-_LISTED: Final = 12  # corrections
-_HEIGHT: Final = 0.06  # of the wrist above the ground [m]
-_GIZMO: Final = 0.03  # [m]
+_LISTED: Final = 12  # most corrections in the list
+_HEIGHT: Final = 0.06  # [m] of the wrist above the ground
+_GIZMO: Final = 0.03  # [m], size of the handle that moves a marker
 
 
 class Corrector:
-    """A take that is open for corrections.
-
-    Args:
-        path: The take's file; the corrections beside it are read.
-
-    Raises:
-        CaptureError: The corrections cannot be read, or cannot be meant for this take.
-    """
+    """A take that is open for corrections, with those in the file beside it."""
 
     def __init__(self, path: Path, take: Take) -> None:
         self.path, self._base, self._lock = path, take, threading.Lock()
-        self.saved: tuple[Correction, ...] = corrections_of(path)
-        """What the file of corrections holds."""
-        self.added: tuple[Correction, ...] = ()
-        """What was added and is not saved."""
         self.take = take
         """The take with all corrections."""
+        self.saved: tuple[Correction, ...] = corrections_of(path)
+        self.added: tuple[Correction, ...] = ()
+        """Corrections that are not saved."""
         self.unfitting: tuple[Correction, ...] = ()
         """Saved corrections that fit no point."""
         self._state = _state_of(path)
@@ -78,7 +70,7 @@ class Corrector:
         return bool(self.added) or self._stale
 
     def span_of(self, frame: int, column: int) -> tuple[int, int]:
-        """The frames around one in which its point has the same ID and label without a gap."""
+        """The first and last frame in which a point has its ID and label without a gap."""
         take, points = self.take, self.take.point_list
         point = points.at(frame, column)
         if points.ids[point] < 0:
@@ -91,36 +83,20 @@ class Corrector:
         return first, last
 
     def add(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
-        """Give a point its right label.
-
-        Args:
-            frame: A frame in which the point is there.
-            span: The first and the last frame in which the label is right.
-            label: Name of its marker, or `NO_MARKER`.
-
-        Returns:
-            The correction, for those frames of the span in which the point is there.
-
-        Raises:
-            CaptureError: The point is not in the span, or another one of a frame is corrected to that marker.
-        """
+        """Give a point its right label, a marker's name or `NO_MARKER`, in the frames of a span."""
         with self._lock:
             correction = self._meant(frame, column, span, label)
             self._make((*self.added, correction))
         return correction
 
     def undo(self) -> None:
-        """Take back what was added last."""
+        """Take the last unsaved correction back."""
         with self._lock:
             if self.added:
                 self._make(self.added[:-1])
 
     def save(self) -> str:
-        """Write the corrections and the take, and say so.
-
-        Raises:
-            CaptureError: A file cannot be written, or was changed since it was read.
-        """
+        """Write the corrections and the take; returns a message."""
         with self._lock:
             if _state_of(self.path) != self._state or corrections_of(self.path) != self.saved:
                 raise CaptureError(
@@ -139,7 +115,7 @@ class Corrector:
         return f"saved {self.path} and {beside}"
 
     def _meant(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
-        """A correction of the frames of a span in which a point is there."""
+        """A point's correction, from its first to its last frame within a span."""
         points = self.take.point_list
         first, last = min(span), max(span)
         point = points.at(frame, column)
@@ -159,7 +135,7 @@ class Corrector:
         return Correction(start, int(followed[-1]), correction.place, label)
 
     def _make(self, added: Sequence[Correction]) -> None:
-        """Make the take with these corrections, unless they cannot be meant."""
+        """Make the take with the saved and these corrections; `CaptureError` if they contradict."""
         every = (*self.saved, *added)
         corrected = correct_take(self._base, every)
         self.added, self.unfitting = tuple(added), corrected.unfitting
@@ -173,7 +149,7 @@ def label_of(take: Take, frame: int, column: int) -> str:
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
-    """What changes when a file is written anew; None where it is gone."""
+    """Time and size of a file, to see whether it was changed; None if it is gone."""
     try:
         found = path.stat()
     except OSError:
@@ -182,11 +158,7 @@ def _state_of(path: Path) -> tuple[int, int] | None:
 
 
 class LabelEditor:
-    """The folder of the panel in which labels are corrected, and a halo around the chosen point.
-
-    Args:
-        changed: Called when the take has changed.
-    """
+    """The folder of the panel in which labels are corrected, and a halo around the chosen point."""
 
     def __init__(
         self,
@@ -202,19 +174,18 @@ class LabelEditor:
         self.halo = server.scene.add_icosphere(
             "/chosen", _HALO * recording.radius, _HALO_COLOR, opacity=0.5, cast_shadow=False, visible=False
         )
-        """Around the chosen point."""
         self._add_controls(server)
         self._list()
 
     def show(self, index: int, *, hurried: bool) -> None:
-        """Follow the page to a frame; where `hurried`, without the list of its points."""
+        """Show a frame, without the list of its points if `hurried`."""
         self._frame = index
         self._show_halo()
         if not hurried:
             self._show_points()
 
     def pick(self, index: int) -> None:
-        """Choose a point of the shown frame, counted as in `ShownFrame.points`."""
+        """Choose a point of the shown frame by its index in `ShownFrame.points`."""
         columns = self._columns()
         if index < len(columns):
             self.choose(self._frame, int(columns[index]))
@@ -222,7 +193,7 @@ class LabelEditor:
             self.state.content = "That marker was not seen: it has no point whose label could be wrong."
 
     def choose(self, frame: int, column: int) -> None:
-        """Choose a point by its column in a frame; the span becomes that of its label."""
+        """Choose a point by its column in a frame, and the span of its label."""
         points = self._corrector.take.point_list
         self.chosen = (frame, column)
         _set(self.span, self._corrector.span_of(frame, column))
@@ -237,7 +208,7 @@ class LabelEditor:
         )
 
     def correct(self) -> None:
-        """Give the chosen point the chosen label over the chosen span, or say why not."""
+        """Give the chosen point the chosen label in the chosen span, or show why that is impossible."""
         if self.chosen is None:
             self.state.content = "Choose a point first: click on it, or take it from the list."
             return
@@ -251,7 +222,7 @@ class LabelEditor:
         self.state.content = f"corrected: {correction}"
 
     def save(self) -> None:
-        """Save the corrections and the take, or say why not."""
+        """Save the corrections and the take, or show why that is impossible."""
         try:
             self.state.content = self._corrector.save()
         except CaptureError as error:
@@ -262,22 +233,17 @@ class LabelEditor:
         gui, last = server.gui, self._recording.num_frames - 1
         with gui.add_folder("Correct labels"):
             self.state = gui.add_markdown("Click on a point whose label is wrong, or take it from the list.")
-            """What is chosen, or what was done."""
             self.points = gui.add_dropdown("point", (_NOTHING,), hint="ID and label of each point")
-            """The points of the shown frame."""
             self.span = gui.add_multi_slider(
                 "frames", 0, max(last, 1), 1, (0, last), disabled=last == 0, hint="First and last frame"
             )
-            """The first and the last frame."""
             ends = gui.add_button_group("shown frame is", ("first", "last"))
             self.label = gui.add_dropdown("right label", (NO_MARKER, *self._recording.label_names))
-            """The label that the point shall have."""
             gui.add_button("Correct").on_click(lambda _: self.correct())
             gui.add_button("Undo", color="gray", hint="What was not saved").on_click(lambda _: self._undo())
             saves = gui.add_button("Save take", color="gray", hint=f"Writes {self._corrector.path}")
             saves.on_click(lambda _: self.save())
             self.list = gui.add_markdown("")
-            """The corrections."""
         self.points.on_update(self._pick_row)
         ends.on_click(lambda event: self._set_end(event.target.value))
 
@@ -287,7 +253,7 @@ class LabelEditor:
         self.state.content = "taken back"
 
     def _renew(self) -> None:
-        """Show what the corrector has made."""
+        """Show the take with the corrector's present corrections."""
         self._recording.replace(self._corrector.take)
         self._list()
         self._changed()
@@ -314,7 +280,7 @@ class LabelEditor:
         )
 
     def _show_points(self) -> None:
-        """The points of the shown frame as rows of a list, the chosen one selected."""
+        """List the points of the shown frame, with the chosen one selected."""
         self._rows = {self._name(self._frame, int(column)): int(column) for column in self._columns()}
         rows = (_NOTHING, *self._rows)
         if rows != self.points.options:
@@ -354,26 +320,21 @@ class LabelEditor:
 
 
 def _set(handle: Any, value: object) -> None:
-    """Give an element of the panel a value, as the program and not a person."""
+    """Set the value of a GUI element, which viser's handles do through `__setattr__`."""
     handle.value = value
 
 
 class LayoutEditor:
-    """The markers of a layout on one hand.
-
-    Args:
-        layout: What it says.
-        out: Where the changed layout is saved.
-    """
+    """The markers of a layout file on one hand; they can be moved and saved to `out`."""
 
     def __init__(
         self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
     ) -> None:
         self._server, self._path, self._out, self._lock = server, path, out, threading.Lock()
         self.shift = np.array([0.0, 0.0, _HEIGHT])
-        """Where the wrist is in the page [m]."""
+        """Wrist position in the page [m]."""
         self.fit: GloveFit = attach(layout, model)
-        """The hand in its glove as it is now."""
+        """The hand in the glove with all changes."""
         self.changed = False
         """Whether a marker was moved since the layout was read or saved."""
         self._chosen: int | None = None
@@ -386,7 +347,6 @@ class LayoutEditor:
         self.gizmo = server.scene.add_transform_controls(
             "/move", scale=_GIZMO, disable_rotations=True, depth_test=False, visible=False, line_width=3.0
         )
-        """The handle of the chosen marker."""
         self._add_controls(layout)
         self.balls.balls.on_click(self._click)
         self.gizmo.on_update(self._drag)
@@ -404,11 +364,11 @@ class LayoutEditor:
             self._chosen = index
             self.gizmo.position = self.fit.attachment.points[index] + self.shift
             self.gizmo.visible = True
-            self.names.value = self.fit.layout.names[index]  # type: ignore[misc]  # viser sets it itself
-            self._tell()
+            _set(self.names, self.fit.layout.names[index])
+            self._describe_chosen()
 
     def move(self, index: int, point: np.ndarray) -> None:
-        """Move a marker to the skin near a point of the page [m]; where there is none it stays."""
+        """Move a marker to the skin near a point of the page [m], if there is skin."""
         with self._lock:
             try:
                 layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift)
@@ -418,14 +378,10 @@ class LayoutEditor:
             self.fit = attach(layout, self.fit.model)
             self.changed = True
             self._show()
-            self._tell()
+            self._describe_chosen()
 
     def save(self) -> str:
-        """Write the layout, and say so.
-
-        Raises:
-            LayoutError: A file cannot be read or written.
-        """
+        """Write the layout; returns a message."""
         with self._lock:
             given = read_bytes(self._path, error=LayoutError).decode("utf-8", "replace")
             text, kept = moved_text(given, self.fit.layout)
@@ -440,14 +396,12 @@ class LayoutEditor:
     def _add_controls(self, layout: MarkerLayout) -> None:
         gui = self._server.gui
         self.state = gui.add_markdown(f"**{layout.name}**: click a marker, then drag its arrows.")
-        """What is chosen, or what was done."""
         self.names = gui.add_dropdown("marker", layout.names)
         self.names.on_update(self._pick)
         every = gui.add_checkbox("names", False)
         labels = frozenset(range(layout.num_markers))
         every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
-        button = gui.add_button("Save layout", hint=f"Writes {self._out}")
-        button.on_click(lambda _: self._save())
+        gui.add_button("Save layout", hint=f"Writes {self._out}").on_click(lambda _: self._save())
 
     def _save(self) -> None:
         try:
@@ -467,17 +421,17 @@ class LayoutEditor:
     def _drag(self, event: Any) -> None:
         chosen = self._chosen
         if chosen is None or (event.phase != "end" and self._lock.locked()):
-            return  # a step of the drag that comes too early; the last one counts
+            return  # the step before is still being computed
         self.move(chosen, np.array(self.gizmo.position))
         if event.phase == "end":
-            self.choose(chosen)  # the gizmo goes where the marker is
+            self.choose(chosen)  # this moves the gizmo onto the marker
 
     def _show(self) -> None:
         count = self.fit.layout.num_markers
         points = self.fit.attachment.points + self.shift
         self.balls.show(points, np.arange(count), np.ones(count, dtype=np.bool_))
 
-    def _tell(self) -> None:
+    def _describe_chosen(self) -> None:
         if self._chosen is None:
             return
         marker = self.fit.layout.markers[self._chosen]
@@ -489,7 +443,7 @@ class LayoutEditor:
 
 
 def edited_path(path: Path) -> Path:
-    """A name beside a file that no file has yet: `glove-edited.toml`, `glove-edited-2.toml`, ..."""
+    """The first unused name beside a file: `glove-edited.toml`, `glove-edited-2.toml`, ..."""
     endings = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
     candidates = (path.with_name(f"{path.stem}-edited{ending}{path.suffix}") for ending in endings)
     return next(candidate for candidate in candidates if not candidate.exists())

@@ -1,4 +1,4 @@
-"""What the viewer shows over time: frames of hands, points and bodies, made one at a time, or as a video."""
+"""Recordings for the viewer: frames of hands, points and bodies, one at a time or as a video."""
 
 from __future__ import annotations
 
@@ -27,13 +27,12 @@ from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
 GHOST_COLOR: Final = (128, 128, 128)
-"""Of points without a label."""
+"""Color of points without a label."""
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
-"""Names that optical systems give to trajectories that nobody named."""
-_ROWS_PER_SECOND: Final = 4.0
-"""Rows of a training set do not follow each other in time; they are shown at this pace."""
-_LIVE_POINTS: Final = 400  # of a live tracker that are shown at most
-_VIDEO_RATE: Final = 30.0  # [Hz] at most
+"""Names that optical systems give to unnamed trajectories."""
+_ROWS_PER_SECOND: Final = 4.0  # pace of the rows of a training set
+_MOST_LIVE_POINTS: Final = 400
+_VIDEO_RATE: Final = 30.0  # [Hz], the highest rate of a video
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,31 +42,31 @@ class ShownFrame:
     time: float
     """[s]"""
     words: tuple[str, ...] = ()
-    """The state of the frame, one line each."""
+    """Lines on the state of the frame."""
     hands: tuple[HandModel, ...] = ()
     qpos: Float[np.ndarray, "H 27"] = field(default_factory=lambda: np.empty((0, 27)))
-    """Poses in the world [m, rad]; NaN where a hand has none."""
+    """Poses [m, rad]; NaN for a hand without a pose."""
     points: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
-    """World [m]."""
+    """World positions [m]."""
     labels: Int[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """Indices of `Recording.label_names`, -1 for a ghost."""
     seen: Bool[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    """Which points were seen; the others are filled in from a pose."""
+    """Which points were seen; the others are computed from a pose."""
     bodies: Float[np.ndarray, "B 7"] = field(default_factory=lambda: np.empty((0, 7)))
-    """Position [m] and orientation (wxyz) of each body; NaN where it is lost."""
+    """Position [m] and orientation (wxyz) of each body; NaN if lost."""
     rays: Float[np.ndarray, "R 2 3"] = field(default_factory=lambda: np.empty((0, 2, 3)))
     """Lines of sight from markers to the cameras that see them [m]."""
 
 
 class Curve(NamedTuple):
-    """A number that changes over the frames."""
+    """A quantity over time."""
 
     name: str
     values: Float[np.ndarray, "T"]
 
 
 class Recording(ABC):
-    """T frames, made when they are asked for."""
+    """T frames, computed on request."""
 
     times: Float[np.ndarray, "T"]
     """Time of each frame [s], increasing."""
@@ -75,15 +74,14 @@ class Recording(ABC):
     most_points: int
     """The largest number of points in a frame."""
     radius = 0.0035
-    """Of a marker [m]."""
+    """Marker radius [m]."""
     bodies: tuple[RigidBody, ...] = ()
-    """The rigid bodies, in the order of `ShownFrame.bodies`."""
     rig: CameraRig | None = None
     curves: tuple[Curve, ...] = ()
     suspects: tuple[SuspectSpan, ...] = ()
-    """Spans of frames that deserve a look, the most doubtful first."""
+    """Doubtful spans of frames, the most doubtful first."""
     has_hands = has_filled = True
-    """Whether there are hands, and points that were not seen."""
+    """Whether there are hands, and filled-in points."""
 
     @property
     def num_frames(self) -> int:
@@ -92,15 +90,11 @@ class Recording(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> ShownFrame:
-        """One of the frames."""
+        """Make a frame."""
 
 
 class TakeRecording(Recording):
-    """A take: labels, poses and status as they were simulated or tracked.
-
-    Args:
-        rig: The cameras; those that the take names, if they come with handsim, when None.
-    """
+    """A take with the given cameras, or with those in its settings."""
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
         self._models = tuple(hand.model for hand in take.hands)
@@ -117,7 +111,7 @@ class TakeRecording(Recording):
         self._markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
 
     def frame(self, index: int) -> ShownFrame:
-        """One of the frames."""
+        """Make a frame."""
         take, points = self._take, self._take.point_list
         there = points.of(index)
         filled = np.flatnonzero(self._filled[index])
@@ -145,13 +139,13 @@ class TakeRecording(Recording):
 
 
 def _words_of(name: str, status: object, rms: float, filled: int = 0) -> str:
-    """The state of a hand or a body."""
+    """A line on the state of a hand or a body."""
     rms_words = f", RMS {1e3 * rms:.2f} mm" if np.isfinite(rms) else ""
     return f"**{name}** {status}{rms_words}" + (f", {filled} filled in" if filled else "")
 
 
 def _curves(take: Take) -> tuple[Curve, ...]:
-    """RMS of each hand, and doubt; nothing where no pose was fitted, as of a truth."""
+    """RMS of each hand, and doubt; empty if no pose was fitted, as in a simulation's truth."""
     if not np.isfinite(take.rms).any():
         return ()
     curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
@@ -159,12 +153,12 @@ def _curves(take: Take) -> tuple[Curve, ...]:
 
 
 def rig_of_settings(rig: object) -> CameraRig | None:
-    """The rig that settings name or hold; None for a path, which is not followed."""
+    """The rig that settings hold or name as a shipped one; else None, also for a path."""
     return load_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
 
 
 class LiveRecording(Recording):
-    """The frames of a tracker that runs, of which there is only the newest one."""
+    """The newest frame of a running tracker."""
 
     def __init__(
         self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate], rig: CameraRig | None
@@ -172,15 +166,15 @@ class LiveRecording(Recording):
         self._models = tuple(hand.model for hand in hands)
         self._offsets = np.cumsum([0, *(hand.layout.num_markers for hand in hands)])
         self.times, self.label_names = np.zeros(1), label_names(hands, bodies)
-        self.most_points, self.radius = _LIVE_POINTS, hands[0].layout.radius
+        self.most_points, self.radius = _MOST_LIVE_POINTS, hands[0].layout.radius
         self.bodies, self.rig = tuple(bodies), rig
 
     def frame(self, index: int) -> ShownFrame:
-        """An empty one, because nothing has been tracked."""
+        """An empty frame, before the first one is tracked."""
         return ShownFrame(0.0)
 
     def frame_of(self, frame: StreamedFrame, tracked: TrackedFrame) -> ShownFrame:
-        """A tracked frame as it is shown."""
+        """Make a frame of what the tracker took and gave."""
         filled = [hand.markers[hand.filled] for hand in tracked.hands]
         labels = [offset + hand.filled for offset, hand in zip(self._offsets, tracked.hands, strict=False)]
         bodies = [np.concatenate([body.translation, body.rotation]) for body in tracked.bodies]
@@ -213,7 +207,7 @@ class CaptureRecording(Recording):
         self.rig = rig
 
     def frame(self, index: int) -> ShownFrame:
-        """One of the frames."""
+        """Make a frame."""
         there = np.isfinite(self._positions[index, :, 0])
         labels = self._labels[there]
         return ShownFrame(
@@ -226,12 +220,7 @@ class CaptureRecording(Recording):
 
 
 class DatasetRecording(Recording):
-    """A training set, row by row: hand, true markers, what the cameras see of them, ghosts.
-
-    Args:
-        dataset: The training set; its rows stay on disk.
-        rig: The cameras; those of the set, if it names shipped ones or holds its own, when None.
-    """
+    """The rows of a training set, with the given cameras or with those in its settings."""
 
     def __init__(self, dataset: Dataset, rig: CameraRig | None = None) -> None:
         self._dataset = dataset
@@ -243,7 +232,7 @@ class DatasetRecording(Recording):
         self.rig = rig_of_settings(dataset.manifest.config.get("rig")) if rig is None else rig
 
     def frame(self, index: int) -> ShownFrame:
-        """One of the rows."""
+        """Make a frame."""
         shard = int(np.searchsorted(self._starts, index, side="right")) - 1
         row = self._dataset.shards[shard][index - self._starts[shard]]
         observed = np.isfinite(row["observed"][:, 0])
@@ -265,7 +254,7 @@ class DatasetRecording(Recording):
         )
 
     def _hand(self, shard: int, number: int) -> HandModel:
-        """The hand of a row; rows that follow each other mostly share it."""
+        """The hand of a row, kept for the next row, which mostly shares it."""
         if self._model is None or self._model[0] != (shard, number):
             self._model = ((shard, number), HandModel(self._dataset.hands(shard)[number]))
         return self._model[1]
@@ -279,14 +268,10 @@ class DatasetRecording(Recording):
 
 
 def label_colors(names: Sequence[str]) -> UInt8[np.ndarray, "K 3"]:
-    """A color for each label, and last that of points without one.
-
-    Markers of one name on two hands ("right:ThumbTip") have the same color.
-    """
+    """A color for each label, equal for both hands, and the color of unlabeled points at the end."""
     bare = [name.rsplit(":", 1)[-1] for name in names]
     order = {name: number for number, name in enumerate(dict.fromkeys(bare))}
-    # Hues in the order of the glove, so that neighbors differ little and digits differ much; two brightnesses
-    # tell neighbors apart.
+    # Hues follow the order of the glove, so that digits differ; neighbors differ in brightness.
     colors = [
         colorsys.hsv_to_rgb(0.92 * order[name] / max(len(order), 1), 1.0, 0.9 if order[name] % 2 else 0.6)
         for name in bare
@@ -303,17 +288,9 @@ def write_video(
     write_clip: Callable[..., None],
     progress: Progress = no_progress,
 ) -> int:
-    """Write what a recording shows, at its own pace; returns the number of pictures.
+    """Write a recording as a video (.mp4) in its own time; returns the number of pictures.
 
-    Args:
-        path: The file, .mp4.
-        shown: Points [m] that the view holds.
-        write_clip: What draws and encodes the pictures, from `render.illustrations`.
-        progress: Called after each picture.
-
-    Raises:
-        ArgumentError: The file's name ends otherwise.
-        FileError: It cannot be written.
+    The view holds the points `shown` [m]; `write_clip` of `render.illustrations` draws and encodes.
     """
     rate, frames = chosen_frames(recording.times)
     palette = label_colors(recording.label_names) / 255.0
@@ -332,7 +309,7 @@ def write_video(
 
 
 def chosen_frames(times: Float[np.ndarray, "T"]) -> tuple[float, list[int]]:
-    """The rate of a video [Hz], and the frame of each of its pictures: the last one up to its time."""
+    """The rate of a video [Hz], and the frame of each picture: the last one up to the picture's time."""
     if len(times) < 2:
         return _VIDEO_RATE, [0]
     rate = min(_VIDEO_RATE, 1.0 / float(np.median(np.diff(times))))

@@ -1,7 +1,4 @@
-"""What stands in the page: light, ground and first look, cameras, skins, points and bodies.
-
-Only what changed is sent to the page.
-"""
+"""The scene in the page: light, ground, first look, cameras, skins, points and bodies."""
 
 from __future__ import annotations
 
@@ -35,27 +32,21 @@ if TYPE_CHECKING:
 
     from handsim.hand.shape import Side
 
-_FROM: Final = np.array([0.62, -0.62, 0.48])  # direction of the first look, from its target
-_NEAREST: Final = 0.22  # [m] between the eye and its target, at least
-_HALF_SIDE: Final = 0.3  # [m] of the cube that wrists move in, as in training sets
-_SPACING: Final = 0.2  # [m] between the points whose cameras are counted
-_MOST_POINTS: Final = 40_000
+_FROM: Final = np.array([0.62, -0.62, 0.48])  # direction from the target of the first look to the eye
+_NEAREST: Final = 0.22  # [m], the smallest distance between the eye and its target
+_HALF_SIDE: Final = 0.3  # [m], half the side of the cube that wrists move in, as in training sets
+_SPACING: Final = 0.2  # [m] of the grid of points whose cameras are counted
+_MOST_POINTS: Final = 40_000  # of the grid
 _FRUSTUM: Final = 0.12  # [m]
-_FEW, _MANY = np.array([214, 96, 60]), np.array([40, 120, 180])
-SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
-"""A right and a left hand look different."""
-_FILLED: Final = 0.45  # size of a marker that was not seen
+_FEW_CAMERAS_COLOR, _ALL_CAMERAS_COLOR = np.array([214, 96, 60]), np.array([40, 120, 180])
+_SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
+_FILLED: Final = 0.45  # relative size of a marker that was not seen
 _BODY_COLOR: Final = (120, 124, 132)
 _RAY_COLOR: Final = (235, 170, 60)
 
 
 def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: float | None = None) -> None:
-    """Light, ground and the first look at some points [m]; NaN points are left out.
-
-    Args:
-        points: What shall be in view.
-        ground: Height of the ground [m]; below the points when None.
-    """
+    """Set light, ground and a first look at points [m], with the ground at a height or below them."""
     there = points[np.isfinite(points).all(axis=1)]
     low, high = np.percentile(there, [2, 98], axis=0) if len(there) else np.tile([[-0.1], [0.1]], 3)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
@@ -86,7 +77,7 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
 
 
 def _set_light(server: ViserServer) -> None:
-    """Light from above and from one side, soft enough to keep the colors of the labels."""
+    """Light the scene from above and from one side, softly, so that labels keep their colors."""
     scene = server.scene
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map("studio", environment_intensity=0.12)
@@ -98,7 +89,7 @@ def _set_light(server: ViserServer) -> None:
 
 
 def show_rig(server: ViserServer, rig: CameraRig) -> None:
-    """The cameras as frusta, each with its number on the first one's side."""
+    """Show the cameras as frusta with their numbers."""
     quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
     for number, (camera, quaternion) in enumerate(zip(rig.cameras, quaternions, strict=True), 1):
         width, height = camera.angles
@@ -118,7 +109,7 @@ def show_rig(server: ViserServer, rig: CameraRig) -> None:
 
 
 def show_volume(server: ViserServer, rig: CameraRig) -> None:
-    """The cube that wrists move in, and dots that tell how many cameras see a place."""
+    """Show the cube that wrists move in, and dots colored by the number of cameras that see them."""
     center = np.array(ROOM_CENTER)
     server.scene.add_line_segments(
         "/volume", points=box_edges(center - _HALF_SIDE, center + _HALF_SIDE), colors=(40, 120, 60)
@@ -128,18 +119,14 @@ def show_volume(server: ViserServer, rig: CameraRig) -> None:
     server.scene.add_point_cloud(
         "/coverage",
         points=places,
-        colors=np.round((1.0 - share) * _FEW + share * _MANY).astype(np.uint8),
+        colors=np.round((1.0 - share) * _FEW_CAMERAS_COLOR + share * _ALL_CAMERAS_COLOR).astype(np.uint8),
         point_size=0.012,
         point_shape="circle",
     )
 
 
 def camera_counts(rig: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Places [m] that at least two cameras see, above the floor, and by how many each is seen.
-
-    Returns:
-        Places (N, 3) on a grid within the box of the cameras, and counts (N,).
-    """
+    """Grid points (N, 3) [m] that two or more cameras see, and the number of these cameras (N,)."""
     low, high = rig.positions.min(axis=0), rig.positions.max(axis=0)
     low[2] = min(0.0, low[2])
     spacing = max(_SPACING, float((np.prod(high - low + _SPACING) / _MOST_POINTS) ** (1 / 3)))
@@ -158,14 +145,9 @@ def box_edges(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> NDAr
 
 
 class HandSkin:
-    """The skin of one hand; the mesh stands in the wrist's frame, its bones in that mesh.
+    """The skin of one hand, by default in the color of its side.
 
-    So a hand that moves as a whole sends two small messages, and a bone that keeps its place none.
-
-    Args:
-        name: Of the node in the scene.
-        color: Of the skin, 0 to 255; that of the hand's side when None.
-        opacity: Less than 1 for skin that one sees through.
+    The mesh moves with the wrist, and its bones in the mesh: moving a whole hand takes two small messages.
     """
 
     def __init__(
@@ -182,12 +164,7 @@ class HandSkin:
         """The mesh in the page, once there is a hand."""
 
     def show(self, model: HandModel, qpos: Float[np.ndarray, "27"]) -> None:
-        """Show a pose.
-
-        Args:
-            model: The hand; another one than before is sent anew.
-            qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; hidden where NaN.
-        """
+        """Show a hand in a pose [m, rad]; hide it if the pose is NaN."""
         if not np.isfinite(qpos).all():
             if self.mesh is not None and self.mesh.visible:
                 self.mesh.visible = False
@@ -218,7 +195,7 @@ class HandSkin:
             bone_wxyzs=quaternions,
             bone_positions=positions,
             skin_weights=weights,
-            color=self._color or SKIN_COLORS[model.shape.side],
+            color=self._color or _SKIN_COLORS[model.shape.side],
             opacity=self._opacity,
         )
 
@@ -229,19 +206,13 @@ def _poses(transforms: Float[np.ndarray, "L 4 4"]) -> tuple[NDArray[np.float64],
 
 
 class PointBalls:
-    """Up to `most` balls at once, all in one message a frame.
-
-    Args:
-        name: Of the node in the scene.
-        most: Number of balls.
-        radius: Of a ball [m].
-    """
+    """Up to `most` balls with a radius [m], all in one message a frame."""
 
     def __init__(
         self, server: ViserServer, name: str, label_names: tuple[str, ...], *, most: int, radius: float
     ) -> None:
         self._server, self._name, self._names = server, name, label_names
-        self._palette = label_colors(label_names)  # the last row is that of label -1
+        self._palette = label_colors(label_names)  # label -1 takes the last row
         self._texts: dict[int, LabelHandle] = {}
         self._chosen: frozenset[int] = frozenset()
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
@@ -261,12 +232,12 @@ class PointBalls:
             lod="off",
             cast_shadow=False,
         )
-        """All balls; those that are not in use have no size."""
+        """All balls; unused ones have size 0."""
 
     def show(
         self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], seen: Bool[np.ndarray, "N"]
     ) -> None:
-        """Show these points [m]; those that were not seen are small."""
+        """Show points [m]; those that were not seen are small."""
         count = min(len(points), len(self._positions))
         self._points, self._labels = points[:count], labels[:count]
         positions, scales, colors = self._positions.copy(), np.zeros_like(self._scales), self._colors.copy()
@@ -282,12 +253,12 @@ class PointBalls:
         self._show_names()
 
     def name(self, labels: frozenset[int]) -> None:
-        """Show the names of these labels, and no others, where their points are."""
+        """Show the names of these labels beside their points, and no others."""
         self._chosen = labels
         self._show_names()
 
     def nearest(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> int | None:
-        """The index of the shown point that is nearest to a ray; None where there are none."""
+        """The index of the shown point nearest to a ray; None without points."""
         if not len(self._points):
             return None
         unit = direction / np.linalg.norm(direction)
@@ -305,7 +276,7 @@ class PointBalls:
             if label not in self._texts:
                 self._texts[label] = self._server.scene.add_label(
                     f"{self._name}/names/{label}",
-                    self._names[label].rsplit(":", 1)[-1],  # the hand is seen
+                    self._names[label].rsplit(":", 1)[-1],
                     font_screen_scale=0.7,
                     anchor="bottom-left",
                 )
@@ -317,14 +288,13 @@ class PointBalls:
 
 
 class FrameView:
-    """The scene of a recording, with switches of what is shown."""
+    """The scene of a recording, with switches for its parts."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording = server, recording
         self._cameras_node = server.scene.add_frame("/cameras", show_axes=False)
         self._hands_node = server.scene.add_frame("/hands", show_axes=False)
         self.skins: list[HandSkin] = []
-        """The skins of the hands, in their order."""
         self.balls = PointBalls(
             server,
             "/points",
@@ -332,23 +302,21 @@ class FrameView:
             most=recording.most_points,
             radius=recording.radius,
         )
-        """The points."""
         self.bodies = [_add_body(server, body) for body in recording.bodies]
-        """The rigid bodies, in their order."""
         self._rays: LineSegmentsHandle | None = None
         self._clicked: frozenset[int] = frozenset()
-        self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points among the frame's
+        self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points in the frame
         self.on_pick: Callable[[int], None] = lambda index: None
-        """Called with the index of a point of the frame that was clicked."""
+        """Called with the index of a clicked point of the frame."""
         self._frame: ShownFrame | None = None
-        self._lock = threading.RLock()  # switches are pressed in threads of viser's pool
+        self._lock = threading.RLock()  # viser handles switches in other threads
         self._add_switches()
         if recording.rig is not None:
             show_rig(server, recording.rig)
         self.balls.balls.on_click(self._click)
 
     def show(self, frame: ShownFrame) -> None:
-        """Show a frame; all of it appears at once."""
+        """Show a frame, in one message."""
         with self._lock, self._server.atomic():
             while len(self.skins) < len(frame.hands):
                 self.skins.append(HandSkin(self._server, f"/hands/{len(self.skins)}"))
@@ -365,26 +333,25 @@ class FrameView:
             self._update_rays()
 
     def _add_switches(self) -> None:
-        with self._server.gui.add_folder("Show"):
-            self._names = self._server.gui.add_checkbox("names", False, hint="A click on a point names it.")
-            self._ghosts = self._server.gui.add_checkbox("unlabeled points", True)
-            self._filled = self._server.gui.add_checkbox(
-                "filled-in markers", True, visible=self._recording.has_filled
-            )
-            self._hands = self._server.gui.add_checkbox("skin", True, visible=self._recording.has_hands)
-            cameras = self._server.gui.add_checkbox("cameras", True, visible=self._recording.rig is not None)
-            center = self._server.gui.add_button("Look at the hands", color="gray", hint="C")
-            rays = self._recording.frame(0).rays if self._recording.num_frames else np.empty((0, 2, 3))
-            self._sight = self._server.gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
+        gui, recording = self._server.gui, self._recording
+        with gui.add_folder("Show"):
+            self._names = gui.add_checkbox("names", False, hint="A click on a point names it.")
+            self._ghosts = gui.add_checkbox("unlabeled points", True)
+            self._filled = gui.add_checkbox("filled-in markers", True, visible=recording.has_filled)
+            self._hands = gui.add_checkbox("skin", True, visible=recording.has_hands)
+            cameras = gui.add_checkbox("cameras", True, visible=recording.rig is not None)
+            center = gui.add_button("Look at the hands", color="gray", hint="C")
+            rays = recording.frame(0).rays if recording.num_frames else np.empty((0, 2, 3))
+            self._sight = gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
         for switch in (self._names, self._ghosts, self._filled, self._sight):
             switch.on_update(lambda _: self._refresh())
         center.on_click(self._look)
-        self._server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
+        gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
         cameras.on_update(lambda _: setattr(self._cameras_node, "visible", cameras.value))
         self._hands.on_update(lambda _: setattr(self._hands_node, "visible", self._hands.value))
 
     def _look(self, event: Any) -> None:
-        """Move the eye of the page that asks, so that the hands are in the middle; it keeps its direction."""
+        """Move the eye of the requesting page, without turning it, so that the hands are in the middle."""
         frame, client = self._frame, event.client
         if frame is None or client is None:
             return
@@ -423,7 +390,7 @@ class FrameView:
             )
 
     def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
-        """Name the clicked marker, or leave it without a name again."""
+        """Show or hide the name of the clicked marker."""
         index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))
         if index is None:
             return
@@ -434,7 +401,7 @@ class FrameView:
 
 
 def _add_body(server: ViserServer, body: RigidBody) -> MeshHandle | FrameHandle:
-    """A body's surface, where that is known, or its axes."""
+    """Add a body's surface if it is known, else its axes."""
     name, thing = f"/bodies/{body.name.replace('/', '_')}", body.shape
     if thing is None:
         return server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002)

@@ -1,4 +1,4 @@
-"""Time in the page: a recording is played, with texts and plots beside it, or a live tracker is shown."""
+"""Time in the page: a recording is played, with texts and plots, or a live tracker is shown."""
 
 from __future__ import annotations
 
@@ -25,25 +25,20 @@ if TYPE_CHECKING:
     from handsim.space.rig import CameraRig
 
 PICTURES: Final = 60.0
-"""Pictures per second while playing, at most [Hz]."""
+"""Most pictures per second while playing [Hz]."""
 _SPEEDS: Final = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_SLIDER: Final = 0.1  # [s] between two moves of the slider while playing
-_IDLE: Final = 0.2  # [s] between two looks at whether the viewer shall end
-
-Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "pagedown"]
-_EVERY: Final = 0.1  # [s] between two texts while frames follow each other quickly
+_SLIDER_PERIOD: Final = 0.1  # [s] between two moves of the slider while playing
+_IDLE: Final = 0.2  # [s], the longest wait before `ended` is asked again
+_TEXT_PERIOD: Final = 0.1  # [s] between two texts while playing
+_LIVE_TEXT_PERIOD: Final = 0.2  # [s]
 _COLUMNS: Final = 600  # of a plot
 _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
-_TEXT_EVERY: Final = 0.2  # [s]
+
+Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "pagedown"]
 
 
 class Timeline:
-    """Chooses frames; `run` shows them in the thread that calls it, everything else only asks for one.
-
-    Args:
-        times: Time of each frame [s], increasing.
-        show: Called with the index of each frame that is to be shown.
-    """
+    """Chooses frames; `run` calls `show` with their indices, all other methods only request one."""
 
     def __init__(
         self, server: ViserServer, times: Float[np.ndarray, "T"], show: Callable[[int], None]
@@ -51,7 +46,7 @@ class Timeline:
         self._times, self._show = times, show
         self._wake = threading.Event()
         self._index, self._shown, self._playing = 0, -1, False
-        self._anchor = (0.0, 0.0)  # clock and time of the take at which playing began
+        self._anchor = (0.0, 0.0)  # clock and time of the recording when playing began [s]
         self._slider_due = 0.0
         last = max(len(times) - 1, 1)
         gui = server.gui
@@ -68,16 +63,16 @@ class Timeline:
 
     @property
     def index(self) -> int:
-        """The frame that was asked for last."""
+        """The frame that was requested last."""
         return self._index
 
     @property
     def playing(self) -> bool:
-        """Whether frames follow each other by themselves."""
+        """Whether the recording is being played."""
         return self._playing
 
     def go_to(self, index: int) -> None:
-        """Ask for a frame; one beyond an end is the one at that end."""
+        """Request a frame; indices beyond the ends mean the first or last frame."""
         self._index = int(np.clip(index, 0, len(self._times) - 1))
         self._set_anchor()
         self._wake.set()
@@ -88,7 +83,7 @@ class Timeline:
         self.go_to(index)
 
     def step(self, frames: int) -> None:
-        """Stop playing and go so many frames on, or back."""
+        """Stop playing and go some frames on, or back."""
         self.play(False)
         self.go_to(self._index + frames)
 
@@ -97,7 +92,7 @@ class Timeline:
         self.play(not self._playing)
 
     def play(self, playing: bool) -> None:
-        """Play, or stop playing; at the end it begins anew."""
+        """Play, or stop playing; after the end the recording begins anew."""
         if playing != self._playing:
             self._button.label = "Pause" if playing else "Play"
         self._playing = playing and len(self._times) > 1
@@ -105,7 +100,7 @@ class Timeline:
         self._wake.set()
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Show what is asked for until `ended`."""
+        """Show the requested frames until `ended`."""
         due = time.perf_counter()
         while not ended():
             if self._playing:
@@ -117,12 +112,12 @@ class Timeline:
             self._wake.clear()
 
     def refresh(self) -> None:
-        """Ask for the frame again: what it shows has changed."""
+        """Request the same frame again, because its content has changed."""
         self._shown = -1
         self._wake.set()
 
     def update(self) -> None:
-        """Show the frame that was asked for, unless it is shown."""
+        """Show the requested frame, unless it is shown."""
         index = self._index
         if index == self._shown:
             return
@@ -131,12 +126,12 @@ class Timeline:
         now = time.perf_counter()
         if not self._playing or now >= self._slider_due:
             self._slider.value = index  # type: ignore[misc]  # viser sets it through __setattr__
-            self._slider_due = now + _SLIDER
+            self._slider_due = now + _SLIDER_PERIOD
 
     def _advance(self) -> None:
         clock, begin = self._anchor
         now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
-        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame has its time too
+        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame is shown for one interval
             self._index = 0
             self._set_anchor()
             return
@@ -163,55 +158,49 @@ class Timeline:
             server.gui.add_command(label, hotkey=key).on_trigger(partial(_call, action))
 
 
-def _call(action: Callable[[], None], _event: object) -> None:
-    action()
+def _call(action: Callable[..., None], *arguments: Any) -> None:
+    """Call an action without the event, which viser gives as the last argument."""
+    action(*arguments[:-1])
 
 
 class StatusPanel:
-    """Text of the shown frame, plots, and rows that lead to doubtful frames."""
+    """Text of the shown frame, plots, and buttons that lead to doubtful frames."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording, self._due = server, recording, 0.0
         self.text = server.gui.add_markdown("")
-        """The state of the frame."""
         self._go_to: Callable[[int], None] = lambda frame: None
         self._rows: GuiFolderHandle | None = None
         self._buttons: list[GuiButtonHandle] = []
         self._plots: list[tuple[GuiUplotHandle, list[int]]] = []
 
     def add_doubts(self, go_to: Callable[[int], None]) -> None:
-        """Add the rows of doubtful frames, if there are any.
-
-        Args:
-            go_to: Called with a frame whose row was clicked.
-        """
+        """Add buttons that call `go_to` with a doubtful frame, if there are such frames."""
         self._go_to = go_to
         if self._recording.suspects:
             self._rows = self._server.gui.add_folder("Doubtful frames")
             self._add_rows(self._rows)
 
     def add_plots(self) -> None:
-        """Add the plots, if there is anything to plot."""
-        server, recording = self._server, self._recording
-        if recording.curves and recording.num_frames > 1:
-            with server.gui.add_folder("Over time", expand_by_default=True):
-                groups: dict[bool, list[int]] = {}
-                for number, curve in enumerate(recording.curves):
-                    groups.setdefault(curve.name.endswith("]"), []).append(number)
-                plots = []
-                for numbers in groups.values():
-                    series: list[uplot.Series] = [{"label": "time [s]"}]
-                    for number, stroke in zip(numbers, _STROKES, strict=False):
-                        name = recording.curves[number].name
-                        series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
-                    plot = server.gui.add_uplot(
-                        _columns(recording, numbers), tuple(series), scales={"x": {"time": False}}, aspect=2.2
-                    )
-                    plots.append((plot, numbers))
-                self._plots = plots
+        """Add a plot of the curves with a unit and one of those without, if there are such curves."""
+        gui, recording = self._server.gui, self._recording
+        if not recording.curves or recording.num_frames < 2:
+            return
+        groups: dict[bool, list[int]] = {}
+        for number, curve in enumerate(recording.curves):
+            groups.setdefault(curve.name.endswith("]"), []).append(number)
+        with gui.add_folder("Over time", expand_by_default=True):
+            for numbers in groups.values():
+                series: list[uplot.Series] = [{"label": "time [s]"}]
+                for number, stroke in zip(numbers, _STROKES, strict=False):
+                    name = recording.curves[number].name
+                    series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
+                columns = _columns(recording, numbers)
+                plot = gui.add_uplot(columns, tuple(series), scales={"x": {"time": False}}, aspect=2.2)
+                self._plots.append((plot, numbers))
 
     def renew(self) -> None:
-        """Show the rows and the plots of a recording that was changed."""
+        """Renew buttons and plots of a recording that was changed."""
         if self._rows is not None:
             for row in self._buttons:
                 row.remove()
@@ -225,46 +214,34 @@ class StatusPanel:
             for doubt in self._recording.suspects:
                 span = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first}-{doubt.last}"
                 row = self._server.gui.add_button(f"{span}: {doubt.words}", color="gray")
-                row.on_click(partial(_jump, self._go_to, doubt.worst))
+                row.on_click(partial(_call, self._go_to, doubt.worst))
                 self._buttons.append(row)
 
     def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
-        """Show the state of a frame; where `hurried`, not more than ten times a second."""
+        """Show the state of a frame; if `hurried`, at most ten times a second."""
         now = time.perf_counter()
         if hurried and now < self._due:
             return
-        self._due = now + _EVERY
+        self._due = now + _TEXT_PERIOD
         head = f"**frame {index}** of {self._recording.num_frames}, {frame.time:.3f} s"
         self.text.content = "\n\n".join((head, *frame.words))
 
 
-def _jump(go_to: Callable[[int], None], frame: int, _event: object) -> None:
-    go_to(frame)
-
-
 def _columns(recording: Recording, numbers: list[int]) -> tuple[np.ndarray, ...]:
-    """Times, and the values of some curves."""
+    """Thinned times, and the thinned values of some curves."""
     columns = [thinned(recording.times, recording.curves[number].values) for number in numbers]
     return (columns[0][0], *(values for _, values in columns))
 
 
 def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
-    """A curve of at most as many values as a plot has columns: the largest of each column.
-
-    Args:
-        times: (T,) [s].
-        values: (T,); NaN where there is none.
-    """
+    """Times and largest values of the columns of a plot, from a curve (T,) that may hold NaN."""
     step = -(-len(times) // _COLUMNS)
     starts = np.arange(0, len(times), step)
     return times[starts], np.fmax.reduceat(values, starts)
 
 
 class LiveView(Closing):
-    """Shows the newest frame of a tracker, from a thread of its own; frames in between are left out.
-
-    It takes frames as a sink does.
-    """
+    """A `FrameOutput` that shows a tracker's newest frame, from a thread of its own."""
 
     def __init__(self, server: ViserServer, rig: CameraRig | None = None) -> None:
         self._server, self._rig = server, rig
@@ -272,11 +249,11 @@ class LiveView(Closing):
         self._came, self._ending = threading.Event(), False
         self._thread: threading.Thread | None = None
         self.frames = self.pictures = 0
-        """Frames that came, and pictures that were made of them."""
+        """Numbers of tracked and of shown frames."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """No frame counts as dropped."""
+        """Empty: frames that are not shown do not count as dropped."""
         return {}
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
@@ -288,7 +265,7 @@ class LiveView(Closing):
         self._thread.start()
 
     def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Give the newest frame; this takes microseconds, whatever the page does."""
+        """Replace the newest frame, in microseconds."""
         if not frame.silent:
             self.frames += 1
             self._newest = (frame, tracked)
@@ -322,7 +299,7 @@ class LiveView(Closing):
                 is_staged = True
             now = time.perf_counter()
             if now >= text_due:
-                text_due = now + _TEXT_EVERY
+                text_due = now + _LIVE_TEXT_PERIOD
                 self._text.content = "\n\n".join((f"**live** frame {newest[0].number}", *shown.words))
             due = max(due + 1.0 / PICTURES, now)
             time.sleep(due - now)

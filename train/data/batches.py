@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,18 +15,20 @@ from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
 from handsim.settings import Limits, Settings
-from train.data.shards import MappedRows
 
-_MOST: Final = 100  # points to add to a cloud or drop from it
+if TYPE_CHECKING:
+    from train.data.shards import MappedRows
+
+_MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
 class Corruption(Settings):
     """The paper's corruption, as it is drawn for training and for tests."""
 
-    occlude: Annotated[int, Limits(0, _MOST)] = 5
+    occlude: Annotated[int, Limits(0, _MAX_CHANGED)] = 5
     """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
-    ghosts: Annotated[int, Limits(0, _MOST)] = 2
+    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 2
     """Most ghosts added, uniform in the sample's box grown by `margin`."""
     jitter: Annotated[float, Limits(0.0, 0.1)] = 0.0
     """Half width of the uniform noise on each coordinate [m]."""
@@ -71,10 +73,10 @@ def corrupt(
     if not isinstance(markers, np.ndarray) or markers.ndim != 3 or markers.shape[2] != 3:
         raise ArgumentError(f"markers is {shown_value(markers)}, expected an array (B, M, 3) [m]")
     batch, count = markers.shape[:2]
-    present = np.isfinite(markers).all(-1)
+    known = np.isfinite(markers).all(-1)
     positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)
-    present &= ~_draw_drops(batch, count, corruption.occlude, rng)
-    drawn = _draw_ghosts(positions, np.isfinite(markers).all(-1), corruption, rng)
+    present = known & ~_draw_drops(batch, count, corruption.occlude, rng)
+    drawn = _draw_ghosts(positions, known, corruption, rng)
     parts = [positions, drawn] if ghosts is None else [positions, drawn, ghosts]
     points = np.concatenate(parts, axis=1)
     present = np.concatenate([present, *(np.isfinite(part).all(-1) for part in parts[1:])], axis=1)
@@ -90,7 +92,7 @@ def shuffled(
     *,
     rng: np.random.Generator,
 ) -> Cloud:
-    """The points [m] that are there in random order, with as little padding as the fullest cloud needs."""
+    """Clouds of the present points [m] in random order, padded to the length of the fullest cloud."""
     order = rng.random(present.shape).argsort(axis=1)
     order = np.take_along_axis(
         order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1
@@ -108,16 +110,15 @@ def _draw_drops(batch: int, count: int, most: int, rng: np.random.Generator) -> 
     if most:
         num_draws = rng.integers(0, most + 1, size=batch)
         draws = rng.integers(0, count, size=(batch, most))
-        taken = np.arange(most) < num_draws[:, None]
-        rows = np.broadcast_to(np.arange(batch)[:, None], draws.shape)
-        dropped[rows[taken], draws[taken]] = True
+        row, draw = np.nonzero(np.arange(most) < num_draws[:, None])
+        dropped[row, draws[row, draw]] = True
     return dropped
 
 
 def _draw_ghosts(
     positions: NDArray[np.float64], known: NDArray[np.bool_], corruption: Corruption, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Zero to `ghosts` points uniform in each sample's box, NaN where none."""
+    """Zero to `ghosts` points uniform in each cloud's box [m], NaN for those that are not drawn."""
     batch, most = len(positions), corruption.ghosts
     low = np.where(known[..., None], positions, np.inf).min(1)
     high = np.where(known[..., None], positions, -np.inf).max(1)
@@ -132,8 +133,8 @@ def _draw_ghosts(
 CORRUPTIONS: Final = "handsim.corruptions"
 """Group of entry points of corruptions."""
 _NOUN: Final = "corruption"
-_FARTHEST: Final = 10.0  # [m] of a point from the markers' middle
-_MOST_POINTS: Final = 512  # points of a cloud
+_MAX_COORDINATE: Final = 10.0  # of a point, from the middle of the markers [m]
+_MAX_POINTS: Final = 512  # points of a cloud
 
 
 class OwnCorruption(Protocol):
@@ -159,16 +160,9 @@ def draw_cloud(
     *,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m] by our corruption or a user's, see `own_cloud`."""
+    """Shuffled clouds (B, N) of clean markers [m] by our corruption or a user's."""
     if isinstance(corruption, Corruption):
         return corrupt(markers, corruption, rng=rng)
-    return own_cloud(corruption, markers, rng=rng)
-
-
-def own_cloud(
-    corruption: OwnCorruption | str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
-) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m] by a user's corruption."""
     if isinstance(corruption, str):
         function = load_plugin(corruption, group=CORRUPTIONS, noun=_NOUN)
     else:
@@ -189,18 +183,19 @@ def own_cloud(
 
 
 def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
-    """Load a corruption and try it on two clouds, before the work."""
+    """Load a corruption and try it on two clouds."""
     rng = np.random.default_rng(0)
-    own_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
+    draw_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
 
 def _check(
     owner: str, points: NDArray[np.float64], labels: NDArray[np.generic], batch: int, count: int
 ) -> None:
-    if points.ndim != 3 or points.shape[0] != batch or points.shape[2] != 3 or points.shape[1] > _MOST_POINTS:
+    """Refuse what a user's corruption returned for `count` markers of a batch, unless it is valid."""
+    if points.ndim != 3 or points.shape[0] != batch or points.shape[2] != 3 or points.shape[1] > _MAX_POINTS:
         raise ArgumentError(
             f"{owner} returns points of shape {points.shape}, expected ({batch}, N, 3) with N up to "
-            f"{_MOST_POINTS}"
+            f"{_MAX_POINTS}"
         )
     if labels.shape != points.shape[:2] or labels.dtype.kind not in "iu":
         raise ArgumentError(
@@ -208,10 +203,10 @@ def _check(
             f"{points.shape[:2]}"
         )
     missing = np.isnan(points)
-    if (missing.any(axis=-1) != missing.all(axis=-1)).any() or (np.abs(points) > _FARTHEST).any():
+    if (missing.any(axis=-1) != missing.all(axis=-1)).any() or (np.abs(points) > _MAX_COORDINATE).any():
         raise ArgumentError(
-            f"{owner} returns points of which some coordinates are NaN or beyond {_FARTHEST:g} m, expected "
-            "meters, and NaN for whole points that are missing"
+            f"{owner} returns points of which some coordinates are NaN or beyond {_MAX_COORDINATE:g} m, "
+            "expected meters, and NaN for whole points that are missing"
         )
     there = ~missing.any(axis=-1)
     known = np.where(there, labels, -1).astype(np.int64)
@@ -225,16 +220,16 @@ def _check(
 
 
 class Weights(NamedTuple):
-    """Factors of the losses of a part of a batch; the mean over all parts is then the loss of the batch."""
+    """Factors of the losses of a part of a batch, so that their mean over all parts is the batch's loss."""
 
     points: float = 1.0
-    """Of a mean over points."""
+    """Factor of a mean over points."""
     clouds: float = 1.0
-    """Of a mean over clouds."""
+    """Factor of a mean over clouds."""
 
 
 WHOLE: Final = Weights()
-"""Of the whole batch."""
+"""The factors for the whole batch."""
 
 
 class Batch(NamedTuple):
@@ -242,19 +237,19 @@ class Batch(NamedTuple):
 
     cloud: Cloud
     markers: Float[np.ndarray, "B M 3"]
-    """True positions [m] of all markers, the lost ones too, in the clouds' frame: centered, not rotated."""
+    """True positions of all markers, centered like the clouds [m]."""
     weights: Weights = WHOLE
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Which clouds of every batch one of several processes learns from: every `count`-th from `first` on."""
+    """The clouds of a batch from which one of several processes learns: every `count`-th from `first` on."""
 
     first: int = 0
     count: int = 1
 
     def of(self, batch: Batch) -> Batch:
-        """These clouds of a batch; the whole batch where there is one part."""
+        """This part of a batch."""
         if self.count == 1:
             return batch
         mine = slice(self.first, None, self.count)
@@ -276,13 +271,13 @@ class BatchRecipe:
     """How a batch is drawn."""
 
     batch: int
-    """Clouds."""
+    """Number of clouds."""
     corruption: Corruption | OwnCorruption | str
-    """What is done to clean markers, or whose: a function or its name."""
+    """Corruption of clean markers, or a user's function or its name."""
     jitter: float = 0.0
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: float = 0.0
-    """Share of batches that are what the simulated rig sees."""
+    """Share of batches with the points that the simulated rig sees."""
     anisotropy: float = 0.0
     """Log standard deviation of the stretch of each hand along three random directions."""
 
@@ -290,12 +285,11 @@ class BatchRecipe:
 def draw_batch(
     rows: NDArray[np.void] | MappedRows, recipe: BatchRecipe, *, rng: np.random.Generator
 ) -> Batch:
-    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones."""
+    """Corrupted, centered clouds of random rows [m]; left hands are mirrored to right ones."""
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)
     center = markers.mean(axis=1, keepdims=True)
-    stretch = _stretches(len(markers), recipe.anisotropy, rng)
-    stretch = _mirrors(chosen["hand"]) @ stretch
+    stretch = _mirrors(chosen["hand"]) @ _stretches(len(markers), recipe.anisotropy, rng)
     markers = (markers - center) @ stretch
     jitter = recipe.jitter * rng.uniform()
     if rng.random() < recipe.rig_share:
@@ -312,7 +306,7 @@ def draw_batch(
 def right_hands(
     rows: NDArray[np.void] | MappedRows, anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
-    """All markers of each row [m], of left hands mirrored; each hand is stretched around its center."""
+    """Centered markers of all rows [m], left hands mirrored, each hand stretched at random."""
     markers = rows["markers"]
     centered = markers - markers.mean(axis=1, keepdims=True)
     return stretched(centered @ _mirrors(rows["hand"]), anisotropy, rng=rng)
@@ -321,7 +315,7 @@ def right_hands(
 def stretched(
     markers: Float[np.ndarray, "B M 3"], anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
-    """Hands stretched at random around the origin, by this standard deviation of the logarithm."""
+    """Hands [m] stretched at random around the origin; anisotropy is the log standard deviation."""
     return markers @ _stretches(len(markers), anisotropy, rng)
 
 
@@ -333,7 +327,7 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
 
 
 def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Matrices (B, 3, 3) that mirror left hands; the two hands of a person are in the order of `SIDES`."""
+    """Matrices (B, 3, 3) that mirror left hands; a person's hands are stored in the order of `SIDES`."""
     mirrors = np.tile(np.eye(3), (len(hand), 1, 1))
     mirrors[hand % len(SIDES) == SIDES.index("left"), 0, 0] = -1.0
     return mirrors

@@ -35,11 +35,11 @@ from handsim.settings import Limits, Settings
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
 CONFIG: Final = "config.json"
-_LONGEST_NAME: Final = 100  # bytes; file systems take 255
+_MAX_NAME_BYTES: Final = 100  # of a file's name; file systems take 255
 
 
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
-    """One frame of one hand.
+    """The record of one frame of one hand.
 
     `qpos` (position [m], quaternion wxyz, 20 joint angles [rad]), `hand` (its index in the shard's hands),
     true `markers` (M, 3) [m], `cameras` with a free view of each marker (bits), positions `observed` by the
@@ -59,11 +59,11 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True)
 class Manifest(Settings):
-    """What a finished training set is made of."""
+    """The contents of a finished training set."""
 
     noun: ClassVar[str] = "field"
     config: dict[str, Any]
-    """The settings that made it."""
+    """Settings of the training set."""
     marker_names: tuple[str, ...]
     num_frames: Annotated[int, Limits(1)]
     min_cameras: Annotated[int, Limits(1)]
@@ -71,50 +71,48 @@ class Manifest(Settings):
     files: dict[str, str]
     """SHA-256 of every file, by name."""
     redrawn: dict[str, int] | None = None
-    """How often people or scenes had to be drawn again, by reason; None in a set that did not count them."""
+    """Number of people and scenes that were drawn again, by reason; None in old sets, which did not count."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
     def check(self) -> None:
-        """Refuse tables that are none, names that are equal, and files of other folders."""
+        """Refuse wrong types, equal marker names, and files of other folders."""
         if not isinstance(self.config, dict):
             raise ArgumentError("config is not a table")
         if not 0 < len(set(self.marker_names)) == len(self.marker_names):
             raise ArgumentError("marker_names is not a list of different names")
-        if not (_is_table_of(self.files, str) and all(map(_is_file_name, self.files))):
+        here = _is_table_of(self.files, str) and all(
+            Path(name).name == name and len(name.encode(errors="replace")) <= _MAX_NAME_BYTES
+            for name in self.files
+        )
+        if not here:
             raise ArgumentError("files is not a table of names of files in this folder and their SHA-256")
         if not (self.redrawn is None or _is_table_of(self.redrawn, int)):
             raise ArgumentError("redrawn is not a table of counts")
 
 
-def _is_file_name(name: str) -> bool:
-    return Path(name).name == name and len(name.encode(errors="replace")) <= _LONGEST_NAME
-
-
 def _is_table_of(value: object, kind: type) -> bool:
+    """Whether a value is a dictionary whose values have this type."""
     return isinstance(value, dict) and all(type(entry) is kind for entry in value.values())
 
 
 def rows_name(shard: int) -> str:
-    """File of a shard's rows."""
+    """Name of the file of a shard's rows."""
     return f"rows-{shard:05d}.npy"
 
 
 def hands_name(shard: int) -> str:
-    """File of a shard's hands."""
+    """Name of the file of a shard's hands."""
     return f"hands-{shard:05d}.npy"
 
 
 def redrawn_name(shard: int) -> str:
-    """File of a shard's counts of what was drawn again."""
+    """Name of the file of a shard's counts of redraws."""
     return f"redrawn-{shard:05d}.json"
 
 
 def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
-    """How often people or scenes were drawn again in all shards, by reason.
-
-    None where a shard has no counts, as those of earlier versions.
-    """
+    """Counts of redraws in all shards, by reason; None if an earlier version made a shard."""
     files = [path / redrawn_name(shard) for shard in range(num_shards)]
     if not all(file.is_file() for file in files):
         return None
@@ -125,7 +123,7 @@ def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
 
 
 def array_bytes(dtype: np.dtype[np.void], count: int) -> int:
-    """Length of the `.npy` file of so many records [bytes]."""
+    """Length of the `.npy` file of `count` records [bytes]."""
     header = io.BytesIO()
     about = np.lib.format.header_data_from_array_1_0(np.empty(0, dtype=dtype)) | {"shape": (count,)}
     np.lib.format.write_array_header_1_0(header, about)
@@ -133,15 +131,15 @@ def array_bytes(dtype: np.dtype[np.void], count: int) -> int:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an `.npy` file, whole or not at all."""
-    # Not numpy.save: it reports a full disk as "8192 requested and 6690 written", without its errno.
+    """Write an `.npy` file, complete or not at all."""
+    # numpy.save reports a full disk as "8192 requested and 6690 written", without its errno.
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
         file.write(np.ascontiguousarray(array).tobytes())
 
 
 def load_manifest(path: Path) -> Manifest:
-    """The manifest of a finished training set; its files are not checked."""
+    """The manifest of a finished training set, whose other files are not checked."""
     file = path / MANIFEST
     if not file.is_file():
         hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
@@ -198,7 +196,7 @@ class Dataset:
             )
 
     def _copied(self, place: UPath) -> Path:
-        """A copy of the files of an object store, removed with the set."""
+        """A copy of the files of an object store, removed together with the `Dataset`."""
         self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")
         folder = Path(self._copy.name)
         for name in (MANIFEST, CONFIG):
@@ -209,12 +207,13 @@ class Dataset:
         return folder
 
     def _map_shards(self) -> list[NDArray[np.void]]:
+        """The memory-mapped rows of each shard."""
         names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
         dtype = row_dtype(len(self.manifest.marker_names))
         return [_load_records(self.path / name, dtype) for name in names]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The folder alone: another process maps the same pages, which are checked already."""
+        """The folder and the manifest: another process maps the same pages without checking them again."""
         return {"path": self.path.absolute(), "manifest": self.manifest}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -255,7 +254,7 @@ class Dataset:
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:
-    """A training set as it is, or by its folder."""
+    """A training set that is given as an object or by its folder."""
     if isinstance(dataset, Dataset):
         return dataset
     check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")
@@ -263,7 +262,7 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
 
 
 def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """A memory-mapped list of records of this type; a `DatasetError` if the file holds something else."""
+    """Memory-mapped records of this type; a `DatasetError` if the file holds something else."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)
@@ -314,7 +313,7 @@ class MappedRows:
         return rows
 
     def _parts(self) -> list[NDArray[np.void]]:
-        """What each array has of the rows."""
+        """The rows of this span in each array."""
         firsts = [int(end) - len(shard) for end, shard in zip(self._ends, self._shards, strict=True)]
         return [
             shard[max(self._start - first, 0) : max(self._stop - first, 0)]

@@ -1,7 +1,7 @@
-"""What a rig sees of hands at work: simulated people, or those of a take, and what becomes of their markers.
+"""Forecasts of what a rig captures of hands at work, which are simulated or those of a take.
 
 Captures are forecast in the rooms of simulated takes; the error of points is a covariance, from the noise of
-blobs in the pictures. Gloves are scored on single frames, which `observe_poses` and `observe_motion` give.
+blobs in the pictures. Gloves are scored on the single frames of `observe_poses` and `observe_motion`.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ from train.simulation.training_frames import (
 )
 
 HALF_SIDE: Final = 0.3
-"""Half side of the cube that hands work in unless somebody says otherwise [m]."""
+"""Half side of the cube that hands work in by default [m]."""
 OPTICS: Final = OpticsConfig()
 """Noise of blobs and size of visible spots, the same in every room."""
 _REAL_LIKE: Final = "real-like"
 _MAX_PEOPLE: Final = 10
-_FEWEST_FRAMES: Final = 12  # of a stretch of a take without a break
-_ROUND: Final = (11.0, 14.0, 9.0)  # through the volume and back along each axis [s]
-_POSES_EACH: Final = 60  # poses of each person in single frames
-_ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
+_MIN_FRAMES: Final = 12  # frames in a row of a take that is used
+_ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # time through the volume and back along each axis [s]
+_POSES_PER_PERSON: Final = 60
+_ERROR_SAMPLES: Final = 4000  # marker-frames of a scene from which the error is estimated
 
 
 def sample_work(
@@ -73,9 +73,9 @@ def sample_work(
     *,
     rng: np.random.Generator,
 ) -> dict[str, list[SceneMotion]]:
-    """What the gloved hands of several people do, by kind of work: real-like, and as in the paper's captures.
+    """Scenes of several people by kind of work: real-like, and as in the paper's captures.
 
-    They work around the center of a volume; through one that is longer than hands reach, people walk [m].
+    Hands work around the center of a volume [m]; people walk through a volume that is longer than they reach.
     """
     work: dict[str, list[SceneMotion]] = {}
     for kind in (_REAL_LIKE, *KINDS):
@@ -88,7 +88,7 @@ def sample_work(
 
 
 def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """The motion of the first person who can do it."""
+    """A scene of the first random person who can do this work."""
     if kind != _REAL_LIKE:
         return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
     reason: PoseError | None = None
@@ -103,14 +103,14 @@ def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random
 def _walk(
     seconds: float, frames: int, sides: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Offsets (T, 3) [m] to and fro through the part of the volume that hands in its middle do not reach."""
+    """Offsets (T, 3) [m] to and fro through the parts of a volume beyond the reach from its middle."""
     reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
-    turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND + rng.random(3)
+    turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND_TRIP + rng.random(3)
     return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))
 
 
 def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
-    """The same motion somewhere else in each frame [m]."""
+    """A scene whose frames are moved by offsets [m]."""
     hands = []
     for hand in scene.hands:
         qpos = hand.qpos.copy()
@@ -125,55 +125,49 @@ def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
 
 
 def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
-    """The first frames of a take where its hands were, in stretches in which every hand has a pose.
-
-    The hands wear another glove if one is given.
-    """
+    """Scenes of the first frames of a take in which every hand has a pose, perhaps in another glove."""
     fits = [hand if layout is None else attach(layout, hand.model) for hand in take.hands]
     whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames
     for first, last in runs_of(whole):
         part = slice(first, min(last + 1, first + left))
-        if part.stop - part.start >= _FEWEST_FRAMES:
+        if part.stop - part.start >= _MIN_FRAMES:
             left -= part.stop - part.start
-            scenes.append(_scene(take, fits, part))
+            hands = tuple(
+                GlovedHand(fit, np.ascontiguousarray(take.qpos[part, number]))
+                for number, fit in enumerate(fits)
+            )
+            held = None
+            for number, body in enumerate(take.bodies):
+                thing, poses = body.shape, take.body_poses[part, number]
+                if held is None and thing is not None and np.isfinite(poses).all():
+                    held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
+            scenes.append(SceneMotion(hands, held, take.rate))
     if not scenes:
         raise CaptureError(
-            f"the take has no {_FEWEST_FRAMES} frames in a row in which every hand has a pose, expected some"
+            f"the take has no {_MIN_FRAMES} frames in a row in which every hand has a pose, expected some"
         )
     return {"the take": scenes}
 
 
-def _scene(take: Take, fits: list[GloveFit], part: slice) -> SceneMotion:
-    hands = tuple(
-        GlovedHand(fit, np.ascontiguousarray(take.qpos[part, number])) for number, fit in enumerate(fits)
-    )
-    held = None
-    for number, body in enumerate(take.bodies):
-        thing, poses = body.shape, take.body_poses[part, number]
-        if held is None and thing is not None and np.isfinite(poses).all():
-            held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
-    return SceneMotion(hands, held, take.rate)
-
-
 class ObservedHand(NamedTuple):
-    """One hand in some frames."""
+    """One hand in some frames, and what a rig captures of it."""
 
     fit: GloveFit
     qpos: Float[np.ndarray, "T 27"]
     frames: HandFrames
-    """What rig and optical system make of it."""
+    """True and captured markers."""
 
 
 def observe_poses(
     layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
 ) -> list[ObservedHand]:
-    """Random people's hands in the poses and scenes of training sets; at least so many frames in all."""
+    """Random people's hands in the poses and scenes of training sets, in at least `num_frames` frames."""
     config, observed, done = GenerateSettings(), [], 0
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     while done < num_frames:
         models = sample_hands(config.population, rng=rng)
-        scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
+        scene = sample_frame_scene(models, _POSES_PER_PERSON, config, rng=rng)
         fits = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         hands = list(_observe(scene, fits, rig, rng))
         observed += hands
@@ -184,7 +178,7 @@ def observe_poses(
 def observe_motion(
     take: Take, layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
 ) -> list[ObservedHand]:
-    """The hands of a take in another glove, in at most so many of its frames, in the middle of the rig."""
+    """The hands of a take in another glove, in up to `num_frames` frames, moved to the middle of the rig."""
     posed = np.flatnonzero(np.isfinite(take.qpos).all(axis=(1, 2)))
     if not len(posed):
         raise CaptureError("there is no frame in which every hand of the take has a pose, expected one")
@@ -200,8 +194,9 @@ def observe_motion(
 def _observe(
     scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
 ) -> Iterator[ObservedHand]:
+    """What the rig captures of each hand of unrelated frames."""
     config = GenerateSettings()
-    # Single frames do not continue points, so that two rays are enough, as for points that exist already.
+    # In single frames two rays are enough for a point, as for one that exists already in a capture.
     optics = dataclasses.replace(config.optics, min_rays_to_start=config.min_cameras)
     frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)
     for fit, qpos, seen in zip(fits, scene.qpos, frames, strict=True):
@@ -209,16 +204,16 @@ def _observe(
 
 
 class LitScene(NamedTuple):
-    """A scene, and all that shines in it as the cameras of a rig see it."""
+    """A scene, and its light sources as the cameras of a rig see them."""
 
     scene: SceneMotion
     sources: LightSources
     optics: OpticsConfig
-    """Noise and losses of the room."""
+    """Noise and losses of the optical system."""
 
     @property
     def num_markers(self) -> int:
-        """Markers of the hands, the first of the sources."""
+        """Number of the hands' markers, which are the first of the sources."""
         return sum(hand.fit.layout.num_markers for hand in self.scene.hands)
 
     @property
@@ -227,7 +222,7 @@ class LitScene(NamedTuple):
         return self.sources.visible[:, : self.num_markers]
 
     def without(self, camera: int) -> LitScene:
-        """The same scene before one camera less."""
+        """The same scene without a camera."""
         visible = np.delete(self.sources.visible, camera, axis=2)
         return self._replace(sources=self.sources._replace(visible=visible))
 
@@ -235,7 +230,7 @@ class LitScene(NamedTuple):
 def light(
     scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
 ) -> list[LitScene]:
-    """Cast all lines of sight; refuses a rig with a camera in the hands."""
+    """Cast all lines of sight of a room; an `ArgumentError` if a camera stands in the hands."""
     return [
         LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
         for scene in scenes
@@ -245,7 +240,7 @@ def light(
 def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
-    """`light` for scenes of each kind of work, in the rooms that simulated takes of it have by default."""
+    """Cast the lines of sight for scenes by kind of work, each in the default room of its kind."""
     return {
         kind: [lit for scene in scenes for lit in light([scene], rig, _room(kind, scene), rng=rng)]
         for kind, scenes in work.items()
@@ -253,7 +248,7 @@ def light_work(
 
 
 def _room(kind: str, scene: SceneMotion) -> RoomConfig:
-    """The room of simulated takes of this kind of work, or of the kind most like it, as for a take."""
+    """The room of simulated takes of this kind of work, or of the most similar kind."""
     if kind not in SIMULATED_KINDS:
         free = "hand-hand" if len(scene.hands) > 1 else "single-hand"
         kind = free if scene.moving_object is None else "hand-pen"
@@ -261,7 +256,7 @@ def _room(kind: str, scene: SceneMotion) -> RoomConfig:
 
 
 class ErrorEllipsoid(NamedTuple):
-    """The error of points, averaged."""
+    """The average error of triangulated points."""
 
     axes: Float[np.ndarray, "3"]
     """Standard deviations along the directions, the longest first [m]; NaN without points."""
@@ -273,7 +268,7 @@ class ErrorEllipsoid(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """What a rig makes of hands at work; shares are of marker-frames: every marker in every frame."""
+    """A forecast of a capture; shares are of marker-frames: every marker in every frame."""
 
     marker_frames: int
     seen_by_two: float
@@ -282,40 +277,41 @@ class Forecast:
     missing: float
     """Share without a point."""
     gaps: float
-    """Gaps of a marker in a minute."""
+    """Gaps of a marker [1/min]."""
     gap_median: float
     """Length of a gap [s]; NaN without gaps."""
     gap_p95: float
     ghosts: float
-    """Points of a frame that are no marker."""
+    """Points per frame that are no marker."""
     error: ErrorEllipsoid
 
 
 class CameraLoss(NamedTuple):
-    """What one camera is worth."""
+    """The contribution of one camera."""
 
     seen: float
     """Share of the marker-frames that it sees."""
     needed: float
     """Share of the marker-frames that it sees and fewer than two others see."""
     without: Forecast | None
-    """The forecast without it; None where two cameras are all there are."""
+    """The forecast without it; None for a rig of two cameras."""
 
 
 class _Counts(NamedTuple):
-    """What is added up over scenes."""
+    """Counts that are added up over scenes."""
 
     marker_frames: int
     scene_frames: int
-    minutes: float  # of markers
-    two: int
-    three: int
+    minutes: float
+    """Duration times number of markers [min]."""
+    seen_by_two: int
+    seen_by_three: int
     missing: int
     ghosts: int
 
 
 def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
-    """What the optical system makes of scenes as this rig sees them, its noise and losses from a seed."""
+    """The forecast of scenes before a rig, whose noise and losses come from a seed."""
     rng = np.random.default_rng(seed)
     counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
     total = _Counts(*(sum(column) for column in zip(*counts, strict=True)))
@@ -323,8 +319,8 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
     median, p95 = np.percentile(lengths, [50, 95]) if len(lengths) else (np.nan, np.nan)
     return Forecast(
         total.marker_frames,
-        total.two / total.marker_frames,
-        total.three / total.marker_frames,
+        total.seen_by_two / total.marker_frames,
+        total.seen_by_three / total.marker_frames,
         total.missing / total.marker_frames,
         len(lengths) / total.minutes,
         float(median),
@@ -337,7 +333,7 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
 def _count(
     one: LitScene, rig: CameraRig, rng: np.random.Generator
 ) -> tuple[_Counts, Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
-    """Counts of a scene, the lengths of its gaps [s], and covariances of some of its points [m^2]."""
+    """Counts of a scene, the lengths of its gaps [s], and covariances of some points [m^2]."""
     sources, optics, markers, rate = one.sources, one.optics, one.num_markers, one.scene.rate
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
@@ -350,7 +346,7 @@ def _count(
     false = np.isfinite(found.false_points[..., 0]) & (false_labels < 0)
     views = one.seen.sum(axis=-1)
     rows, columns = np.nonzero(triangulated[:, :markers] & (views >= FEWEST_CAMERAS))
-    step = max(1, len(rows) // _ERRORS)
+    step = max(1, len(rows) // _ERROR_SAMPLES)
     rows, columns = rows[::step], columns[::step]
     noise = optics.noise * np.sqrt(MARKER_RADIUS / sources.radii[columns])
     counts = _Counts(
@@ -367,7 +363,7 @@ def _count(
 
 
 def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> list[CameraLoss]:
-    """What each camera is worth: the same hands without it."""
+    """The contribution of each camera: forecasts of the same scenes without it."""
     seen = np.concatenate([one.seen.reshape(-1, len(rig.positions)) for one in lit])
     views, losses = seen.sum(axis=1), []
     for camera in range(len(rig.positions)):
@@ -385,12 +381,9 @@ def covariances(
     rig: CameraRig,
     noise: Float[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Covariance of each triangulated point [m^2], the one nearest to its rays, which all count alike.
+    """Covariance of each point [m^2] triangulated from equally weighted rays of two cameras or more.
 
-    Args:
-        points: Points in the world [m].
-        seen: Which cameras see each: two or more, from different directions.
-        noise: Standard deviation of each point's blob per axis [px].
+    `noise` is the standard deviation of each point's blob per axis [px].
     """
     total, shifts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
     for number, camera in enumerate(rig.cameras):
@@ -399,7 +392,7 @@ def covariances(
         directions = rays / distances[:, None]
         across = (np.eye(3) - directions[:, :, None] * directions[:, None]) * seen[:, number, None, None]
         total += across
-        # A pixel to the right or down moves the ray at the point's depth by so much, across the ray.
+        # Motion of the ray, at the point's depth and across the ray, by one pixel to the right and down.
         local = camera.local(points)
         tangents = np.linalg.inv(camera.lens.jacobian(local)) / camera.focal_lengths
         shift = across @ camera.T_world_camera[:3, :2] @ tangents * (local[:, 2] * noise)[:, None, None]
@@ -409,7 +402,7 @@ def covariances(
 
 
 def ellipsoid(spread: Float[np.ndarray, "N 3 3"]) -> ErrorEllipsoid:
-    """The mean of some points' covariances [m^2]."""
+    """The ellipsoid of the mean of covariances [m^2]."""
     if not len(spread):
         return ErrorEllipsoid(np.full(3, np.nan), np.eye(3), float("nan"))
     values, vectors = np.linalg.eigh(spread.mean(axis=0))

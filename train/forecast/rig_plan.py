@@ -1,7 +1,7 @@
-"""The search for a camera rig: where cameras can hang, what they would see of hands at work, which are best.
+"""The search for a camera rig: places for cameras, what they would see of hands at work, and the best ones.
 
-Cameras are chosen one after the other, then exchanged while that helps. What a candidate sees is kept as bits
-of marker-frames, and as the information that it gives on points.
+Cameras are chosen one after the other, then exchanged while that helps. Each candidate has bits of the
+marker-frames that it sees, and the information that it gives on the points.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
 from train.simulation.room import SceneSight, marker_radii
 from train.simulation.scenes import SceneMotion
 
-_MOST: Final = 400  # places; the step between them grows with the room
-_STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # between places [m]
-_OFF: Final = 0.1  # distance of a lens from wall, ceiling or beam [m]
-_LOWEST: Final = 0.5  # height of cameras on walls and posts [m]
-_TRIPODS: Final = (0.9, 1.4, 1.9)  # heights of heads [m]
-_LARGE: Final = 1.0  # side of a volume from which on cameras look elsewhere than at its middle, too [m]
-_ASIDE: Final = 0.3  # how far from the middle, as a share of the side
+_MAX_PLACES: Final = 400  # the step between places grows with the room
+_STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # steps between places [m]
+_CLEARANCE: Final = 0.1  # distance of a lens from wall, ceiling or beam [m]
+_MIN_HEIGHT: Final = 0.5  # least height of cameras on walls and posts [m]
+_TRIPOD_HEIGHTS: Final = (0.9, 1.4, 1.9)  # [m]
+_LARGE_SIDE: Final = 1.0  # side of a volume above which cameras may also look beside its middle [m]
+_ASIDE: Final = 0.3  # distance of these targets from the middle, as a share of the side
 
 _WEIGHTS: Final = (0.02, 0.4, 0.6, 0.05)
-"""What the shares of marker-frames that one, two, three and four cameras see are worth. A point begins with
-three rays and goes on with two, so that both count; one alone matters while there is one camera only, and a
-fourth forgives a lost picture."""
-_ERROR: Final = 0.15  # what a millimeter of mean error costs
-_LONGEST: Final = 1.5  # error of points that no two cameras see, or only along nearly one line [mm]
-_APART: Final = 0.3  # least distance of two cameras [m]
-_GAIN: Final = 1e-5  # least gain of an exchange
-_EXCHANGES: Final = 200
+"""Values of the shares of marker-frames that one, two, three and four cameras see. A point begins with three
+rays and continues with two, so that both count; one camera matters while there is no other, and a fourth
+makes up for a lost picture."""
+_ERROR_COST: Final = 0.15  # cost of a millimeter of mean error
+_MAX_ERROR: Final = 1.5  # error of points that no two cameras see, or only along nearly one line [mm]
+_MIN_DISTANCE: Final = 0.3  # between two cameras [m]
+_MIN_GAIN: Final = 1e-5  # of an exchange
+_MAX_EXCHANGES: Final = 200
 _WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170.0)))
-"""A camera in whose view hands are wherever it is aimed."""
-_SAMPLED: Final = 1200  # marker-frames whose error is looked at
-_PEOPLE: Final = 3  # of each kind of work
-_FRAMES: Final = 900  # of each
-_SKIPPED: Final = 12  # every so many frames count
-_JUDGED: Final = 600  # frames of a person that the plan did not see
+"""A camera that has hands in view wherever it is aimed."""
+_ERROR_SAMPLES: Final = 1200  # marker-frames from which the error is estimated
+_PEOPLE: Final = 3  # people for each kind of work
+_FRAMES: Final = 900  # frames of each person
+_STRIDE: Final = 12  # one frame of this many is used
+_TEST_FRAMES: Final = 600  # frames of each person for the forecast, who are not those of the search
 
 
 class RigPlan(NamedTuple):
@@ -109,15 +109,15 @@ def plan_rig(
     sides, center = np.array(chosen.volume, dtype=np.float64), np.array(chosen.center, dtype=np.float64)
     focal = focal_of_angle(min(chosen.size), np.deg2rad(chosen.field_of_view))
     new = camera or (old[0] if old else pinhole("camera", chosen.size, focal))
-    free = places(lengths, chosen.mounts, center, sides)
-    candidates = [*old, *(new.at(pose) for pose in free.T_world_camera)]
+    poses, free = places(lengths, chosen.mounts, center, sides)
+    candidates = [*old, *(new.at(pose) for pose in poses)]
     ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
-    targets = np.array([*ahead, *free.targets])
+    targets = np.array([*ahead, *free])
     on_step("simulating hands")
     rng = np.random.default_rng(seed)
     work = sample_work(layout, center, sides, _FRAMES, _PEOPLE, rng=rng)
-    scenes = [one.faster(_SKIPPED) for part in work.values() for one in part]
-    on_step(f"what cameras at {len(free.targets)} places would see")
+    scenes = [one.faster(_STRIDE) for part in work.values() for one in part]
+    on_step(f"what cameras at {len(free)} places would see")
     search = Planning(view_candidates(scenes, candidates, rng=rng), kept=range(len(old)))
     search.grow(cameras)
     search.exchange(lambda value: on_step(f"moving cameras: {value:.4f}"))
@@ -127,7 +127,7 @@ def plan_rig(
     ]
     rig = CameraRig(name, [*old, *hung])
     on_step("forecasting")
-    fresh = sample_work(layout, center, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
+    fresh = sample_work(layout, center, sides, _TEST_FRAMES, 1, rng=np.random.default_rng(seed + 1))
     before = None if kept is None else _forecast(fresh, kept, seed)
     return RigPlan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
 
@@ -137,27 +137,19 @@ def _forecast(work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, seed: i
     return forecast([one for scenes in lit.values() for one in scenes], rig, seed=seed)
 
 
-class Places(NamedTuple):
-    """K ways to hang one camera."""
-
-    T_world_camera: Float[np.ndarray, "K 4 4"]
-    targets: Float[np.ndarray, "K 3"]
-    """What each looks at [m]."""
-
-
 def places(
     room: Float[np.ndarray, "3"],
     mounts: Sequence[Mount],
     center: Float[np.ndarray, "3"],
     sides: Float[np.ndarray, "3"],
-) -> Places:
-    """All positions on the mounts of a room, with all aims at a volume, given by its center and sides [m]."""
+) -> tuple[Float[np.ndarray, "K 4 4"], Float[np.ndarray, "K 3"]]:
+    """Poses `T_world_camera` of all candidates on the mounts of a room, and their targets in a volume [m]."""
     for step in _STEPS:
         found = np.unique(np.concatenate([_ON[mount](room, step) for mount in mounts]).round(6), axis=0)
         found[:, :2] += center[:2]
         nearest = np.clip(found, center - sides / 2, center + sides / 2)
         found = found[np.linalg.norm(found - nearest, axis=1) >= HAND_REACH]
-        if len(found) <= _MOST:
+        if len(found) <= _MAX_PLACES:
             break
     if not len(found):
         raise ArgumentError(
@@ -166,40 +158,40 @@ def places(
         )
     aims = [center]
     for axis in range(3):
-        if sides[axis] > _LARGE:
+        if sides[axis] > _LARGE_SIDE:
             offset = np.eye(3)[axis] * _ASIDE * sides
             aims += [center + offset, center - offset]
     pairs = [(position, aim) for position in found for aim in aims]
-    return Places(
-        np.stack([look_at(position, aim) for position, aim in pairs]), np.stack([aim for _, aim in pairs])
-    )
+    return np.stack([look_at(position, aim) for position, aim in pairs]), np.stack([aim for _, aim in pairs])
 
 
 def _on_walls(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    width, depth = room[:2] / 2 - _OFF
-    return _product(_outline(width, depth, step), _line(_LOWEST, room[2] - _OFF, step))
+    """Positions (N, 3) on the four walls [m]."""
+    width, depth = room[:2] / 2 - _CLEARANCE
+    return _product(_outline(width, depth, step), _line(_MIN_HEIGHT, room[2] - _CLEARANCE, step))
 
 
 def _on_truss(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Beams along the top of all four sides, and the posts below their ends."""
+    """Positions (N, 3) on the beams along the top of all four sides and on the posts below their ends [m]."""
     width, depth = room[:2] / 2
-    beams = _product(_outline(width, depth, step), np.array([room[2] - _OFF]))
+    beams = _product(_outline(width, depth, step), np.array([room[2] - _CLEARANCE]))
     corners = np.array([[x, y] for x in (-width, width) for y in (-depth, depth)])
-    return np.concatenate([beams, _product(corners, _line(_LOWEST, room[2] - _OFF, step))])
+    return np.concatenate([beams, _product(corners, _line(_MIN_HEIGHT, room[2] - _CLEARANCE, step))])
 
 
 def _on_tripods(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    width, depth = room[:2] / 2 - 3 * _OFF
+    """Positions (N, 3) of tripods all over the floor [m]."""
+    width, depth = room[:2] / 2 - 3 * _CLEARANCE
     along, across = _line(-width, width, step), _line(-depth, depth, step)
     floor = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
-    return _product(floor, np.array([height for height in _TRIPODS if height < room[2] - _OFF]))
+    return _product(floor, np.array([height for height in _TRIPOD_HEIGHTS if height < room[2] - _CLEARANCE]))
 
 
 _ON: Final = {"walls": _on_walls, "truss": _on_truss, "tripods": _on_tripods}
 
 
 def _outline(width: float, depth: float, step: float) -> NDArray[np.float64]:
-    """Points (N, 2) on a rectangle of these half sides."""
+    """Points (N, 2) on a rectangle with these half sides, about a step apart [m]."""
     along, across = _line(-width, width, step), _line(-depth, depth, step)
     sides = [np.stack([along, np.full(len(along), end)], axis=1) for end in (-depth, depth)]
     sides += [np.stack([np.full(len(across), end), across], axis=1) for end in (-width, width)]
@@ -207,12 +199,12 @@ def _outline(width: float, depth: float, step: float) -> NDArray[np.float64]:
 
 
 def _line(low: float, high: float, step: float) -> NDArray[np.float64]:
-    """Numbers from end to end, about a step apart."""
+    """Evenly spaced numbers from end to end, about a step apart."""
     return np.linspace(low, high, max(1, round((high - low) / step)) + 1)
 
 
 def _product(floor: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each point (N, 2) at each height."""
+    """Points (N, 3): each point (N, 2) at each height [m]."""
     above = np.repeat(floor, len(heights), axis=0)
     return np.column_stack([above, np.tile(heights, len(floor))])
 
@@ -222,22 +214,22 @@ def _lengths(sides: NDArray[np.float64]) -> str:
 
 
 class CandidateViews(NamedTuple):
-    """K candidate cameras before N marker-frames."""
+    """Marker-frames as K candidate cameras see them."""
 
     positions: Float[np.ndarray, "K 3"]
-    """Where each is [m]."""
+    """Positions of the candidates [m]."""
     bits: UInt64[np.ndarray, "K W"]
-    """Marker-frames that each sees, 64 in a word."""
+    """Visible marker-frames of each candidate, 64 in a word."""
     num_marker_frames: int
     information: Float[np.ndarray, "6 K S"]
-    """Information that each gives on S of the marker-frames [1/mm^2]: xx, xy, xz, yy, yz, zz; 0 where it does
-    not see."""
+    """Information on S of the marker-frames from each candidate [1/mm^2]: xx, xy, xz, yy, yz, zz; 0 where it
+    does not see."""
 
 
 def view_candidates(
     scenes: Sequence[SceneMotion], candidates: Sequence[Camera], *, rng: np.random.Generator
 ) -> CandidateViews:
-    """Cast the lines of sight from every marker to every candidate, once for candidates at one position."""
+    """Cast the lines of sight from every marker to every candidate, once for each position."""
     positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
     apart, which = np.unique(positions.round(6), axis=0, return_inverse=True)
     seen, points, noise = [], [], []
@@ -248,7 +240,7 @@ def view_candidates(
         points.append(centers)
         noise.append(OPTICS.noise * np.sqrt(MARKER_RADIUS / radii))
     views, centers = np.concatenate(seen, axis=1), np.concatenate(points)
-    sampled = rng.choice(len(centers), min(_SAMPLED, len(centers)), replace=False)
+    sampled = rng.choice(len(centers), min(_ERROR_SAMPLES, len(centers)), replace=False)
     focals = np.array([one.focal_length for one in candidates])
     information = _information(centers[sampled], positions, np.concatenate(noise)[sampled] / focals[:, None])
     padded = np.zeros((len(views), -(-views.shape[1] // 64) * 64), dtype=bool)
@@ -260,12 +252,12 @@ def view_candidates(
 def _free_views(
     scene: SceneMotion, positions: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Of the hands' markers in all frames: which positions see them (N, P), where (N, 3), how large (N,)."""
+    """The hands' marker-frames: positions that see them (N, P), their centers (N, 3) and radii (N,) [m]."""
     count = sum(hand.fit.layout.num_markers for hand in scene.hands)
     parts = []
     for begin in range(0, len(positions), MAX_CAMERAS):
         few = positions[begin : begin + MAX_CAMERAS]
-        # A rig has two cameras at least: where one is left, it comes with another that is cut off again.
+        # A rig has at least two cameras: a single one gets a companion, whose view is cut off again.
         some = few if len(few) >= FEWEST_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
         middle = scene.hands[0].qpos[:, :3].mean(axis=0)
         cameras = [
@@ -283,7 +275,7 @@ def _free_views(
 def _information(
     points: NDArray[np.float64], positions: NDArray[np.float64], noise: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Information of rays with noise [rad] across themselves (6, K, S) [1/mm^2]."""
+    """Information (6, K, S) [1/mm^2] of rays whose directions have noise [rad]."""
     rays = points - positions[:, None]
     distances = np.linalg.norm(rays, axis=-1)
     x, y, z = np.moveaxis(rays / distances[..., None], -1, 0)
@@ -293,53 +285,49 @@ def _information(
 
 
 class Planning:
-    """Cameras chosen among candidates; those that are kept come first and stay."""
+    """Cameras chosen among candidates, after those that are kept."""
 
     def __init__(self, views: CandidateViews, kept: Sequence[int] = ()) -> None:
         self._views, self._kept = views, tuple(kept)
         self.chosen = list(kept)
-        """Numbers of the candidates so far."""
+        """Indices of the candidates chosen so far."""
 
-    @property
-    def value(self) -> float:
-        """How good the chosen cameras are."""
-        return self._value_of(self.chosen)
+    def value_of(self, chosen: Sequence[int]) -> float:
+        """The value of some cameras together."""
+        seen = [int(np.bitwise_count(plane).sum()) for plane in self._planes(chosen)]
+        shares = np.array(seen) / self._views.num_marker_frames
+        error = _mean_error(self._views.information[:, list(chosen)].sum(axis=1)[:, None])
+        return float(shares @ _WEIGHTS - _ERROR_COST * error[0])
 
     def grow(self, num_cameras: int) -> None:
-        """Choose the best candidate, then the best beside it, and so on."""
+        """Add the best candidate until there are `num_cameras`."""
         while len(self.chosen) < num_cameras:
             values = self._values_with(self.chosen)
             if not np.isfinite(values.max()):
                 raise ArgumentError(
-                    f"there is room for {len(self.chosen)} cameras {_APART:g} m apart, expected "
+                    f"there is room for {len(self.chosen)} cameras {_MIN_DISTANCE:g} m apart, expected "
                     f"{num_cameras}; give more mounts or a larger room"
                 )
             self.chosen.append(int(values.argmax()))
 
     def exchange(self, told: Callable[[float], None] = lambda value: None) -> None:
-        """Move one camera at a time to the best candidate, while that helps; `told` of each new value."""
-        value, idle, number = self.value, 0, len(self._kept)
+        """Move one camera at a time to the best candidate while that helps; `told` gets each new value."""
+        value, idle, number = self.value_of(self.chosen), 0, len(self._kept)
         free = len(self.chosen) - len(self._kept)
-        for _ in range(_EXCHANGES):
+        for _ in range(_MAX_EXCHANGES):
             if idle >= free:
                 return
             others = self.chosen[:number] + self.chosen[number + 1 :]
             values = self._values_with(others)
             best = int(values.argmax())
             idle += 1
-            if values[best] > value + _GAIN:
+            if values[best] > value + _MIN_GAIN:
                 self.chosen[number], value, idle = best, float(values[best]), 0
                 told(value)
             number = number + 1 if number + 1 < len(self.chosen) else len(self._kept)
 
-    def _value_of(self, chosen: Sequence[int]) -> float:
-        seen = [int(np.bitwise_count(plane).sum()) for plane in self._planes(chosen)]
-        shares = np.array(seen) / self._views.num_marker_frames
-        error = _mean_error(self._views.information[:, list(chosen)].sum(axis=1)[:, None])
-        return float(shares @ _WEIGHTS - _ERROR * error[0])
-
     def _values_with(self, chosen: Sequence[int]) -> NDArray[np.float64]:
-        """The value (K,) of the chosen cameras and each candidate; -inf where that is too near to one."""
+        """The values (K,) of the chosen cameras with each candidate; -inf if it is too near to another."""
         views = self._views
         planes = self._planes(chosen)
         values = np.zeros(len(views.bits))
@@ -349,13 +337,15 @@ class Planning:
             values += weight * (fresh + int(np.bitwise_count(plane).sum()))
         values /= views.num_marker_frames
         information = views.information[:, list(chosen)].sum(axis=1)[:, None]
-        values -= _ERROR * _mean_error(information + views.information)
+        values -= _ERROR_COST * _mean_error(information + views.information)
         for camera in chosen:
-            values[np.linalg.norm(views.positions - views.positions[camera], axis=1) < _APART] = -np.inf
+            values[
+                np.linalg.norm(views.positions - views.positions[camera], axis=1) < _MIN_DISTANCE
+            ] = -np.inf
         return values
 
     def _planes(self, chosen: Sequence[int]) -> list[NDArray[np.uint64]]:
-        """Bits of the marker-frames that at least one, two, ... of the chosen cameras see."""
+        """Bits of the marker-frames that one, two, ... or more of the chosen cameras see."""
         planes = [np.zeros_like(self._views.bits[0]) for _ in _WEIGHTS]
         for camera in chosen:
             for level in range(len(_WEIGHTS) - 1, 0, -1):
@@ -365,12 +355,12 @@ class Planning:
 
 
 def _mean_error(information: Float[np.ndarray, "6 K S"]) -> NDArray[np.float64]:
-    """Root mean square distance of points from the truth (K,) [mm], averaged over the points."""
+    """Root mean square error of points (K,) [mm], averaged over the points."""
     a, b, c, d, e, f = information
     # The trace of the inverse of [[a, b, c], [b, d, e], [c, e, f]].
     minors = (d * f - e * e) + (a * f - c * c) + (a * d - b * b)
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     known = determinant > 1e-6 * np.maximum(a + d + f, 1e-12) ** 3
-    squared = np.where(known, minors, _LONGEST**2) / np.where(known, determinant, 1.0)
-    mean: NDArray[np.float64] = np.sqrt(np.clip(squared, 0.0, _LONGEST**2)).mean(axis=-1, dtype=np.float64)
+    squared = np.where(known, minors, _MAX_ERROR**2) / np.where(known, determinant, 1.0)
+    mean: NDArray[np.float64] = np.sqrt(np.clip(squared, 0.0, _MAX_ERROR**2)).mean(axis=-1, dtype=np.float64)
     return mean

@@ -60,19 +60,19 @@ _HANDS: Final = 12  # hands at every point of the map
 _LONGEST_ERROR: Final = 0.01  # of errors that are averaged [m]: two rays that hardly cross make no point
 
 # A rig with these figures gets a sentence.
-_MISSING: Final = 0.05  # share of marker-frames without a point
-_CORNER: Final = 0.7  # share of markers seen by two at the worst point of the volume, over that at the best
-_USELESS: Final = 0.005  # share of marker-frames that need a camera which can go
-_RISE: Final = 1.1  # factor by which missing marker-frames may rise without it
-_LONG: Final = 2.0  # longest axis of the error over the shortest
-_FAR: Final = 0.0005  # smallest longest axis [m]
-_GHOSTS: Final = 0.2  # ghosts in a frame
-_CLOSE: Final = 0.10  # distance of two cameras that see the same [m]
-_AWAY: Final = 0.5  # distance from where simulated hands are [m]
-_NARROW: Final = 30.0  # largest angle between two cameras [deg]
-_SMALL: Final = 2.0  # diameter of a marker in the picture [px]
+_MANY_MISSING: Final = 0.05  # share of marker-frames without a point
+_POOR_CORNER: Final = 0.7  # share of markers seen by two at the worst point of the volume, over the best
+_RARELY_NEEDED: Final = 0.005  # share of marker-frames that need a camera
+_RISE: Final = 1.1  # factor by which missing marker-frames may rise when a camera goes
+_LONG_AXIS_RATIO: Final = 2.0  # longest axis of the error over the shortest
+_LEAST_LONG_AXIS: Final = 0.0005  # longest axis of the error [m]
+_MANY_GHOSTS: Final = 0.2  # ghosts in a frame
+_CLOSE_CAMERAS: Final = 0.10  # distance between two cameras that see the same [m]
+_OFF_CENTER: Final = 0.5  # distance of the working point from where simulated hands are [m]
+_NARROW_ANGLE: Final = 30.0  # largest angle between two cameras [deg]
+_SMALL_MARKER: Final = 2.0  # diameter of a marker in the picture [px]
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
-_UPSIDE_DOWN: Final = -0.2  # cosine of the picture's up and the world's
+_UPSIDE_DOWN: Final = -0.2  # cosine between the picture's up and the world's
 
 
 class VolumeMap(NamedTuple):
@@ -111,9 +111,7 @@ class RigScore:
         suspicious = [f"Suspicious: {fault}." for fault in self.faults]
         if self.whole.missing >= 1.0:
             return [*suspicious, "No point is seen: hands work where no two cameras look."]
-        parts = (_missing, _corner, _needed, _dispensable, _error, _ghosts)
-        found = [*suspicious, *(one for part in parts for one in part(self))]
-        return found or ["Nothing stands out: hands at work are seen well, and no camera is idle."]
+        return [*suspicious, *_sentences(self)]
 
     def record(self) -> dict[str, Any]:
         """All figures as JSON, in meters and seconds; what does not exist is null."""
@@ -260,28 +258,42 @@ def _numbers(value: Any) -> Any:
     return array.item() if np.isfinite(array) else None
 
 
-def _missing(score: RigScore) -> Iterator[str]:
-    whole = score.whole
-    if whole.missing > _MISSING:
-        worst = max(score.kinds, key=lambda kind: score.kinds[kind].missing)
-        most = (
-            f", most with {worst} ({100 * score.kinds[worst].missing:.0f} %)" if len(score.kinds) > 1 else ""
-        )
+def _sentences(score: RigScore) -> Iterator[str]:
+    """What the figures of a rig suggest, the worst problem first."""
+    whole, (axes, directions, _) = score.whole, score.whole.error
+    if whole.missing > _MANY_MISSING:
+        worst_kind = max(score.kinds, key=lambda kind: score.kinds[kind].missing)
+        share = f"{100 * score.kinds[worst_kind].missing:.0f} %"
+        most = f", most with {worst_kind} ({share})" if len(score.kinds) > 1 else ""
         yield f"{100 * whole.missing:.1f} % of the marker-frames will be missing{most}: add or move cameras."
-
-
-def _corner(score: RigScore) -> Iterator[str]:
     seen = score.volume.seen_by_two
     worst = int(seen.argmin())
-    if seen[worst] < _CORNER * seen.max():
+    if seen[worst] < _POOR_CORNER * seen.max():
         yield (
             f"At {_place(score.volume.points[worst])} two cameras see {100 * seen[worst]:.0f} % of a hand's "
             f"markers, {100 * seen.max():.0f} % at the best place: keep hands away or aim a camera "
             "at it."
         )
+    yield from _camera_sentences(score)
+    if axes[0] > _LEAST_LONG_AXIS and axes[0] > _LONG_AXIS_RATIO * axes[2]:
+        along = "xyz"[int(np.abs(directions[0]).argmax())]
+        yield (
+            f"Points are least certain along {along}, {1e3 * axes[0]:.2f} mm against {1e3 * axes[2]:.2f} mm: "
+            f"a camera that looks across {along} would help."
+        )
+    if whole.ghosts > _MANY_GHOSTS:
+        worst_kind = max(score.kinds, key=lambda kind: score.kinds[kind].ghosts)
+        most = (
+            f", most with {worst_kind} ({score.kinds[worst_kind].ghosts:.1f})" if len(score.kinds) > 1 else ""
+        )
+        yield (
+            f"{whole.ghosts:.1f} points a frame will be no marker{most}: reflections that cameras see, "
+            "mirror images, and rays that meet by chance where few cameras see a marker."
+        )
 
 
-def _needed(score: RigScore) -> Iterator[str]:
+def _camera_sentences(score: RigScore) -> Iterator[str]:
+    """Which camera matters most, and which cameras can go."""
     if len(score.losses) == FEWEST_CAMERAS:
         yield "Without either camera there are no points at all: a third would forgive a loss."
         return
@@ -291,14 +303,11 @@ def _needed(score: RigScore) -> Iterator[str]:
         f"Camera {worst + 1} matters most: without it {100 * missing[worst]:.1f} % of the marker-frames are "
         f"missing, not {100 * score.whole.missing:.1f} %."
     )
-
-
-def _dispensable(score: RigScore) -> Iterator[str]:
-    allowed = _RISE * score.whole.missing + 0.1 * _USELESS
+    allowed = _RISE * score.whole.missing + 0.1 * _RARELY_NEEDED
     idle = {
         number: one.without.missing
         for number, one in enumerate(score.losses, 1)
-        if one.without is not None and one.needed <= _USELESS and one.without.missing <= allowed
+        if one.without is not None and one.needed <= _RARELY_NEEDED and one.without.missing <= allowed
     }
     if not idle:
         return
@@ -312,30 +321,10 @@ def _dispensable(score: RigScore) -> Iterator[str]:
     yield f"Camera {least} can go: {told}{also}."
 
 
-def _error(score: RigScore) -> Iterator[str]:
-    axes, directions = score.whole.error.axes, score.whole.error.directions
-    if axes[0] > _FAR and axes[0] > _LONG * axes[2]:
-        along = "xyz"[int(np.abs(directions[0]).argmax())]
-        yield (
-            f"Points are least certain along {along}, {1e3 * axes[0]:.2f} mm against {1e3 * axes[2]:.2f} mm: "
-            f"a camera that looks across {along} would help."
-        )
-
-
-def _ghosts(score: RigScore) -> Iterator[str]:
-    if score.whole.ghosts > _GHOSTS:
-        worst = max(score.kinds, key=lambda kind: score.kinds[kind].ghosts)
-        most = f", most with {worst} ({score.kinds[worst].ghosts:.1f})" if len(score.kinds) > 1 else ""
-        yield (
-            f"{score.whole.ghosts:.1f} points a frame will be no marker{most}: reflections that cameras see, "
-            "mirror images, and rays that meet by chance where few cameras see a marker."
-        )
-
-
 def faults(rig: CameraRig) -> list[str]:
-    """What is suspicious about a rig from its geometry alone, in sentences."""
+    """What is suspicious about the geometry of a rig, in sentences."""
     point = working_point(rig)
-    return [*_axes_faults(rig, point), *_place_faults(rig, point), *_coverage_faults(rig, point)]
+    return [*_axes_faults(rig, point), *_place_faults(rig, point)]
 
 
 def working_point(rig: CameraRig) -> NDArray[np.float64]:
@@ -349,6 +338,7 @@ def working_point(rig: CameraRig) -> NDArray[np.float64]:
 
 
 def _axes_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
+    """Cameras that look the wrong way."""
     rays = point - rig.positions
     ahead = np.einsum("ci,ci->c", rays, rig.T_world_camera[:, :3, 2])
     if (ahead < 0.0).sum() > len(ahead) / 2:
@@ -364,16 +354,17 @@ def _axes_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
 
 
 def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
+    """Cameras in the wrong places, and what they do not cover around the point where they look."""
     positions = rig.positions
     for number in np.flatnonzero(positions[:, 2] < 0.0) + 1:
         yield f"camera {number} is {-positions[number - 1, 2]:.2f} m below the floor, expected z up"
     apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    for first, second in zip(*np.nonzero(np.triu(apart < _CLOSE, 1)), strict=True):
+    for first, second in zip(*np.nonzero(np.triu(apart < _CLOSE_CAMERAS, 1)), strict=True):
         yield (
             f"cameras {first + 1} and {second + 1} are {100 * apart[first, second]:.0f} cm apart and see "
             "nearly the same"
         )
-    if np.linalg.norm(point - ROOM_CENTER) > _AWAY:
+    if np.linalg.norm(point - ROOM_CENTER) > _OFF_CENTER:
         yield (
             f"the cameras look at {_place(point)}; simulated hands move around "
             f"{_place(np.array(ROOM_CENTER))}, so give rig score --center, or move the rig's origin"
@@ -386,19 +377,16 @@ def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
         )
     rays = (point - positions) / np.linalg.norm(point - positions, axis=1, keepdims=True)
     widest = np.rad2deg(np.arccos(np.clip(np.abs(rays @ rays.T), 0.0, 1.0))).max()
-    if widest < _NARROW:
+    if widest < _NARROW_ANGLE:
         yield (
             f"no two cameras see the middle at more than {widest:.0f} deg to each other: depth will be "
-            f"noisy, expected at least {_NARROW:.0f} deg"
+            f"noisy, expected at least {_NARROW_ANGLE:.0f} deg"
         )
-
-
-def _coverage_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
     sizes = pixels_of_a_marker(rig, point)
-    for number in np.flatnonzero(sizes < _SMALL) + 1:
+    for number in np.flatnonzero(sizes < _SMALL_MARKER) + 1:
         yield (
             f"camera {number} sees a marker of {2e3 * MARKER_RADIUS:.1f} mm as {sizes[number - 1]:.1f} px, "
-            f"expected at least {_SMALL:g} px"
+            f"expected at least {_SMALL_MARKER:g} px"
         )
     covered = float((rig.in_view(cube_points(point, 2 * HALF_SIDE)).sum(axis=-1) >= 2).mean())
     if covered < _COVERED:
@@ -446,10 +434,23 @@ def write_rig_page(path: Path, score: RigScore) -> None:
     rig = score.rig
     seen = f"{score.whole.marker_frames:,} marker-frames of {score.work}"
     lead = f"{len(rig.cameras)} cameras of {rig.pictures()}; {seen}."
+    error = score.whole.error
+    axes = ", ".join(
+        f"{1e3 * axis:.3f} mm along ({coordinates(direction)})"
+        for axis, direction in zip(error.axes, error.directions, strict=True)
+    )
+    note = f"The error as an ellipsoid, standard deviations: {axes}."
+    note = note if np.isfinite(error.mean) else "No marker has a point."
+    without = (
+        "The same hands without one camera. Sees, needed: share of the marker-frames that the camera sees, "
+        "and that it sees and fewer than two others."
+    )
+    caption = "Marker-frames that are missing without each camera, and with all."
+    losses = picture((8.4, 3.2), _draw_losses, score.losses, score.whole.missing)
     sections = [
         Section("What to do", html_list(score.advice)),
-        Section("Hands at work", COLUMNS_TOLD, table=work_table(score), notes=[_error_note(score.whole)]),
-        _cameras_section(score),
+        Section("Hands at work", COLUMNS_TOLD, table=work_table(score), notes=[note]),
+        Section("Cameras", without, table=camera_table(score), pictures=[(losses, caption)]),
         _volume_section(score),
     ]
     write_sections(path, sections, title=f"Rig {rig.name}", lead=lead)
@@ -485,26 +486,6 @@ def _cells(one: Forecast) -> list[str]:
 
 def _number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if np.isfinite(value) else NOTHING
-
-
-def _error_note(one: Forecast) -> str:
-    if not np.isfinite(one.error.mean):
-        return "No marker has a point."
-    axes = ", ".join(
-        f"{1e3 * axis:.3f} mm along ({coordinates(direction)})"
-        for axis, direction in zip(one.error.axes, one.error.directions, strict=True)
-    )
-    return f"The error as an ellipsoid, standard deviations: {axes}."
-
-
-def _cameras_section(score: RigScore) -> Section:
-    text = (
-        "The same hands without one camera. Sees, needed: share of the marker-frames that the camera sees, "
-        "and that it sees and fewer than two others."
-    )
-    caption = "Marker-frames that are missing without each camera, and with all."
-    drawn = picture((8.4, 3.2), _draw_losses, score.losses, score.whole.missing)
-    return Section("Cameras", text, table=camera_table(score), pictures=[(drawn, caption)])
 
 
 def _draw_losses(figure: Figure, losses: list[CameraLoss], missing: float) -> None:

@@ -1,9 +1,9 @@
-"""The paper's network as a labeler, whatever runs the network: its views, its images, its labels; no torch.
+"""The paper's network as a labeler without torch: the views and images of clouds, and the labels.
 
 A view is an orthogonal matrix from the cloud's frame into the camera's; one with determinant -1 shows a left
 hand as a right one. Views are random as in the paper, or aligned: they turn every hand like the mean hand of
-its layout, so that the network does not have to learn all orientations. In training the true markers tell
-how; labeling begins with views along the cloud's principal axes and turns the next view by the predictions.
+its layout, so that the network does not have to learn all orientations. Training aligns views by the true
+markers; labeling begins with the cloud's principal axes and aligns the next view by the predicted markers.
 
 Images are 52x52 depth images (Han et al. 2018, section 3.1): an orthographic camera whose axis passes through
 the cloud's mean, zoomed so that every point stays clear of a 10 % margin; the depth of a point is the
@@ -29,23 +29,23 @@ from train.labelers.protocol import Labeling, check_output, label_in_batches, pa
 from train.settings import CNNConfig
 
 SIGNS: Final = np.array(list(product((1.0, -1.0), repeat=3)))
-"""Signs (8, 3) of the principal axes, four for each side of the body."""
+"""Signs (8, 3) of the principal axes: four rotations for each side of the body."""
 MIRROR_IMAGE: Final = np.array([-1.0, 1.0, 1.0])
 """Signs of the camera's axes in a mirrored view."""
-_CANDIDATES: Final = 10  # views, of which the one on which a cloud spreads best is taken (Han et al., 3.1)
+_CANDIDATES: Final = 10  # views from which the best one is chosen (Han et al., section 3.1)
 _MOMENTS: Final = tuple(
     powers for order in (3, 5) for powers in combinations_with_replacement(range(3), order)
 )
 NUM_MOMENTS: Final = len(_MOMENTS)
-_ALIGNED_SHARE: Final = 0.6  # of the views in training; the others are along principal axes
+_ALIGNED_SHARE: Final = 0.6  # share of aligned views in training; the others are along principal axes
 _TURN_SPREAD: Final = np.radians(12.0)  # standard deviation of an aligned view's angle from the truth [rad]
-_ROUNDS: Final = 10  # of averaging hands and aligning them with the average
-_REGULAR: Final = 1e-4  # added to the variances of moments, which have no unit
+_ROUNDS: Final = 10  # rounds in which hands are averaged and aligned with their average
+_REGULARIZATION: Final = 1e-4  # added to the variances of moments, which have no unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanHand:
-    """The mean right hand of a layout, and what the moments of its clouds look like."""
+    """The mean right hand of a layout, and the distribution of its clouds' moments."""
 
     markers: Float[np.ndarray, "M 3"]
     """Mean positions of the aligned markers [m], principal axes along x, y and z."""
@@ -61,7 +61,7 @@ class MeanHand:
         points: Float[np.ndarray, "B N 3"],
         present: Bool[np.ndarray, "B N"],
     ) -> MeanHand:
-        """The mean hand of a training set: of markers of right hands [m], and of the clouds of them."""
+        """The mean hand of a training set, from markers of right hands [m] and their clouds."""
         mean = markers[0]
         for _ in range(_ROUNDS):
             rotations, _ = rigid_fit(markers, mean)
@@ -71,11 +71,11 @@ class MeanHand:
         mean = mean @ (upright * np.linalg.det(upright)).T
         rotations, _ = rigid_fit(markers, mean)
         seen = _moments(points, present, _nearest_axes(points, present, rotations)[:, None])[:, 0]
-        covariance = np.cov(seen.T) + _REGULAR * np.eye(NUM_MOMENTS)
+        covariance = np.cov(seen.T) + _REGULARIZATION * np.eye(NUM_MOMENTS)
         return cls(mean, seen.mean(axis=0), np.linalg.inv(covariance))
 
     def align(self, markers: Float[np.ndarray, "B M 3"], side: Float[np.ndarray, "B"]) -> NDArray[np.float64]:
-        """Views (B, 3, 3) that turn markers [m] like the mean hand; mirrored where `side` is -1, not 1."""
+        """Views (B, 3, 3) that align markers [m] with the mean hand; where `side` is -1, mirrored ones."""
         mirrors = np.ones((len(markers), 1, 3))
         mirrors[:, 0, 0] = side
         rotations, _ = rigid_fit(markers * mirrors, self.markers)
@@ -84,10 +84,9 @@ class MeanHand:
     def first_views(
         self, points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"]
     ) -> NDArray[np.float64]:
-        """Views (B, 8, 3, 3) along the principal axes of clouds [m], the likeliest signs first.
+        """Views (B, 8, 3, 3) along the principal axes of clouds [m], the likeliest signs of the axes first.
 
-        The moments of odd order change sign with the axes; each choice of signs is as likely as the moments
-        that it gives, in a normal distribution.
+        Moments of odd order change sign with the axes; the mean hand has a normal distribution of them.
         """
         views = SIGNS[:, :, None] * principal_axes(points, present)[:, None]
         offsets = _moments(points, present, views) - self.moments
@@ -103,7 +102,7 @@ class MeanHand:
         *,
         rng: np.random.Generator,
     ) -> NDArray[np.float64]:
-        """Views (B, 3, 3) of right hands' clouds and markers [m]: first ones of labeling, or aligned ones."""
+        """Random views (B, 3, 3) of right hands [m], along principal axes or nearly aligned."""
         from scipy.spatial.transform import Rotation  # not loaded by labeling
 
         aligned = self.align(markers, np.ones(len(markers)))
@@ -125,18 +124,17 @@ def principal_axes(
 
 
 def random_views(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Rotations (count, 3, 3) to views from anywhere; the paper's in training (section 3.1)."""
+    """Random rotations (count, 3, 3), the paper's views in training (section 3.1)."""
     return quaternion_matrix(random_quaternions(count, rng=rng))
 
 
 def spread_views(
     points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"], *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Rotations (B, 3, 3) to the one of ten views on which each cloud spreads best (section 3.1).
+    """Rotations (B, 3, 3) to the one of ten views in which each cloud spreads best (section 3.1).
 
     The ten are the same for all clouds. A cloud spreads best where the smaller eigenvalue of its projection's
-    covariance is largest; of equals the larger eigenvalue counts, which is the order of determinants but
-    tells views of a straight line apart.
+    covariance is largest; the larger eigenvalue decides between equals.
     """
     candidates = random_views(_CANDIDATES, rng=rng)  # (V, 3, 3)
     offsets, _ = centered(points, present)
@@ -264,34 +262,34 @@ def _view_frames(
     )
 
 
-_SEARCH_REJECT: Final = 0.04  # cost of a point without a label where none is chosen [m]
-_SPREAD: Final = 0.005  # of the confidence before one is chosen [m]
-_ACCEPTED: Final = 0.01  # mean distance of labeled points from which no further view is tried [m]
-_GHOSTS: Final = 2  # most points without a label then
-_TOGETHER: Final = (1, 2)  # first views of a cloud that are tried at once, then all others
-_TURNS: Final = 2  # of each first view toward the mean hand
-_IMAGES: Final = 128  # that go through the network at once
+_SEARCH_REJECT: Final = 0.04  # default cost of a point without a label [m]
+_SPREAD: Final = 0.005  # default spread of the confidence [m]
+_ACCEPTED_DISTANCE: Final = 0.01  # a view with a smaller mean distance of labeled points is accepted [m]
+_ACCEPTED_GHOSTS: Final = 2  # an accepted view has at most so many points without a label
+_TOGETHER: Final = (1, 2)  # numbers of first views that are tried at once, before all others
+_TURNS: Final = 2  # times that each first view is aligned by the predictions
+_IMAGES: Final = 128  # images that go through the network at once
 
 
 class _View(NamedTuple):
-    """How well the markers predicted from one view fit a cloud."""
+    """The fit of the markers predicted from one view to a cloud."""
 
     distances: Float[np.ndarray, "N M"]
-    """Of the points from the predicted markers [m]."""
+    """Distances of the points from the predicted markers [m]."""
     cost: float
-    """Mean cost of a point [m], that of equation 1."""
+    """Mean cost of a point in equation 1 [m]."""
     accepted: bool
-    """Whether it fits so well that no further view is tried."""
+    """Whether the fit is so good that no further view is tried."""
 
 
 _NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
 
 
 class CNNLabeler:
-    """The paper's network with weights, then equation 1, whose least cost also decides between views.
+    """The paper's network, which maps images (B, 1, 52, 52) to positions (B, M, 3) in view units.
 
-    The network, from images (B, 1, 52, 52) to positions (B, M, 3) in view units, was trained on right hands
-    with this mean hand; a mirrored view shows it a left hand as a right one.
+    Equation 1 then matches points, and its cost decides between views. The network knows right hands only;
+    mirrored views show left hands as right ones.
     """
 
     def __init__(
@@ -339,10 +337,10 @@ class CNNLabeler:
     def _first_views(
         self, points: NDArray[np.float64], present: NDArray[np.bool_]
     ) -> Float[np.ndarray, "B V 3 3"]:
-        """The views to try, in this order."""
+        """The views to try, in order."""
         if self._aligned:
             return self._hand.first_views(points, present)
-        # The same clouds get the same labels every time.
+        # A fixed seed gives the same clouds the same labels every time.
         views = spread_views(points, present, rng=np.random.default_rng(0))
         return np.stack([views, MIRROR_IMAGE[:, None] * views], axis=1)
 
@@ -352,7 +350,7 @@ class CNNLabeler:
         present: Bool[np.ndarray, "B N"],
         views: Float[np.ndarray, "B 3 3"],
     ) -> NDArray[np.float64]:
-        """Predicted markers (B, M, 3) [m] in the frame of the points, seen from these views at first."""
+        """Predicted markers (B, M, 3) [m] in the frame of the points, with these views first."""
         predicted = self._predict_once(points, present, views)
         if self._aligned:
             sides = np.sign(np.linalg.det(views))
@@ -364,6 +362,7 @@ class CNNLabeler:
     def _predict_once(
         self, points: NDArray[np.float64], present: NDArray[np.bool_], views: NDArray[np.float64]
     ) -> NDArray[np.float64]:
+        """Markers (B, M, 3) [m] predicted from these views."""
         parts = [np.zeros((0, len(self.marker_names), 3))]
         for first in range(0, len(points), _IMAGES):
             part = slice(first, first + _IMAGES)
@@ -380,16 +379,15 @@ def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View
     labels = match_distances(distances, _SEARCH_REJECT)
     labeled = labels >= 0
     costs = np.where(labeled, distances[np.arange(len(points)), labels], _SEARCH_REJECT)
-    near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED)
-    accepted = bool(near and (~labeled).sum() <= _GHOSTS)
+    near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED_DISTANCE)
+    accepted = bool(near and (~labeled).sum() <= _ACCEPTED_GHOSTS)
     return _View(distances, float(costs.mean()) if len(costs) else 0.0, accepted)
 
 
 def label_by_distance(distances: Float[np.ndarray, "N M"], reject: float, spread: float) -> Labeling:
-    """Labels of equation 1 by distances from predicted markers [m], a ghost costing `reject` [m].
+    """Labels of equation 1 by distances from predicted markers [m], with ghosts at the cost `reject` [m].
 
-    A confidence is the label's share of the weights of all labels of its point, which fall to 1/e over a
-    difference of `spread` [m].
+    A confidence is the label's share of weights that fall by a factor of e over `spread` [m].
     """
     labels = match_distances(distances, reject)
     rejects = np.full((len(distances), 1), reject)

@@ -1,8 +1,8 @@
 """From scores or distances to labels: one point per label, one label per point, with a reject option.
 
-Labels are verified by a pose: labelings near the likeliest one compete by the network's scores and the prior
-of hands. A network judges each point by itself. Where it is unsure, the likeliest labeling may be no hand: a
-neighbor's marker may stand in the place of an occluded one, or a chain of labels may be shifted by one.
+A network judges each point by itself, so that the likeliest labeling may be no hand: an occluded marker's
+label may go to its neighbor, or a chain of labels may be shifted by one. Therefore labelings near the
+likeliest one compete by the network's scores and a prior of hands.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ GHOST = -1
 _SCORE_WEIGHT: Final = 0.65
 """Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
 _SINKHORN_ROUNDS: Final = 20
-_NEVER: Final = 1e-30  # a probability whose logarithm is still a number
+_MIN_PROBABILITY: Final = 1e-30  # its logarithm is still a number
 SINKHORN: Final = {
     "score_weight": _SCORE_WEIGHT,
     "sinkhorn_rounds": _SINKHORN_ROUNDS,
-    "least_probability": _NEVER,
+    "least_probability": _MIN_PROBABILITY,
 }
-"""What `pair_probabilities` goes by, for other programs that do the same."""
+"""Constants of `pair_probabilities`, for programs that repeat it."""
 IMPOSSIBLE: Final = 1e6
-"""Cost of a pair that cannot be."""
+"""Cost of a pair that is excluded."""
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -53,8 +53,7 @@ def pair_probabilities(
 ) -> Float[np.ndarray, "N+1 M+1"]:
     """Probability of each label for each point when no two points may share one; rows of points sum to 1.
 
-    Both log-probabilities are weighted, added and normalized over rows and columns in turn, so that every
-    point and every label is used once. Ghosts (last column) and occluded labels (last row) are outside of it.
+    The last column is a ghost, the last row an occluded label.
     """
     return balance(
         point_scores.astype(np.float64), label_scores.astype(np.float64), _SCORE_WEIGHT, _SINKHORN_ROUNDS
@@ -63,41 +62,36 @@ def pair_probabilities(
 
 def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
     """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
-    costs, reject = assignment_costs(probabilities)
-    return assign(costs, reject)[1]
+    return assign(*assignment_costs(probabilities))[1]
 
 
 def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
-    """One-to-one labeling of a cloud with the least total distance.
+    """One-to-one labeling with the least total distance from predicted markers [m], the paper's equation 1.
 
-    The paper's equation 1 for distances from predicted markers [m], with the reject option that its results
-    imply: a point may be a `GHOST` at the cost of `reject`, so that none is matched over a larger distance.
+    A point is a `GHOST` at the cost of `reject` [m], an option that the paper's results imply.
     """
     return assign(distances.astype(np.float64), np.full(len(distances), reject))[1]
 
 
 @kernel
 def assignment_costs(probabilities: Float[np.ndarray, "N+1 M+1"]) -> tuple[FloatArray, FloatArray]:
-    """What each pair of a point and a label costs (N, M), and each point as a ghost (N,), in logarithms.
-
-    A pair assigns a point and a label, which then is not occluded.
-    """
+    """Costs of pairs of a point and a label (N, M), against the label's occlusion, and of ghosts (N,)."""
     count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
     costs, reject = np.empty((count, num_labels)), np.empty(count)
     for i in range(count):
         for j in range(num_labels):
-            pair = np.log(max(probabilities[i, j], _NEVER))
-            costs[i, j] = np.log(max(probabilities[count, j], _NEVER)) - 2.0 * pair
-        reject[i] = -np.log(max(probabilities[i, num_labels], _NEVER))
+            pair = np.log(max(probabilities[i, j], _MIN_PROBABILITY))
+            costs[i, j] = np.log(max(probabilities[count, j], _MIN_PROBABILITY)) - 2.0 * pair
+        reject[i] = -np.log(max(probabilities[i, num_labels], _MIN_PROBABILITY))
     return costs, reject
 
 
 @kernel
 def assign(costs: Float[np.ndarray, "N M"], reject: Float[np.ndarray, "N"]) -> tuple[float, IntArray]:
-    """The least cost of a labeling, and its labels (N,): a point per label, `GHOST` at the cost of a reject.
+    """The least cost of a one-to-one labeling with ghosts at the cost `reject`, and its labels (N,).
 
-    The shortest augmenting paths of Jonker and Volgenant (1987); only a path's own end may be a reject,
-    because a point that is a ghost takes no label from another.
+    Shortest augmenting paths (Jonker and Volgenant 1987). Only the end of a path may be rejected, because a
+    ghost takes no label from another point.
     """
     count, num_labels = costs.shape
     labels, owner = np.full(count, GHOST), np.full(num_labels, -1)
@@ -186,10 +180,10 @@ def balance(
     plan = np.zeros((count + 1, num_labels + 1))
     for i in range(count):
         for j in range(num_labels):
-            plan[i, j] = np.exp(weight * (point_scores[i, j] + label_scores[j, i])) + _NEVER
-        plan[i, num_labels] = np.exp(2.0 * weight * point_scores[i, num_labels]) + _NEVER
+            plan[i, j] = np.exp(weight * (point_scores[i, j] + label_scores[j, i])) + _MIN_PROBABILITY
+        plan[i, num_labels] = np.exp(2.0 * weight * point_scores[i, num_labels]) + _MIN_PROBABILITY
     for j in range(num_labels):
-        plan[count, j] = np.exp(2.0 * weight * label_scores[j, count]) + _NEVER
+        plan[count, j] = np.exp(2.0 * weight * label_scores[j, count]) + _MIN_PROBABILITY
     totals = np.empty(num_labels)
     for _ in range(rounds):
         totals[:] = 0.0
@@ -210,36 +204,36 @@ def balance(
     return plan
 
 
-_SURE: Final = 0.95  # a pair of this probability is not taken back
-_MOST_UNSURE: Final = 8  # pairs that are taken back, one at a time; the least sure
-_ROUNDS: Final = 3  # how many pairs are taken back in turn
-_WIDTH: Final = 3  # labelings of a round that the next one starts from
-_MOST: Final = 1 + _MOST_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)  # labelings
-_FARTHEST: Final = 14.0  # cost of a labeling above that of the likeliest [nats, twice]
+_SURE: Final = 0.95  # pairs with this probability are final
+_MAX_UNSURE: Final = 8  # the least sure pairs of a labeling, each of which is tried without
+_ROUNDS: Final = 3  # pairs that a labeling is tried without
+_WIDTH: Final = 3  # best labelings of a round, from which the next round starts
+_MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)
+_MAX_EXTRA_COST: Final = 14.0  # of a labeling above the cost of the likeliest one [nats, twice]
 _PRIOR_WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
-_NEAR: Final = 40  # components that count for the labelings around the likeliest one
+_NEAR_COMPONENTS: Final = 40  # components of the prior that are tried for all labelings of a cloud
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
-_LEAST: Final = 4  # labeled points of a hand
-_LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
+_MIN_LABELED: Final = 4  # labeled points of a hand
+_MIN_DENSITY: Final = 2.5  # log-density of a hand per coordinate; true labels of real hands have 2.8 to 4.2
 
 
 def matching_constants() -> dict[str, float]:
-    """What `match_scores` goes by, for other programs that do the same: docs/how_to/onnx.md has one."""
+    """Constants of `match_scores`, for programs that repeat it, such as that of docs/how_to/onnx.md."""
     return {
         **SINKHORN,
         "impossible": IMPOSSIBLE,
         "sure": _SURE,
-        "most_unsure": _MOST_UNSURE,
+        "most_unsure": _MAX_UNSURE,
         "rounds": _ROUNDS,
         "width": _WIDTH,
-        "farthest": _FARTHEST,
+        "farthest": _MAX_EXTRA_COST,
         "prior_weight": _PRIOR_WEIGHT,
         "ghost": _GHOST,
-        "near": _NEAR,
+        "near": _NEAR_COMPONENTS,
         "nearest": NEAREST,
-        "least_points": _LEAST,
-        "least_density": _LEAST_DENSITY,
+        "least_points": _MIN_LABELED,
+        "least_density": _MIN_DENSITY,
     }
 
 
@@ -249,13 +243,9 @@ def match_scores(
     label_scores: Float[np.ndarray, "M N+1"],
     prior: PosePrior | None,
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Most likely one-to-one labeling of one cloud.
+    """Most likely one-to-one labeling of one cloud [m], and the probability of each point's label.
 
-    A point may stay a `GHOST` and a label occluded, each at its own cost, so nothing is forced (the paper's
-    equation 1 with a reject option). Without a prior the scores alone decide.
-
-    Returns:
-        Label of each point, and its probability.
+    A point may be a `GHOST`, and a label occluded. Without a prior the scores alone decide.
     """
     probabilities = pair_probabilities(point_scores, label_scores)
     labels = match_probabilities(probabilities)
@@ -264,23 +254,23 @@ def match_scores(
     if (
         prior is None
         or confidence.min(initial=1.0) > _SURE
-        or np.count_nonzero(labels >= 0) < _LEAST
-        or len(points) > 2 * num_labels  # more than a hand: somebody has to divide them first
+        or np.count_nonzero(labels >= 0) < _MIN_LABELED
+        or len(points) > 2 * num_labels  # more than one hand
     ):
         return labels, confidence
     return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, tables_of(prior))
 
 
 class _Factors(NamedTuple):
-    """Cholesky factors by component and by set of markers, which most labelings share."""
+    """Cholesky factors by component and by set of markers, shared between labelings."""
 
     sets: Bool[np.ndarray, "L M"]
     """The sets of markers."""
     stored: Int[np.ndarray, "L C"]
-    """Number of the factor of each set and component, -1 for none."""
+    """Index of the factor of each set and component, -1 for none."""
     factors: Float[np.ndarray, "F R R"]
     counts: Int[np.ndarray, "2"]
-    """How many sets and factors there are."""
+    """Numbers of stored sets and factors."""
 
 
 @kernel
@@ -289,23 +279,23 @@ def _verify(
     probabilities: Float[np.ndarray, "N+1 M+1"],
     prior: PriorTables,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label."""
+    """The best labeling (N,) near the likeliest one, and the probability (N,) of each label."""
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
     near, mirrored = _near_components(points, labels, prior)
     near_table = means_by_marker(prior.means, near)
-    found = np.empty((_MOST, len(points)), dtype=np.int64)
-    scores, densities = np.empty(_MOST), np.empty(_MOST)
-    taken = np.full((_MOST, _ROUNDS), -1)  # points whose pairs were taken back for a labeling
-    columns = np.full((_MOST, _ROUNDS), -1)  # and their labels then
+    found = np.empty((_MAX_LABELINGS, len(points)), dtype=np.int64)
+    scores, densities = np.empty(_MAX_LABELINGS), np.empty(_MAX_LABELINGS)
+    taken = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # points whose pairs a labeling excludes
+    columns = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # labels of these pairs
     rank = prior.directions.shape[3]
     kept = _Factors(
-        np.empty((_MOST, len(prior.means[0])), dtype=np.bool_),
-        np.full((_MOST, len(near)), -1),
-        np.empty((NEAREST * _MOST, rank, rank)),
+        np.empty((_MAX_LABELINGS, len(prior.means[0])), dtype=np.bool_),
+        np.full((_MAX_LABELINGS, len(near)), -1),
+        np.empty((NEAREST * _MAX_LABELINGS, rank, rank)),
         np.zeros(2, np.int64),
     )
-    front, num_front, num_found = np.zeros(_MOST, dtype=np.int64), 1, 0
+    front, num_front, num_found = np.zeros(_MAX_LABELINGS, dtype=np.int64), 1, 0
     for step in range(_ROUNDS + 1):
         first = num_found
         for parent in front[: min(num_front, _WIDTH)]:
@@ -316,11 +306,11 @@ def _verify(
                     taken[num_found], columns[num_found] = taken[parent], columns[parent]
                     taken[num_found, step - 1], columns[num_found, step - 1] = point, found[parent, point]
                     cost, fresh = _assign_without(costs, reject, taken[num_found], columns[num_found], step)
-                    if cost > least + _FARTHEST or _index_of(fresh, found, num_found) >= 0:
+                    if cost > least + _MAX_EXTRA_COST or _index_of(fresh, found, num_found) >= 0:
                         continue
                 known = np.flatnonzero(fresh >= 0)
                 density = -np.inf
-                if len(known) >= _LEAST:
+                if len(known) >= _MIN_LABELED:
                     cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
                     density = _log_density_of_near(cloud, known_labels, near, near_table, prior, kept)
                 found[num_found] = fresh
@@ -341,9 +331,9 @@ def _log_density_of_near(
     prior: PriorTables,
     kept: _Factors,
 ) -> float:
-    """Log-density of centered, labeled points [m] by those of some components that are nearest to them.
+    """Log-density of centered, labeled points [m] by the nearest of some components, their means in `table`.
 
-    `table` holds the mean hands of these components; factors are kept from labeling to labeling.
+    Cholesky factors are kept for other labelings.
     """
     marked = np.zeros(kept.sets.shape[1], dtype=np.bool_)
     marked[labels] = True
@@ -374,7 +364,7 @@ def _near_components(
     labels: Int[np.ndarray, "N"],
     prior: PriorTables,
 ) -> tuple[NDArray[np.int64], bool]:
-    """The components (C,) near to labeled points as those of the likelier side, and whether it is left."""
+    """The components (C,) nearest to labeled points of the likelier side, and whether that is the left."""
     known = np.flatnonzero(labels >= 0)
     known_labels = labels[known]
     best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
@@ -383,7 +373,7 @@ def _near_components(
     )
     for mirrored in (False, True):
         cloud = seen_as_right(points[known], mirrored)
-        chosen = np.argsort(errors_of_products(products, squares, mirrored))[:_NEAR]
+        chosen = np.argsort(errors_of_products(products, squares, mirrored))[:_NEAR_COMPONENTS]
         density = log_density(cloud, known_labels, chosen[:NEAREST], prior)
         if density > best or not len(near):
             best, near, left = density, chosen, mirrored
@@ -394,11 +384,11 @@ def _near_components(
 def _least_sure(
     probabilities: Float[np.ndarray, "N+1 M+1"], labels: Int[np.ndarray, "N"]
 ) -> NDArray[np.int64]:
-    """The points of a labeling that may be taken back, the least sure first."""
+    """The points of a labeling with the least sure labels, in this order."""
     confidence = np.empty(len(labels))
     for point in range(len(labels)):
         confidence[point] = probabilities[point, labels[point]]
-    order = np.argsort(confidence)[:_MOST_UNSURE]
+    order = np.argsort(confidence)[:_MAX_UNSURE]
     return order[confidence[order] < _SURE]
 
 
@@ -410,7 +400,7 @@ def _assign_without(
     labels: Int[np.ndarray, "3"],
     count: int,
 ) -> tuple[float, NDArray[np.int64]]:
-    """The labeling of least cost without some pairs of a point and a label, or of a point and no label."""
+    """The labeling of least cost that excludes some pairs of a point and a label, -1 for a ghost."""
     rest, without = costs.copy(), reject.copy()
     for number in range(count):
         if labels[number] >= 0:
@@ -422,7 +412,7 @@ def _assign_without(
 
 @kernel
 def _index_of(row: NDArray[np.generic], rows: NDArray[np.generic], count: int) -> int:
-    """Which of the first rows of a table (R, W) is equal to a row (W,); -1 if none."""
+    """Index of a row (W,) among the first rows of a table (R, W); -1 if it is not there."""
     for number in range(count):
         same = True
         for column in range(len(row)):
@@ -443,12 +433,11 @@ def _elected(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The best labeling (N,), and the confidence (N,) of each of its labels.
 
-    That is the geometric mean of the network's own and the share of the labelings that agree, by their odds;
-    the network's own where all agree. Points that are no hand in any labeling are labeled as the
-    network has it.
+    The confidence is the network's own where all labelings agree; else its geometric mean with the odds of
+    the labelings that agree. The network alone decides if the best labeling is no hand.
     """
     best, count = int(np.argmax(scores)), len(found)
-    if densities[best] < _LEAST_DENSITY:
+    if densities[best] < _MIN_DENSITY:
         best, count = 0, 1
     odds = np.exp(_TEMPERATURE * (scores[:count] - scores[:count].max()))
     odds /= odds.sum()

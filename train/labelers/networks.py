@@ -7,10 +7,10 @@ they add up evidence and can count neighbors. Two outputs are trained together: 
 point; and the point, or none, of each label.
 
 The network for any layout describes points and markers by such messages, from the distances between the
-points of a cloud and from the distributions of those between two markers over many people and poses. It then
-compares them in rounds. Each round knows the last one's matches: whom a point's likely marker expects at
-which distance, and whether somebody is there (a mean-field step of graph matching). So a layout that was
-never trained on is labeled from its distances alone.
+points of a cloud and from the distributions of the distance between two markers over many people and poses.
+It then compares points and markers in rounds. Each round uses the matches of the last one: it compares the
+distances from a point to other matched points with those from a marker (a mean-field step of graph matching).
+So a layout that was never trained on is labeled from its distances alone.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSett
 
 
 class LabelScores(NamedTuple):
-    """Log-probabilities of both outputs."""
+    """Log-probabilities of both outputs of a network."""
 
     points: Float[Tensor, "B N M+1"]
     """Each point: its label, or ghost (last)."""
@@ -55,7 +55,7 @@ class SetLabeler(nn.Module):
         super().__init__()
         self.config = config
         self.prior: PosePrior | None = None
-        """What labelings are checked against; learned after training."""
+        """Prior of hands that verifies labelings, learned after training."""
         width, bumps = config.width, config.num_distances
         self.register_buffer("centers", torch.linspace(0.0, config.reach, bumps), persistent=False)
         self.embed = nn.Sequential(nn.Linear(bumps + 1, width), nn.SiLU(), nn.Linear(width, width))
@@ -96,11 +96,10 @@ class SetLabeler(nn.Module):
 
 
 class PairedScores(nn.Module):
-    """A network with two more outputs, for exported files: what its labels are assigned by.
+    """A network with two more outputs, for exported files, as `train.labelers.matching` has them.
 
-    They are as `train.labelers.matching` makes them of the scores: the probabilities of pairs of a point
-    and a label, ghosts last (B, N, M+1); and what each label costs each point, and each point as a ghost
-    (B, N, M+N).
+    They are the probabilities of pairs of a point and a label, ghosts last (B, N, M+1), and the costs of
+    pairs and of points as ghosts (B, N, M+N).
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -130,7 +129,7 @@ class PairedScores(nn.Module):
 
 
 class MessageRound(nn.Module):
-    """One round: sum gated messages from all points, then transform the sums."""
+    """One round of messages: sum gated messages from all points, then transform the sums."""
 
     def __init__(self, width: int, gates: int, bumps: int) -> None:
         super().__init__()
@@ -155,7 +154,7 @@ class MessageRound(nn.Module):
         batch, count, width = features.shape
         normed = self.norm(features)
         receiver, sender = self.ends(normed).transpose(1, 2).chunk(2, dim=1)  # (B, G, N) each
-        # Gates before points: the large arrays of pairs are then laid out as bmm expects them.
+        # Gates come before points, because bmm expects the large arrays of pairs in this layout.
         near = torch.bmm(self.distance_gate.weight.expand(batch, -1, -1), bumps).view(batch, -1, count, count)
         biased = receiver + self.distance_gate.bias[:, None]
         gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
@@ -180,18 +179,10 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weight
     return weights.points * point_loss + weights.clouds * label_loss
 
 
-def set_loss(network: nn.Module, batch: Batch, device: torch.device) -> Tensor:
-    """Loss of one batch, see `labeling_loss`."""
-    cloud = batch.cloud
-    points = torch.from_numpy(cloud.points.astype(np.float32)).to(device)
-    present, truth = torch.from_numpy(cloud.present).to(device), torch.from_numpy(cloud.truth).to(device)
-    return labeling_loss(network(points, present), truth, present, weights=batch.weights)
-
-
-_USUAL: Final = 20.0  # points of a cloud
-_RAREST: Final = 1e-3  # share of poses that a distance counts as having at least
-_EARLY: Final = 0.3  # weight of the loss of each comparison before the last
-_IMPOSSIBLE: Final = -1e4
+_USUAL_POINTS: Final = 20.0  # number of points that a cloud's is divided by
+_MIN_SHARE: Final = 1e-3  # added to the shares of poses, so that they have logarithms
+_EARLY_WEIGHT: Final = 0.3  # weight of the loss of each comparison before the last
+_IMPOSSIBLE: Final = -1e4  # score of a point that is padding
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,10 +243,13 @@ class LayoutNetwork(nn.Module):
         graphs = _Graphs.of(points, present, layouts, self.config)
         there = graphs.there
         around = torch.cat(
-            [graphs.near.mul(there[:, None]).sum(2), (there.sum(1, keepdim=True) / _USUAL).expand_as(there)],
+            [
+                graphs.near.mul(there[:, None]).sum(2),
+                (there.sum(1, keepdim=True) / _USUAL_POINTS).expand_as(there),
+            ],
             -1,
         )
-        size = layouts.new_full((*layouts.shape[:2], 1), layouts.shape[1] / _USUAL)
+        size = layouts.new_full((*layouts.shape[:2], 1), layouts.shape[1] / _USUAL_POINTS)
         of_points = self.embed_points(around)
         of_markers = self.embed_markers(torch.cat([layouts.sum(2), size], -1))
         for number in range(self.config.first_rounds):
@@ -277,7 +271,7 @@ class LayoutNetwork(nn.Module):
 
 
 class _Graphs(NamedTuple):
-    """Distances of clouds and layouts in the forms in which the network reads them."""
+    """Distances of clouds and layouts in the layouts that the network needs."""
 
     near: Float[Tensor, "B N N K"]
     flat_near: Float[Tensor, "B K N*N"]
@@ -285,17 +279,18 @@ class _Graphs(NamedTuple):
     """Share of each basis function in the distance to every other point."""
     there: Float[Tensor, "B N 1"]
     pairs: Float[Tensor, "G M M 2K"]
-    """Distributions of the distances between two markers, and their logarithms."""
+    """Distributions of the distance between two markers, and their scaled logarithms."""
     flat_layouts: Float[Tensor, "G 2K M*M"]
 
     @classmethod
     def of(cls, points: Tensor, present: Tensor, layouts: Tensor, config: LayoutNetworkConfig) -> _Graphs:
+        """The distances of clouds (B, N, 3) [m] and of layouts (G, M, M, K)."""
         batch, count = present.shape
         bumps = config.num_distances
         near, there = distance_features(points, config), present[..., None].to(points.dtype)
         others = there[:, None] * (1.0 - torch.eye(count))[None, :, :, None]
         shares = near / near.sum(-1, keepdim=True).clamp_min(1e-3) * others
-        pairs = torch.cat([layouts, torch.log(layouts + _RAREST) / 3.0 + 1.0], -1)
+        pairs = torch.cat([layouts, torch.log(layouts + _MIN_SHARE) / 3.0 + 1.0], -1)
         return cls(
             near,
             near.permute(0, 3, 1, 2).reshape(batch, bumps, -1),
@@ -307,12 +302,12 @@ class _Graphs(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """A comparison of points and markers."""
+    """The result of one comparison of points and markers."""
 
     scores: Float[Tensor, "B N M"]
     log: LabelScores
     soft: Float[Tensor, "B N M"]
-    """How likely each pair is, for both of its ends."""
+    """Geometric mean of both probabilities of a pair."""
     points_sure: Float[Tensor, "B N 2"]
     """Probability that a point is a ghost, and of its likeliest marker."""
     markers_sure: Float[Tensor, "B M 2"]
@@ -320,7 +315,7 @@ class _Matches(NamedTuple):
 
 
 class Comparison(nn.Module):
-    """Compares the features of points and markers; either may have no partner."""
+    """Compares the features of points and markers; ghosts and occluded markers have no partner."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -335,7 +330,7 @@ class Comparison(nn.Module):
         present: Bool[Tensor, "B N"],
         evidence: Float[Tensor, "B N M"] | None,
     ) -> _Matches:
-        """The matches, with what is known beside the features themselves."""
+        """The matches by features and, after the first comparison, further evidence."""
         left = self.of_points(self.norm_points(of_points))
         right = self.of_markers(self.norm_markers(of_markers))
         scores = left @ right.transpose(1, 2) / math.sqrt(left.shape[-1])
@@ -351,7 +346,7 @@ class Comparison(nn.Module):
 
 
 class MatchExchange(nn.Module):
-    """Tells points and markers of their matches, and how well each pair agrees with all others."""
+    """Passes features between matched points and markers, and compares each pair with all others."""
 
     def __init__(self, config: LayoutNetworkConfig) -> None:
         super().__init__()
@@ -384,11 +379,13 @@ class MatchExchange(nn.Module):
         return points, markers, self._agreement(soft, graphs) + self.kept * matches.scores
 
     def _agreement(self, soft: Float[Tensor, "B N M"], graphs: _Graphs) -> Float[Tensor, "B N M"]:
-        """How well the distances from a point fit those from a marker, where the others are matched."""
+        """How well the distances from a point to matched points fit those from a marker."""
         batch, count, num_markers = soft.shape
         groups, heads = len(graphs.pairs), len(self.weights)
         bumps = graphs.pairs.shape[-1] // 2
-        seen = (graphs.shares @ soft).view(batch, bumps, count, num_markers)  # who is how far from each point
+        seen = (graphs.shares @ soft).view(
+            batch, bumps, count, num_markers
+        )  # which markers are at which distance
         seen = seen.permute(0, 2, 1, 3).reshape(groups, -1, bumps * num_markers)
         other = (1.0 - torch.eye(num_markers))[None, :, :, None]
         fits = (self.agreement(graphs.pairs) * other).view(groups, num_markers, num_markers, heads, bumps)
@@ -405,14 +402,14 @@ def _embedding(bumps: int, width: int) -> nn.Sequential:
 def layout_loss(found: list[LabelScores], truth: Tensor, present: Tensor) -> Tensor:
     """Loss of all comparisons, see `train.labelers.networks.labeling_loss`."""
     losses = torch.stack([labeling_loss(scores, truth, present) for scores in found])
-    return losses[-1] + _EARLY * losses[:-1].sum()
+    return losses[-1] + _EARLY_WEIGHT * losses[:-1].sum()
 
 
-_PREPARED: Final = 20_000  # frames
+_MEAN_HAND_FRAMES: Final = 20_000
 
 
 def new_network(config: NetworkConfig) -> nn.Module:
-    """An untrained network of the kind that its settings are for."""
+    """An untrained network with these settings."""
     if isinstance(config, CNNConfig):
         network = DeepLabelCNN(config)
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -420,10 +417,10 @@ def new_network(config: NetworkConfig) -> nn.Module:
 
 
 def prepare_network(network: nn.Module, rows: NDArray[np.void] | MappedRows) -> None:
-    """Give an untrained network what it must know of a training set before the first step."""
+    """Give an untrained network of the paper's kind the mean hand of a training set."""
     if isinstance(network, DeepLabelCNN):
         rng = np.random.default_rng(0)
-        config = TrainSettings(batch=_PREPARED, rig_share=0.0, anisotropy=0.0)
+        config = TrainSettings(batch=_MEAN_HAND_FRAMES, rig_share=0.0, anisotropy=0.0)
         batch = draw_batch(rows, batch_recipe(config, network.config.num_labels), rng=rng)
         hand = MeanHand.of_clouds(batch.markers, batch.cloud.points, batch.cloud.present)
         network.mean_hand.set(hand)
@@ -438,13 +435,16 @@ def batch_loss(
     rng: np.random.Generator,
     part: Part,
 ) -> torch.Tensor:
-    """Loss of a part of one batch, a scalar; its mean over all parts is the loss of the batch.
+    """Loss of a part of a batch, a scalar; its mean over all parts is the loss of the batch.
 
-    What is drawn is drawn for the whole batch, so that a cloud does not depend on the number of parts.
+    Random draws are for the whole batch, so that a cloud does not depend on the number of parts.
     """
     if config.labeler == "cnn":
         return cnn_loss(network, batch, device, config, rng=rng, part=part)
-    return set_loss(network, part.of(batch), device)
+    (points, present, truth), _, weights = part.of(batch)
+    known = torch.from_numpy(present).to(device)
+    scores = network(torch.from_numpy(points.astype(np.float32)).to(device), known)
+    return labeling_loss(scores, torch.from_numpy(truth).to(device), known, weights=weights)
 
 
 def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabeler:
@@ -468,21 +468,21 @@ def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
 
 
 def batch_device() -> torch.device:
-    """Where batches are labeled."""
+    """The device on which batches are labeled."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 class BatchNetwork:
-    """A trained network for batches; where there is a GPU, a copy on it is made for the first of them."""
+    """A trained network for batches; the first batch copies it to the GPU, if there is one."""
 
     def __init__(self, network: nn.Module) -> None:
         self._network = network
         self._placed: tuple[nn.Module, torch.device] | None = None
 
     def __call__(self, *inputs: torch.Tensor) -> Any:
-        """What the network makes of inputs on the CPU; its tensors stay on the network's device.
+        """Outputs of the network, on its device, for inputs on the CPU.
 
-        A GPU computes in 32 bits too, so that labels are the CPU's but for ties in the last bits.
+        TF32 is off, so that labels differ from the CPU's in near ties only.
         """
         if self._placed is None:
             device, here = batch_device(), next(self._network.parameters()).device

@@ -1,9 +1,9 @@
-"""What labeled points say of a hand as a whole: how likely its pose is, wherever it is, and its side.
+"""How likely labeled points are as a hand, in any position and orientation, and which side it is of.
 
 The prior is a mixture. Each component is a mean hand with the directions in which markers move together
 around it (probabilistic principal components, Tipping and Bishop 1999), learned from a cluster of frames.
 Missing markers are left out of mean and covariance, which is exact for a normal distribution. Points are
-turned and moved onto each mean hand first.
+aligned with each mean hand first.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from handsim.hand.shape import Side
 from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
-"""Components that count, of all those whose mean hand is compared with the points."""
-_LEAST_POINTS: Final = 4  # fewer fit any hand
-_NEWTON_STEPS: Final = 60  # most, of a polynomial of fourth degree, from above its largest root
-_ROUGH, _EXACT = 1e-9, 1e-14  # last step, relative to the bound above the root
-_MOST_COMPONENTS, _MOST_DIRECTIONS = 10_000, 100
+"""Number of components in a density: those whose mean hands are nearest to the points."""
+_MIN_POINTS: Final = 4  # fewer points fit any hand
+_MAX_NEWTON_STEPS: Final = 60
+_ROUGH, _EXACT = 1e-9, 1e-14  # tolerance of the largest root, relative to the bound above it
+_MAX_COMPONENTS, _MAX_DIRECTIONS = 10_000, 100
 FloatArray = NDArray[np.float64]
 
 
@@ -39,9 +39,9 @@ class PosePrior:
     means: Float32[np.ndarray, "K M 3"]
     """Mean hand of each component [m]."""
     directions: Float32[np.ndarray, "K M 3 R"]
-    """Directions in which it varies, with their standard deviations as lengths [m]."""
+    """Principal directions of each component; their lengths are standard deviations [m]."""
     spreads: Float32[np.ndarray, "K"]
-    """Standard deviation of each coordinate around them [m]."""
+    """Standard deviation of each coordinate beside these directions [m]."""
     log_weights: Float32[np.ndarray, "K"]
     """Logarithm of each component's share."""
 
@@ -52,8 +52,8 @@ class PosePrior:
         found = tuple(getattr(self, field.name) for field in fields(self))
         if (
             tuple(one.shape for one in found) != shapes
-            or not 0 < count <= _MOST_COMPONENTS
-            or not 0 < rank <= _MOST_DIRECTIONS
+            or not 0 < count <= _MAX_COMPONENTS
+            or not 0 < rank <= _MAX_DIRECTIONS
             or not all(np.isfinite(one).all() for one in found)
             or not (self.spreads > 0.0).all()
         ):
@@ -67,21 +67,21 @@ class PosePrior:
     def log_density(
         self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], *, mirrored: bool
     ) -> float:
-        """Logarithm of the density of labeled points, of a left hand where `mirrored`; -inf below four."""
-        if len(points) < _LEAST_POINTS:
+        """Log-density of labeled points [m], of a left hand where `mirrored`; -inf for fewer than four."""
+        if len(points) < _MIN_POINTS:
             return -np.inf
         cloud, tables = seen_as_right(points, mirrored), tables_of(self)
         nearest = np.argsort(procrustes_errors(cloud, labels, tables.by_marker))[:NEAREST]
         return float(log_density(cloud, labels, nearest, tables))
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
-        """The tables by name, for a file; directions in half precision, which is enough for them."""
+        """The tables by name, for a file, the directions in half precision."""
         tables = {field.name: getattr(self, field.name) for field in fields(self)}
         return tables | {"directions": self.directions.astype(np.float16)}
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]]) -> PosePrior:
-        """The prior out of a file's tables."""
+        """The prior from the tables of a file."""
         if set(tensors) != {field.name for field in fields(cls)}:
             raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
@@ -100,14 +100,14 @@ class PriorTables(NamedTuple):
 
 @functools.lru_cache(maxsize=8)
 def tables_of(prior: PosePrior) -> PriorTables:
-    """The tables of a prior; kept, because every cloud is compared with them."""
+    """The tables of a prior, cached for all clouds."""
     by_marker = means_by_marker(prior.means, np.arange(len(prior.means)))
     return PriorTables(by_marker, prior.means, prior.directions, prior.spreads, prior.log_weights)
 
 
 @kernel
 def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArray:
-    """Centered points (N, 3) [m] of what is a right hand then."""
+    """Centered points (N, 3) [m], mirrored to a right hand's if need be."""
     centered = points.copy()
     for axis in range(3):
         centered[:, axis] -= points[:, axis].mean()
@@ -118,7 +118,7 @@ def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArra
 
 @kernel
 def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray, "C"]) -> FloatArray:
-    """Mean hands (M, 3, C) of some components, the components next to one another in memory [m]."""
+    """Mean hands (M, 3, C) of some components [m], contiguous along the components."""
     table = np.empty((means.shape[1], 3, len(chosen)))
     for number in range(len(chosen)):
         for marker in range(means.shape[1]):
@@ -131,7 +131,7 @@ def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray,
 def procrustes_errors(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
 ) -> FloatArray:
-    """Squared distances (C,) of centered points to mean hands that are moved and turned onto them [m^2]."""
+    """Squared distances (C,) of centered points from mean hands that are aligned with them [m^2]."""
     return errors_of_products(*products_with_means(cloud, labels, table), False)
 
 
@@ -163,7 +163,7 @@ def products_with_means(
 def errors_of_products(
     product: Float[np.ndarray, "9 C"], squares: Float[np.ndarray, "C"], mirrored: bool
 ) -> FloatArray:
-    """See `procrustes_errors`; of the mirror image of the points where `mirrored`."""
+    """Procrustes errors (C,) [m^2] of points, or of their mirror image, from `products_with_means`."""
     errors = np.empty(len(squares))
     for one in range(len(squares)):
         largest = _largest_root(product[:, one], mirrored, 0.5 * squares[one], _ROUGH)
@@ -188,7 +188,7 @@ def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float,
         c1 = -c1
     c0 = 2.0 * (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) - total * total
     root = above
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         value = ((root * root + c2) * root + c1) * root + c0
         slope = (4.0 * root * root + 2.0 * c2) * root + c1
         if slope <= 0.0:
@@ -240,7 +240,7 @@ def factor_of(
 def residual_of(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], mean: Float32[np.ndarray, "M 3"]
 ) -> FloatArray:
-    """Centered points (N, 3), turned onto the markers of a mean hand, minus these [m]."""
+    """Residuals (N, 3) [m] of centered points, once they are aligned with a mean hand."""
     center, product, bound = np.zeros(3), np.zeros((3, 3)), 0.0
     for number in range(len(cloud)):
         for axis in range(3):
@@ -282,7 +282,7 @@ def _largest_eigenvector(k: Float[np.ndarray, "4 4"], root: float) -> FloatArray
     for axis in range(4):
         vector[axis] = _cofactor(shifted, best, axis)
     length = np.sqrt((vector * vector).sum())
-    if not length > 0.0:  # two eigenvalues are equal: each mixture of their eigenvectors is as good
+    if not length > 0.0:  # two equal eigenvalues: any mixture of their eigenvectors will do
         vector, length = np.linalg.eigh(k)[1][:, 3], 1.0
     unit: FloatArray = vector / length
     return unit
@@ -334,32 +334,32 @@ def log_normal(
     return log
 
 
-MOST_COMPONENTS: Final = 400
-_FRAMES_EACH: Final = 400  # of a component; fewer frames give fewer components
-_LEAST_COMPONENTS: Final = 12  # a prior of fewer knows less than the network
-_LEAST_MEMBERS: Final = 20  # of a component
+_MAX_LEARNED_COMPONENTS: Final = 400
+_FRAMES_PER_COMPONENT: Final = 400
+_MIN_COMPONENTS: Final = 12  # a prior with fewer components knows less than the network
+_MIN_MEMBERS: Final = 20  # frames of a component
 _DIRECTIONS: Final = 24  # about the degrees of freedom of a hand
-_NOISE: Final = 0.0012  # of a marker's coordinate in a capture [m], optics and skin
-_LENT: Final = 100.0  # frames' worth of its neighbors' covariance that each component is given
+_NOISE: Final = 0.0012  # noise of a marker's coordinate in a capture, from optics and skin [m]
+_NEIGHBOR_FRAMES: Final = 100.0  # frames that the neighbors' covariance counts as
 _NEIGHBORS: Final = 8
-_CLUSTERINGS: Final = 4
-_RIGID: Final = 6  # directions that the alignment takes out
-_CHUNK: Final = 8192
-_MOST_FRAMES: Final = 200_000
+_ITERATIONS: Final = 4  # of each clustering and alignment
+_RIGID: Final = 6  # degrees of freedom that the alignment removes
+_CHUNK: Final = 8192  # frames that are compared with the centers at once
+_MAX_FRAMES: Final = 200_000
 
 
 def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
     """The prior of right hands in frames with every marker [m]; None for too few frames or markers."""
     markers = markers[np.isfinite(markers).all(axis=(1, 2))]
-    if len(markers) > _MOST_FRAMES:
-        markers = markers[np.sort(rng.permutation(len(markers))[:_MOST_FRAMES])]
-    count = min(MOST_COMPONENTS, len(markers) // _FRAMES_EACH)
+    if len(markers) > _MAX_FRAMES:
+        markers = markers[np.sort(rng.permutation(len(markers))[:_MAX_FRAMES])]
+    count = min(_MAX_LEARNED_COMPONENTS, len(markers) // _FRAMES_PER_COMPONENT)
     rank = min(_DIRECTIONS, 3 * markers.shape[1] - _RIGID - 1)
-    if count < _LEAST_COMPONENTS or rank < 1:
+    if count < _MIN_COMPONENTS or rank < 1:
         return None
     members = _clusters(markers.astype(np.float64), count, rng)
     means, scatters, sizes = _moments(markers.astype(np.float64), members, count)
-    covariances = _lent(means, scatters, sizes)
+    covariances = _shrunk_covariances(means, scatters, sizes)
     values, vectors = np.linalg.eigh(covariances)  # in ascending order
     spreads = np.sqrt(values[:, _RIGID:-rank].mean(axis=1) + _NOISE**2)
     deviations = np.sqrt(np.maximum(values[:, -rank:] + _NOISE**2 - spreads[:, None] ** 2, 0.0))
@@ -375,7 +375,7 @@ def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Gene
 def align_all(
     hands: Float[np.ndarray, "T M 3"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "T M 3"]:
-    """Hands turned and moved onto one hand with the least squares of distances (Kabsch 1976)."""
+    """Hands aligned with a target by least squares (Kabsch 1976) [m]."""
     centered = hands - hands.mean(axis=1, keepdims=True)
     center = target.mean(axis=0)
     left, _, right = np.linalg.svd(centered.swapaxes(1, 2) @ (target - center))
@@ -389,12 +389,12 @@ def _clusters(
 ) -> Int[np.ndarray, "T"]:
     """The cluster of each frame, by k-means of the hands aligned with their mean."""
     mean = markers[0]
-    for _ in range(_CLUSTERINGS):
+    for _ in range(_ITERATIONS):
         mean = align_all(markers, mean).mean(axis=0)
     flat = align_all(markers, mean).reshape(len(markers), -1)
     centers = flat[rng.permutation(len(flat))[:count]]
     members = _nearest(flat, centers)
-    for _ in range(_CLUSTERINGS):
+    for _ in range(_ITERATIONS):
         sums = np.zeros_like(centers)
         np.add.at(sums, members, flat)
         sizes = np.bincount(members, minlength=count)
@@ -416,14 +416,14 @@ def _nearest(flat: Float[np.ndarray, "T D"], centers: Float[np.ndarray, "K D"]) 
 def _moments(
     markers: Float[np.ndarray, "T M 3"], members: Int[np.ndarray, "T"], count: int
 ) -> tuple[Float[np.ndarray, "K M 3"], Float[np.ndarray, "K D D"], Int[np.ndarray, "K"]]:
-    """Mean hand, scatter matrix and size of each cluster, its hands aligned with that mean; no small ones."""
+    """Mean hand, scatter matrix around it and size of each cluster with enough members."""
     means, scatters, sizes = [], [], []
     for cluster in range(count):
         hands = markers[members == cluster]
-        if len(hands) < _LEAST_MEMBERS:
+        if len(hands) < _MIN_MEMBERS:
             continue
         mean = hands[0]
-        for _ in range(_CLUSTERINGS):
+        for _ in range(_ITERATIONS):
             aligned = align_all(hands, mean)
             mean = aligned.mean(axis=0)
         off = (aligned - mean).reshape(len(hands), -1)
@@ -433,27 +433,31 @@ def _moments(
     return np.array(means), np.array(scatters), np.array(sizes)
 
 
-def _lent(
+def _shrunk_covariances(
     means: Float[np.ndarray, "K M 3"], scatters: Float[np.ndarray, "K D D"], sizes: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K D D"]:
-    """Covariances, each with some of its neighbors', because its own frames are few."""
+    """Covariances of the clusters, each shrunk toward its neighbors', because its own frames are few."""
     flat = means.reshape(len(means), -1)
     covariances = np.empty_like(scatters)
     for cluster, mean in enumerate(flat):
         near = np.argsort(((flat - mean) ** 2).sum(axis=1))[1 : _NEIGHBORS + 1]
         around = scatters[near].sum(axis=0) / sizes[near].sum()
-        covariances[cluster] = (scatters[cluster] + _LENT * around) / (sizes[cluster] + _LENT)
+        covariances[cluster] = (scatters[cluster] + _NEIGHBOR_FRAMES * around) / (
+            sizes[cluster] + _NEIGHBOR_FRAMES
+        )
     return covariances
 
 
 _MAX_FOURS: Final = 3000
-_POSES: Final = 100  # of each size
-_TOLD: Final = 0.98  # share of whole hands whose side is told in a layout unlike its mirror image; mostly all
+_POSES: Final = 100  # of a hand of each size
+_RECOGNIZED: Final = (
+    0.98  # share of complete hands whose side is right if a layout is unlike its mirror image
+)
 _SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
 class SideClassifier:
-    """Classifies the hands of a layout as left or right, one frame at a time; labelers do not tell.
+    """Classifies the labeled hands of a layout as left or right, one frame at a time.
 
     Four labeled points span a tetrahedron, and a mirror inverts its orientation. Some groups of four have the
     same orientation in almost every pose (thumb, knuckles and wrist), others do not. Poses of simulated right
@@ -471,32 +475,29 @@ class SideClassifier:
         self._num_markers = layout.num_markers
 
     def classify(self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"]) -> tuple[Side, float]:
-        """The side of one hand, and the clearness of the vote [0, 1]; 0 for fewer than four markers."""
+        """The side of one hand [m], and how clear the vote is, 0 to 1; 0 for fewer than four markers."""
         markers = np.full((self._num_markers, 3), np.nan)
         markers[labels[labels >= 0]] = points[labels >= 0]
         vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
 
     def recognized(self, hands: Float[np.ndarray, "T M 3"], side: Side) -> Bool[np.ndarray, "T"]:
-        """Whether each hand of a side is classified as one of it, by its true labels; NaN where missing."""
+        """Whether each hand of a side is classified right by its true labels; NaN for missing markers."""
         labels = np.arange(self._num_markers)
         return np.array([self.classify(hand, labels)[0] == side for hand in hands], dtype=np.bool_)
 
 
 def is_mirror_like(layout: MarkerLayout) -> bool:
-    """Whether a layout is nearly its own mirror image, so that the side of a whole hand is not always told.
-
-    That is by its true labels; where they are unknown, sides are exchanged more often.
-    """
+    """Whether a layout is nearly its own mirror image, so that true labels do not always tell the side."""
     if any(one.bone.startswith("thumb") for one in layout.markers):
-        return False  # a thumb tells, without a third of a second
+        return False  # a thumb always shows the side
     rng = np.random.default_rng(0)
     classifier = SideClassifier(layout, rng=rng)
-    return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _TOLD)
+    return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _RECOGNIZED)
 
 
 def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Markers of a right hand of a size in random poses."""
+    """Markers (T, M, 3) [m] of a right hand of a size in random poses."""
     from gloves.fit import attach_markers
     from handsim.hand.model import HandModel, join_qpos
     from poses.shapes import sample_valid_angles

@@ -63,7 +63,7 @@ class Labeler(Protocol):
 
 
 def checked_names(names: object) -> tuple[str, ...]:
-    """Marker names out of a file."""
+    """Marker names from a file; a ValueError if they are not different strings."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("marker_names is not a list of names")
     if len(set(names)) < len(names) or not names:
@@ -75,10 +75,7 @@ def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
 ) -> list[Labeling]:
-    """Check frames and label them in batches of similar size, so that padding stays small.
-
-    `label` gets batches whose last frame holds the most points, and at least one.
-    """
+    """Check frames, and label them in batches of similar size, so that padding stays small."""
     clouds = check_clouds(frames)
     order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
@@ -93,7 +90,14 @@ def label_in_batches(
 
 def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.float64]]:
     """The points of every frame [m], after the checks that `Labeler.label_frames` names."""
-    clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
+    clouds = [np.asarray(points, dtype=np.float64) for points in frames]
+    for frame, cloud in enumerate(clouds):
+        if cloud.ndim != 2 or cloud.shape[1] != 3:
+            raise ArgumentError(f"frame {frame} has shape {cloud.shape}, expected (N, 3)")
+        if not np.isfinite(cloud).all():
+            raise ArgumentError(f"frame {frame} holds NaN or infinite points; leave missing points out")
+        if len(cloud) > MAX_POINTS:
+            raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     check_unit(clouds, only_wide=True)
     return clouds
 
@@ -101,7 +105,7 @@ def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.
 def pad_clouds(
     clouds: Sequence[NDArray[np.float64]],
 ) -> tuple[Float32[np.ndarray, "B N 3"], Bool[np.ndarray, "B N"]]:
-    """Clouds [m] moved to their centers and padded to one length, and which points are there."""
+    """Clouds [m] around their means, padded to one length, and which points are no padding."""
     longest = max(len(cloud) for cloud in clouds)
     points = np.zeros((len(clouds), longest, 3), dtype=np.float32)
     present = np.zeros((len(clouds), longest), dtype=bool)
@@ -113,7 +117,7 @@ def pad_clouds(
 
 
 def check_output(numbers: Float[np.ndarray, "..."]) -> None:
-    """Refuse what a network with damaged weights gives."""
+    """Raise a `WeightsError` for NaN in the output of a network, whose weights are damaged then."""
     if np.isnan(numbers).any():
         raise WeightsError(
             "the labeler's network gives numbers that are NaN, expected weights that are whole"
@@ -138,37 +142,26 @@ def label_by_scores(
     return labelings
 
 
-def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.float64]:
-    cloud = np.asarray(points, dtype=np.float64)
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise ArgumentError(f"frame {frame} has shape {cloud.shape}, expected (N, 3)")
-    if not np.isfinite(cloud).all():
-        raise ArgumentError(f"frame {frame} holds NaN or infinite points; leave missing points out")
-    if len(cloud) > MAX_POINTS:
-        raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
-    return cloud
-
-
 def learned_folder() -> Path:
-    """Where labelers of learned gloves are kept; `XDG_CACHE_HOME` moves it."""
+    """The folder of the labelers of learned gloves; `XDG_CACHE_HOME` moves it."""
     return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
 
 
 def learned_gloves() -> tuple[Path, ...]:
-    """The files of the gloves that are kept, the most recently used first."""
+    """The files of learned gloves, the most recently used first."""
     files = learned_folder().glob(f"*{LEARNED}")
     return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def label_on(threads: int) -> None:
-    """Have labelers use this many threads from now on; it is one when this is never called."""
+    """Set the number of threads of all labelers; the default is one."""
     check_count("threads", threads, 1, MOST_THREADS)
     _threads.set(threads)
 
 
 @contextmanager
 def labeling_threads() -> Iterator[None]:
-    """Within the block torch uses the threads of labelers."""
+    """Within the block torch uses the number of threads set for labelers."""
     with torch_threads(_threads.get()):
         yield
 
@@ -177,8 +170,8 @@ def labeling_threads() -> Iterator[None]:
 def torch_threads(count: int) -> Iterator[None]:
     """Within the block torch and labelers use this many threads.
 
-    Torch's own default, a thread a core, makes a small network many times slower where others compute too:
-    its threads wait for one another in every operation.
+    With torch's default, one a core, a small network is many times slower on a busy machine, because its
+    threads wait for one another in every operation.
     """
     import torch
 
@@ -192,7 +185,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class OwnLabeler:
-    """A user's `Labeler`, as an object or by its name, behind checks of what it is and returns."""
+    """A user's `Labeler`, given as an object or by its name, whose results are checked."""
 
     def __init__(self, labeler: Labeler | str) -> None:
         name = plugin_name(labeler)
@@ -217,6 +210,7 @@ class OwnLabeler:
         return [self._checked(one, len(cloud)) for one, cloud in zip(returned, clouds, strict=True)]
 
     def _checked(self, labeling: Any, count: int) -> Labeling:
+        """A labeling of `count` points, if it is a valid one."""
         owner = f"{_NOUN} '{self._name}'"
         try:
             labels, confidence = np.asarray(labeling.labels), np.asarray(labeling.confidence, np.float64)

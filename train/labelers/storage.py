@@ -1,9 +1,8 @@
 """Labelers by their names and files: of a glove, for any layout, trained, exported, or your own object.
 
-A trained labeler is safetensors for the weights and JSON for the model card, or one ONNX file, written with
-torch and run by onnxruntime without it. The metadata of the weights repeat what others ask of a file that
-they find alone: what it is, of which layout, who wrote it, from what data, under which license. Nothing here
-reads it back: the card is what counts.
+A trained labeler is a safetensors file of weights and a model card in JSON, or one ONNX file, which
+onnxruntime runs without torch. The metadata of the weights repeat parts of the card for people who find the
+file alone; handsim reads the card only.
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ from train.labelers.set_inference import TrainedSetLabeler, weight_shapes
 from train.settings import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 
 if TYPE_CHECKING:
-    import onnx
     from torch import nn
 
 
@@ -57,25 +55,25 @@ ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
-_ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
-_PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
+_ANY_LAYOUT: Final = "any_layout"  # stem of the weights of the network for any layout
+_PRIOR: Final = "pose_prior."  # prefix of the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
-_LENGTH: Final = 8  # bytes that hold the header's length
-_LEAST_BYTES: Final = 4  # of a number of a network
-_MOST_CARD: Final = 1 << 24  # bytes
+_LENGTH_BYTES: Final = 8  # bytes that hold the header's length
+_BYTES_PER_WEIGHT: Final = 4
+_MAX_CARD_BYTES: Final = 1 << 24
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
-_FEW_POSES: Final = 6000  # from which a layout is known that nobody asked for
+_FEW_POSES: Final = 6000  # poses that describe a layout to the labeler without a minute of learning
 _EXPECTED: Final = (
     "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
     "module:name"
 )
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
-_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
+_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, taken with 64 zeros in its place
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
 _ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
-_MATCHING: Final = "handsim.matching"  # key of the constants that labels are chosen by, for other programs
-_IMAGES: Final = "images"  # its input
+_MATCHING: Final = "handsim.matching"  # key of the constants of the matching, for other programs
+_IMAGES: Final = "images"  # input of the paper's network
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
 _PAIRED: Final = "pairs", "costs"  # outputs for other programs
@@ -100,7 +98,7 @@ _MEANINGS: Final = {
     "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
     "image's width.",
 }
-"""What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
+"""Descriptions of inputs and outputs, stored in the file's metadata under `handsim.` and their names."""
 _HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
@@ -151,7 +149,7 @@ def load_labeler(
 
 @functools.lru_cache(maxsize=32)
 def labeler_at_once(layout: MarkerLayout) -> Labeler:
-    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn."""
+    """A labeler of a glove without a minute of learning; it is good enough to recognize the glove."""
     shipped = _shipped_labeler(layout)
     if shipped is not None:
         return shipped
@@ -163,6 +161,7 @@ def labeler_at_once(layout: MarkerLayout) -> Labeler:
 
 
 def _is_glove(given: Any) -> bool:
+    """Whether an argument is a glove rather than a labeler."""
     return (
         isinstance(given, MarkerLayout)
         or str(given) in list_layouts()
@@ -171,7 +170,7 @@ def _is_glove(given: Any) -> bool:
 
 
 def _resolved(labeler: Any) -> Labeler:
-    """A labeler as it is, or by its name or path."""
+    """A labeler that is given as an object, or by its name or path."""
     if labeler == ANY_LAYOUT:
         raise ArgumentError(
             f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
@@ -190,13 +189,13 @@ def _resolved(labeler: Any) -> Labeler:
 
 
 def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
-    """The labeler that comes with handsim for a layout, if one does."""
+    """The shipped labeler of a layout, if there is one."""
     found = (name for name in shipped_labelers() if load_layout(name) == layout)
     return next((_read(*_files(name)).labeler() for name in found), None)
 
 
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
-    """The labeler for any layout, after a warning that it is this one."""
+    """The labeler for any layout, after a warning that the glove has none of its own."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
     from train.labelers.pose_prior import is_mirror_like  # kernels
 
@@ -221,7 +220,7 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
 
 def shipped_labelers() -> tuple[str, ...]:
-    """Gloves whose trained labeler comes with the package."""
+    """Names of the gloves whose trained labelers are shipped."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if path.stem != _ANY_LAYOUT))
 
 
@@ -232,7 +231,7 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
 
 def _files(name: str) -> tuple[Path, Path]:
-    """Weights and card of a shipped labeler or a folder."""
+    """Paths of the weights and the card of a shipped labeler or of a folder."""
     if name in shipped_labelers():
         return _SHIPPED / f"{name}.safetensors", _SHIPPED / f"{name}.json"
     weights, card = Path(name) / WEIGHTS, Path(name) / CARD
@@ -247,7 +246,7 @@ def _files(name: str) -> tuple[Path, Path]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stored:
-    """What the two files of a labeler hold."""
+    """The contents of the two files of a labeler."""
 
     config: NetworkConfig
     card: dict[str, Any]
@@ -256,7 +255,7 @@ class _Stored:
     prior: PosePrior | None
 
     def labeler(self) -> Labeler:
-        """The labeler, of the default kind without torch."""
+        """The labeler; the set labeler works without torch."""
         names = tuple(self.card["marker_names"])
         if isinstance(self.config, SetLabelerConfig):
             return TrainedSetLabeler(self.config, self.weights, self.prior, names)
@@ -278,18 +277,18 @@ class _Stored:
 
 
 def _read(weights: Path, card: Path) -> _Stored:
-    """What two files hold; nothing in them is trusted."""
+    """Read and check weights and card."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
     try:
-        content = json.loads(read_bytes(card, error=WeightsError, most=_MOST_CARD))
+        content = json.loads(read_bytes(card, error=WeightsError, most=_MAX_CARD_BYTES))
         names = checked_names(content["marker_names"])
         config = _CONFIGS[content.get("labeler", "set")](**content["network"])
         if len(names) != config.num_labels:
             raise WeightsError(f"{card} names {len(names)} markers for {config.num_labels} labels")
         expected = _shapes_of(config)
-        if weights.stat().st_size < _LEAST_BYTES * sum(map(math.prod, expected.values())):
+        if weights.stat().st_size < _BYTES_PER_WEIGHT * sum(map(math.prod, expected.values())):
             raise ValueError("it is too short for the network that its card describes")
         tensors = load_file(weights)
         tables = {
@@ -319,7 +318,7 @@ def _read(weights: Path, card: Path) -> _Stored:
 
 
 def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a network's weights, which are not made."""
+    """Names and shapes of a network's weights."""
     if isinstance(config, SetLabelerConfig):
         return weight_shapes(config)
     import torch
@@ -331,7 +330,7 @@ def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
 
 
 def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None:
-    """Write weights, with the pose prior if there is one, and model card with at least `marker_names`."""
+    """Write the weights, with the pose prior if there is one, and the model card."""
     import torch
     from safetensors.torch import save
 
@@ -344,21 +343,19 @@ def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None
         tensors |= {_PRIOR + name: torch.from_numpy(table) for name, table in prior.tensors().items()}
     with written_together():
         with atomic_write(folder / WEIGHTS) as temporary:
-            # safetensors' own writing hides that a disk is full
+            # The writer of safetensors does not report a full disk.
             temporary.write_bytes(_with_metadata(save(tensors), weights_metadata(card)))
         save_json(folder / CARD, card)
 
 
 def weights_metadata(card: dict[str, Any]) -> dict[str, str]:
-    """What a file of weights tells of itself; all text, as safetensors has it."""
-    dataset = card.get("dataset", {})
-    layout = dataset.get("layout", {}).get("name")
+    """Metadata of the weights: the parts of the card that describe them, as text."""
     known = {
         "format": "pt",
         "library_name": "handsim",
         "handsim_version": card.get("handsim"),
         "labeler": card.get("labeler"),
-        "layout": layout,
+        "layout": card.get("dataset", {}).get("layout", {}).get("name"),
         "marker_names": json.dumps(card["marker_names"]),
         "units": "points in meters",
         "trained_on": card.get("trained_on"),
@@ -368,13 +365,13 @@ def weights_metadata(card: dict[str, Any]) -> dict[str, str]:
 
 
 def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
-    """A safetensors file with metadata in this order; safetensors' own writing shuffles them each time."""
-    end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
-    tensors = json.loads(content[_LENGTH:end])
+    """A safetensors file with its metadata in this order; safetensors' own writer shuffles them."""
+    end = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+    tensors = json.loads(content[_LENGTH_BYTES:end])
     tensors.pop(_METADATA, None)
     header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
-    header += b" " * (-len(header) % _LENGTH)  # tensors begin at multiples of eight bytes
-    return len(header).to_bytes(_LENGTH, "little") + header + content[end:]
+    header += b" " * (-len(header) % _LENGTH_BYTES)  # tensors begin at multiples of eight bytes
+    return len(header).to_bytes(_LENGTH_BYTES, "little") + header + content[end:]
 
 
 class OnnxLabeler:
@@ -400,10 +397,14 @@ class OnnxLabeler:
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
             metadata = self._session.get_modelmeta().custom_metadata_map
-            self._scores_alone = onnxruntime.RunOptions()  # not what other programs need beside them
+            self._scores_alone = onnxruntime.RunOptions()  # skips the outputs for other programs
             self._scores_alone.only_execute_path_to_fetches = True
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
-            self.prior = _unpacked(metadata[_ONNX_PRIOR]) if _ONNX_PRIOR in metadata else None
+            self.prior = None
+            if _ONNX_PRIOR in metadata:
+                stored = io.BytesIO(base64.b64decode(metadata[_ONNX_PRIOR], validate=True))
+                with np.load(stored) as tables:  # unpickles nothing
+                    self.prior = PosePrior.of_tensors(dict(tables))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
             self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class of their own
@@ -412,7 +413,7 @@ class OnnxLabeler:
             ) from error
 
     def _try(self, given: str) -> None:
-        """Raise a ValueError unless the network gives finite numbers of the right shapes."""
+        """Raise a ValueError unless the outputs are finite and have the shapes of a labeler's."""
         count = len(self.marker_names)
         if given == _IMAGES:
             found = self._session.run(None, {_IMAGES: np.zeros((1, 1, 52, 52), np.float32)})[:1]
@@ -431,13 +432,13 @@ class OnnxLabeler:
         return label_in_batches(frames, self._label)
 
     def _label_by_scores(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
-        """The set labeler."""
+        """Label a batch with the set labeler."""
         given = dict(zip(_INPUTS, pad_clouds(clouds), strict=True))
         by_point, by_label = self._session.run(_OUTPUTS, given, self._scores_alone)
         return label_by_scores(clouds, by_point, by_label, self.prior)
 
     def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
-        """The paper's network, with what its metadata tells of its use."""
+        """What labels a batch with the paper's network, given its settings in JSON."""
         content = json.loads(settings)
         hand = MeanHand(*(np.array(content["mean_hand"][field.name]) for field in fields(MeanHand)))
         config = CNNConfig(**content["config"])
@@ -449,21 +450,8 @@ class OnnxLabeler:
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
 
 
-def _unpacked(text: str) -> PosePrior:
-    """The pose prior in a file's metadata."""
-    with np.load(io.BytesIO(base64.b64decode(text, validate=True))) as tables:  # unpickles nothing
-        return PosePrior.of_tensors(dict(tables))
-
-
-def _packed(prior: PosePrior) -> str:
-    """The pose prior as text."""
-    file = io.BytesIO()
-    np.savez(file, **prior.tensors())  # type: ignore[arg-type]
-    return base64.b64encode(file.getvalue()).decode()
-
-
 def sign_model(content: bytes) -> bytes:
-    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before."""
+    """The bytes of an ONNX model with a fresh SHA-256 in the place of its old one."""
     key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
     if content.count(key) != 1:
         raise ValueError("the file has no SHA-256")
@@ -482,6 +470,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
 
     try:
         import onnx
+        import onnx.helper
     except ImportError as error:
         raise HandSimError(f"exporting needs onnx; {_HINT}") from error
     properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64, "handsim.version": __version__}
@@ -498,7 +487,9 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
         prior = getattr(network, "prior", None)
         if isinstance(prior, PosePrior):
-            properties[_ONNX_PRIOR] = _packed(prior)
+            stored = io.BytesIO()
+            np.savez(stored, **prior.tensors())  # type: ignore[arg-type]
+            properties[_ONNX_PRIOR] = base64.b64encode(stored.getvalue()).decode()
             properties[_MATCHING] = json.dumps(matching_constants())
             network, outputs = PairedScores(network), [*outputs, *_PAIRED]
             axes |= {name: {0: "frames", 1: "points"} for name in _PAIRED}
@@ -517,17 +508,10 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             dynamo=False,
         )
         model = onnx.load(str(plain))
-        _describe(model, properties)
+        model.producer_name, model.producer_version = "handsim", __version__
+        model.doc_string = model.graph.doc_string = _DESCRIPTION
+        for value in (*model.graph.input, *model.graph.output):
+            value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
+        onnx.helper.set_model_props(model, properties)
         onnx.checker.check_model(model, full_check=True)
         temporary.write_bytes(sign_model(model.SerializeToString()))
-
-
-def _describe(model: onnx.ModelProto, properties: dict[str, str]) -> None:
-    """Say who wrote a model and what goes in and out, and add these properties."""
-    import onnx.helper
-
-    model.producer_name, model.producer_version = "handsim", __version__
-    model.doc_string = model.graph.doc_string = _DESCRIPTION
-    for value in (*model.graph.input, *model.graph.output):
-        value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
-    onnx.helper.set_model_props(model, properties)

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REPORT: Final = "report.html"
-MOST_ROWS: Final = 50_000
+MAX_ROWS: Final = 50_000
 """Rows read for the plots; larger sets are sampled evenly."""
 _ANGLE_BINS: Final = 40
-_CHUNK: Final = 1024  # rows whose marker pairs are held in memory at one time
+_CHUNK: Final = 1024  # rows whose marker pairs are in memory at once
 _LOW: Final = np.array([joint.low for joint in JOINTS])
 _HIGH: Final = np.array([joint.high for joint in JOINTS])
 _PUBLISHED_MEDIAN: Final = (3, 4)  # median gap of real finger markers [frames]: lowest and highest take
@@ -70,19 +70,15 @@ def write_dataset_page(
     return path
 
 
-def sample_rows(dataset: Dataset, most: int = MOST_ROWS) -> Shaped[np.ndarray, "T"]:
-    """At most this many rows, evenly spaced over all shards, in order."""
-    total = sum(len(shard) for shard in dataset.shards)
-    chosen = np.arange(min(most, total)) * total // min(most, total)
-    first, parts = 0, []
-    for shard in dataset.shards:
-        here = chosen[(chosen >= first) & (chosen < first + len(shard))] - first
-        parts.append(shard[here])
-        first += len(shard)
-    return np.concatenate(parts)
+def sample_rows(dataset: Dataset, most: int = MAX_ROWS) -> Shaped[np.ndarray, "T"]:
+    """At most `most` rows, evenly spaced over all shards, in order."""
+    rows = dataset.mapped_rows()
+    count = min(most, len(rows))
+    return rows[np.arange(count) * len(rows) // count]
 
 
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:
+    """A table of figures on the whole set."""
     manifest = dataset.manifest
     files = [dataset.path / hands_name(shard) for shard in range(len(dataset.shards))]
     hands = np.concatenate([np.load(file, allow_pickle=False)["length"] for file in files])
@@ -107,6 +103,7 @@ def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section
 
 
 def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
+    """Histograms of joint angles."""
     text = (
         "Share of frames by angle, for each of the twenty joints. Zero is the flat hand; flexion counts "
         "towards the palm, abduction towards the thumb (the thumb's: away from the palm)."
@@ -131,13 +128,13 @@ def angle_shares(rows: Shaped[np.ndarray, "T"], bins: int = _ANGLE_BINS) -> Floa
 def _draw_angles(
     figure: Figure, shares: Float[np.ndarray, "20 N"], middle: Float[np.ndarray, "20 2"]
 ) -> None:
-    """One column per digit, one row per joint angle from the knuckle outwards; `middle` is in [deg]."""
+    """Draw a column per digit and a row per joint angle; 98 % of the frames lie between `middle` [deg]."""
     panels = figure.subplots(4, 5)
     edges = np.linspace(_LOW, _HIGH, _ANGLE_BINS + 1, axis=1)
     for number, joint in enumerate(JOINTS):
         digit, row = divmod(number, 4)
         panel: Axes = panels[row, digit]
-        if digit > 1:  # the thumb has axes of its own; linked before anything is drawn, so that all fits
+        if digit > 1:  # the thumb has axes of its own; axes are linked before anything is drawn
             panel.sharex(panels[row, 1])
             panel.sharey(panels[row, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
@@ -164,6 +161,7 @@ def _draw_angles(
 
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
+    """How often each marker is lost, and how many cameras see it."""
     manifest = dataset.manifest
     least = manifest.min_cameras
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
@@ -191,7 +189,7 @@ def _draw_visibility(
     seen_by: Float[np.ndarray, "M C+1"],
     min_cameras: int,
 ) -> None:
-    """Bars of the share of frames without each marker; beside them how many cameras see it."""
+    """Draw the share of frames without each marker, and beside it the number of cameras that see it."""
     rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
     left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
@@ -225,6 +223,7 @@ def _draw_visibility(
 
 
 def _ghosts_section(rows: Shaped[np.ndarray, "T"]) -> Section:
+    """Number of ghosts, and their distances from markers."""
     counts = ghost_counts(rows)
     caption = f"Left: ghosts per frame, of which {len(counts) - 1} at most are kept. Right: their distances."
     text = "Points of no marker: mirror images in shiny surfaces near the hand, and stray reflections."
@@ -239,7 +238,7 @@ def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
 
 
 def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
-    """From every ghost to the nearest marker of its frame, seen or not [m]."""
+    """Distance from every ghost to the nearest marker of its frame, seen or not [m]."""
     frame, ghost = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
     away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, ghost][:, None]
     distances: NDArray[np.float64] = np.linalg.norm(away, axis=-1).min(axis=1)
@@ -247,7 +246,7 @@ def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
 
 
 def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float[np.ndarray, "N"]) -> None:
-    """Ghosts per frame, and how far [m] each lies from the nearest marker."""
+    """Draw the number of ghosts per frame, and their distances from the nearest marker [m]."""
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
     shares = 100.0 * counts / max(1, counts.sum())
     left.bar(np.arange(len(counts)), shares, color=Paint.BLUE, width=0.62)
@@ -270,6 +269,7 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:
+    """Distances between neighboring markers with a diameter [m]."""
     distances = neighbor_distances(rows)
     closer = 100.0 * (distances.min(axis=1) < diameter).mean()
     caption = (
@@ -282,7 +282,7 @@ def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Sectio
 
 
 def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"]:
-    """From every marker to the nearest other one, seen or not, center to center [m]."""
+    """Distance from every marker to the nearest other one, center to center [m]."""
     parts = []
     for first in range(0, len(rows), _CHUNK):
         markers = rows["markers"][first : first + _CHUNK]
@@ -293,7 +293,7 @@ def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"
 
 
 def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
-    """How near each marker's nearest neighbor is, and the nearest pair of each frame [m]."""
+    """Draw the distances of each marker's nearest neighbor, and of each frame's nearest pair [m]."""
     panel = figure.subplots()
     nearest, bins = distances.min(axis=1), _bins(distances)
     panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
@@ -322,13 +322,13 @@ def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
 def _histogram(
     distances: Float[np.ndarray, "N"], bins: Float[np.ndarray, "B"]
 ) -> tuple[Float[np.ndarray, "B-1"], Float[np.ndarray, "B"]]:
-    """Percent per millimeter of distances [m], and the bins."""
+    """Percent of the distances [m] per millimeter in each bin, and the bins [mm]."""
     counts, _ = np.histogram(1e3 * distances, bins)
     return 100.0 * counts / (max(1, len(distances)) * np.diff(bins)), bins
 
 
 def _mark(panel: Axes, value: float, text: str, color: str) -> None:
-    """An upright line with its meaning beside its top."""
+    """Draw a vertical line with a text beside its top."""
     panel.axvline(value, color=color, linewidth=1.4)
     panel.annotate(
         text.format(value), (value, 1.0), (5, -2), ("data", "axes fraction"), "offset points", va="top",
@@ -361,7 +361,7 @@ def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
 
 
 def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> None:
-    """Share of gaps [frames] that are no longer than a length, beside the published median and p90."""
+    """Draw the share of gaps up to each length [frames], beside the published median and p90."""
     panel = figure.subplots()
     ordered = np.sort(lengths)
     longest = int(max(ordered[-1], 1.3 * _PUBLISHED_P90[1]))

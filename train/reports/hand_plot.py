@@ -24,15 +24,15 @@ HAND_SIZE: Final = (10.8, 9.6)
 HAND_CAPTION: Final = (
     "A right hand of size M at rest, from the back; rings are markers that look to the palm's side. "
 )
-LONGEST_NAME: Final = 20
-"""Letters of a marker's name that are drawn."""
-_MOST_ARROWS: Final = 12
+MAX_LETTERS: Final = 20
+"""Longest marker name that is drawn in full."""
+_MAX_ARROWS: Final = 12
 _MARGIN: Final = 34.0  # around the hand [points]
 _BEND: Final = 0.22  # of the arrows, so that the two between a pair of markers lie side by side
 _BAR: Final = (0.90, 0.2, 0.016, 0.6)  # place of the color bar, as shares of the picture
 _FONT_SIZE: Final = 7.5  # of names [points]
 _DOT_RADIUS: Final = 4.2  # of a marker's dot [points]
-_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # tried from dot to name [points]
+_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # from dot to name [points]
 
 
 class FlatHand(NamedTuple):
@@ -59,7 +59,7 @@ class FlatHand(NamedTuple):
 
 
 def flat_hand(layout: MarkerLayout) -> FlatHand:
-    """The drawing of a glove on the hand."""
+    """The drawing of a glove on the hand of size M at rest."""
     model = HandModel.named("M")
     attachment = attach_markers(layout, model)
     starts = model.rest_transforms[:, :3, 3]
@@ -76,14 +76,14 @@ def flat_hand(layout: MarkerLayout) -> FlatHand:
 
 
 def _projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions in the wrist's frame (..., 3) [m] as seen from the back of a right hand (..., 2)."""
+    """Positions (..., 3) in the wrist's frame as seen from the back of a right hand (..., 2) [m]."""
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
 def _outlines(
     vertices: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"]
 ) -> list[Float[np.ndarray, "N 2"]]:
-    """Loops around the faces that face the viewer; holes in them run in the opposite direction."""
+    """Outlines of the faces that are turned to the viewer; those of holes run in the opposite direction."""
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     one, other = second - first, third - first
     seen = faces[one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0.0]
@@ -106,7 +106,7 @@ def _outlines(
 
 
 class Mistake(NamedTuple):
-    """Points of one marker that were labeled as another's."""
+    """Points of the marker `truth` that were labeled as the marker `called`."""
 
     truth: int
     called: int
@@ -115,8 +115,8 @@ class Mistake(NamedTuple):
     """Share of the marker's points."""
 
 
-def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MOST_ARROWS) -> list[Mistake]:
-    """The pairs of markers that are confused most often, most often first; ghosts do not count."""
+def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MAX_ARROWS) -> list[Mistake]:
+    """The most frequently confused pairs of markers, the most frequent first."""
     between = confusion[:-1, :-1] * ~np.eye(len(confusion) - 1, dtype=np.bool_)
     order = np.argsort(-between, axis=None, kind="stable")[:most]
     truths, called = np.unravel_index(order, between.shape)
@@ -128,7 +128,7 @@ def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MOST_ARROWS) ->
 
 
 def hand_picture(layout: MarkerLayout, accuracy: Float[np.ndarray, "M"], arrows: list[Mistake]) -> str:
-    """The hand with each marker's slot accuracy, and arrows for the mistakes, the most frequent first."""
+    """A picture of the hand with each marker's slot accuracy, and arrows for mistakes."""
     return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, accuracy, arrows)
 
 
@@ -139,6 +139,7 @@ def _draw_hand(
     accuracy: Float[np.ndarray, "M"],
     arrows: list[Mistake],
 ) -> None:
+    """Draw hand, markers, arrows, names and color bar."""
     # Constrained layout would move things after the names are placed.
     figure.set_layout_engine("none")
     panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -166,12 +167,12 @@ def _draw_hand(
 
 
 def short(name: str) -> str:
-    """A marker's name as there is room for it."""
-    return name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
+    """A marker's name, cut to the room that there is."""
+    return name if len(name) <= MAX_LETTERS else name[: MAX_LETTERS - 1] + "…"
 
 
 def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], center: NDArray[np.float64]) -> None:
-    """A name, with a line to its dot where it is not beside it."""
+    """Draw a name, with a line to its dot if that is not beside it."""
     panel.annotate(
         name, (center[0], center[1]), fontsize=_FONT_SIZE, color=Paint.INK, ha="center", va="center_baseline",
         zorder=6, parse_math=False,
@@ -183,7 +184,7 @@ def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], center: NDArray
 
 
 def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) -> None:
-    """Arrows from what points are to what they were called, wider the more points."""
+    """Draw arrows from true to given labels, wider for more points."""
     from matplotlib.patches import FancyArrowPatch
 
     for arrow in arrows:
@@ -199,7 +200,7 @@ def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) 
 
 
 def arrow_curve(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (15, 2) along an arrow [points], which is bent as matplotlib's arc3 is."""
+    """Points (15, 2) along an arrow that is bent like matplotlib's arc3 [points]."""
     aside = _BEND * (second - first)[::-1] * (1.0, -1.0)
     middle = (first + second) / 2.0 + aside
     along = np.linspace(0.1, 0.9, 15)[:, None]
@@ -212,7 +213,7 @@ def place_names(
     curves: Sequence[Float[np.ndarray, "K 2"]],
     size: tuple[float, float],
 ) -> Float[np.ndarray, "M 2"]:
-    """Centers of the names [points], each placed in turn where it overlaps least with what is there."""
+    """Centers of the names, placed one by one where each overlaps least with the rest [points]."""
     extents = np.array([name_extent(name) for name in names])
     taken = np.concatenate([dots, *curves])
     half_sizes = np.concatenate(
@@ -222,7 +223,7 @@ def place_names(
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     centers = np.zeros_like(dots)
     crowd = np.linalg.norm(dots[:, None] - dots, axis=-1)
-    # The most crowded dots come first.
+    # The names of the most crowded dots are placed first.
     for number in np.argsort(np.sort(crowd, axis=1)[:, : min(4, len(dots))].sum(axis=1), kind="stable"):
         half = extents[number] / 2.0
         offsets = np.concatenate([around * (distance + half) for distance in _DISTANCES])

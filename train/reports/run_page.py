@@ -1,4 +1,4 @@
-"""What a training run leaves to read: the page with its curves and confusions, and the model card."""
+"""The page of a training run, with its curves and confusions, and the model card."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ if TYPE_CHECKING:
 PAGE: Final = "report.html"
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
-"""The license of weights as long as who trained them names none; hubs know the word."""
+"""License in the card of weights whose owner has named none, in the word that hubs of models know."""
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
-_LEAST_SHARE: Final = 0.01  # lowest end of the confusions' scale [%]
-_MOST_WRITTEN: Final = 30  # classes up to which a cell has room for a number
+_MIN_SHARE: Final = 0.01  # lower end of the confusions' scale [%]
+_MAX_WRITTEN: Final = 30  # number of classes up to which a cell has room for a number
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
-    """Write the page of a run, complete or not at all; its path.
-
-    The report is of held-out frames with the paper's corruption.
-    """
+    """Write the page of a run and return its path; the report is of frames with the paper's corruption."""
     layout = stored_layout(card["dataset"]["layout"])
+    caption = (
+        "Mean loss since the point before; slot accuracy on the same few held-out frames each time, with the "
+        "paper's recipe and the running mean of the weights; learning rate."
+    )
+    curves = picture((9.6, 5.6), draw_curves, history)
     sections = [
         _figures_section(card, report),
-        _curves_section(history),
+        Section("The run", "The course of training.", pictures=[(curves, caption)]),
         _confusion_section(layout, report),
         _hand_section(layout, report),
         _reliability_section(report),
@@ -48,7 +50,7 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: La
 
 
 def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
-    """The run's settings and its two most telling figures, in words."""
+    """The run's settings and its two main figures, in words."""
     train = card["train"]
     clean, (recipe, corrupted) = _columns(card)
     average = f", weights averaged with decay {train['average']:g}" if train["average"] else ""
@@ -64,7 +66,7 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
 
 
 def _columns(card: dict[str, Any]) -> tuple[dict[str, float], tuple[str, dict[str, float]]]:
-    """Held-out figures without corruption, and the paper's recipe with those under it."""
+    """Held-out figures without corruption; then the paper's recipe, and the figures with it."""
     columns = dict(card["held_out_simulated"])
     clean = columns.pop("clean")
     ((recipe, corrupted),) = columns.items()
@@ -72,6 +74,7 @@ def _columns(card: dict[str, Any]) -> tuple[dict[str, float], tuple[str, dict[st
 
 
 def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
+    """A table of all figures."""
     clean, (recipe, corrupted) = _columns(card)
     table = [["figure [%]", "clean", recipe]]
     table += [[name.replace("_", " "), percent(clean[name]), percent(corrupted[name])] for name in corrupted]
@@ -86,17 +89,8 @@ def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     return Section("In figures", text, table=table, notes=notes)
 
 
-def _curves_section(history: History) -> Section:
-    caption = (
-        "Mean loss since the point before; slot accuracy on the same few held-out frames each time, with the "
-        "paper's recipe and the running mean of the weights; learning rate."
-    )
-    text = "How it went over the clouds that the network saw."
-    return Section("The run", text, pictures=[(picture((9.6, 5.6), draw_curves, history), caption)])
-
-
 def draw_curves(figure: Figure, history: History) -> None:
-    """Loss, held-out accuracy where there is any, and learning rate, over the samples seen."""
+    """Draw loss, held-out accuracy if there is any, and learning rate over the samples."""
     from matplotlib.ticker import LogFormatter
 
     done, losses, rates = np.array(history.losses, dtype=np.float64).reshape(-1, 3).T
@@ -128,6 +122,7 @@ def draw_curves(figure: Figure, history: History) -> None:
 
 
 def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
+    """The confusion matrix."""
     size = confusion_size(layout.num_markers + 1)
     drawn = picture(size, draw_confusion, layout.names, report.confusion)
     caption = (
@@ -146,7 +141,7 @@ def confusion_size(num_classes: int) -> tuple[float, float]:
 
 
 def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarray, "M+1 M+1"]) -> None:
-    """Share of each row's points by what they were called: mistakes in color, the diagonal in figures."""
+    """Draw the shares of each row's points: mistakes in color, the diagonal in figures."""
     from matplotlib.colors import LogNorm
 
     classes = [*map(short, names), "ghost"]
@@ -156,19 +151,19 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
     wrong = np.where(np.eye(len(classes), dtype=np.bool_) | (shares == 0.0), np.nan, shares)
     # From the decade below the rarest mistake to the most frequent one.
     rarest, most = np.nanmin(wrong, initial=1.0), np.nanmax(wrong, initial=10.0)
-    norm = LogNorm(max(_LEAST_SHARE, 10.0 ** np.ceil(np.log10(rarest) - 1.0)), most, clip=True)
+    norm = LogNorm(max(_MIN_SHARE, 10.0 ** np.ceil(np.log10(rarest) - 1.0)), most, clip=True)
     panel: Axes = figure.subplots()
     for place, right in enumerate(shares.diagonal()):
         low, high = place - 0.5, place + 0.5
         panel.fill([low, high, high, low], [low, low, high, high], color=Paint.BAND, linewidth=0)
-        if len(classes) <= _MOST_WRITTEN and np.isfinite(right):
+        if len(classes) <= _MAX_WRITTEN and np.isfinite(right):
             panel.annotate(f"{right:.1f}" if right < 99.95 else "100", (place, place), ha="center",
                            va="center", fontsize=6.0, color=Paint.SOFT)  # fmt: skip
     edges = np.arange(len(classes) + 1) - 0.5
     shades = panel.pcolormesh(edges, edges, np.ma.masked_invalid(wrong), cmap="Oranges", norm=norm)
     panel.hlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
     panel.vlines(edges, edges[0], edges[-1], color=Paint.BAND, linewidth=0.5)
-    small = 8.0 if len(classes) <= _MOST_WRITTEN else 6.5
+    small = 8.0 if len(classes) <= _MAX_WRITTEN else 6.5
     panel.set_xticks(places, classes, rotation=90, fontsize=small, color=Paint.INK, parse_math=False)
     panel.set_yticks(places, classes, fontsize=small, color=Paint.INK, parse_math=False)
     panel.set_xlim(edges[0], edges[-1])
@@ -185,6 +180,7 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
 
 
 def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
+    """Accuracies and confusions on a drawing of the hand."""
     arrows = mistakes(report.confusion)
     drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
     caption = HAND_CAPTION + (
@@ -203,7 +199,7 @@ def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
 
 
 def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
-    """The markers most often wrong, and what became of hidden markers and ghosts; HTML."""
+    """The worst markers, and figures on occluded markers and ghosts, as HTML."""
     order = np.argsort(report.slot_accuracy_by_marker, kind="stable")[:3]
     worst = ", ".join(
         f"{escape(layout.names[marker])} {percent(report.slot_accuracy_by_marker[marker])} %"
@@ -222,6 +218,7 @@ def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
 
 
 def _reliability_section(report: LabelingReport) -> Section:
+    """The calibration of confidences."""
     bins = reliability(report.confidences, report.right)
     drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
     caption = (
@@ -233,7 +230,7 @@ def _reliability_section(report: LabelingReport) -> Section:
 
 
 def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
-    """Share right by confidence, and below it how many points have that confidence."""
+    """Draw the share of right labels by confidence, and below it the number of points."""
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3.0, 1.0))
     there = bins.count > 0
     upper.plot([0.0, 100.0], [0.0, 100.0], color=Paint.LINE, linewidth=1.4, zorder=1)
@@ -311,10 +308,7 @@ _CARD_FIGURES: Final = {
 
 
 def write_model_card(out: Path, card: dict[str, Any]) -> Path:
-    """Write the README of a run's folder, complete or not at all, from its card; the page's path.
-
-    A README there is replaced, unless somebody has named a license in it: then it is theirs.
-    """
+    """Write the README of a run's folder and return its path; one with a license is not replaced."""
     path = out / MODEL_CARD
     if path.is_file() and f"license: {UNKNOWN_LICENSE}" not in path.read_text("utf-8", "replace"):
         return path
@@ -324,7 +318,7 @@ def write_model_card(out: Path, card: dict[str, Any]) -> Path:
 
 
 def model_card(card: dict[str, Any]) -> str:
-    """The README's text as hubs of models read it: YAML first, then data, figures, use and limits."""
+    """The README's text for hubs of models: YAML, data, figures, use and limits."""
     dataset, columns = card["dataset"], card["held_out_simulated"]
     figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     figures += [

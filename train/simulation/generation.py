@@ -44,7 +44,7 @@ from train.data.shards import (
 from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
-_SMALL: Final = 50_000_000  # bytes that no disk is asked for
+_SMALL_BYTES: Final = 50_000_000  # size of sets for which free space is not checked
 
 
 def generate_dataset(
@@ -88,7 +88,7 @@ def make_dataset(
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
 ) -> Manifest:
-    """As `generate_dataset`, but the set is not read: its manifest is what `manifest.json` holds."""
+    """Make a training set like `generate_dataset`, without reading it, and return its manifest."""
     place, workers = place_of(out), _allowed_workers(workers, settings.sampler)
     source = _resolved(settings)
     if isinstance(place, Path):
@@ -107,7 +107,7 @@ def make_dataset(
 
 
 def _resolved(settings: GenerateSettings) -> FrameSource:
-    """The settings with the glove, rig and sampler that they name, tried before anything is written."""
+    """The settings with the glove, rig and sampler that they name, checked against each other."""
     layout, rig = load_layout(settings.glove), load_rig(settings.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), settings.volume)
     if settings.min_cameras > len(rig.positions):
@@ -121,7 +121,7 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
 
 
 def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str | None) -> int | Executor:
-    """One process for a sampler that others cannot import; a number that was asked for is told about."""
+    """The workers, but one process for a sampler that others cannot import, with a warning if need be."""
     allowed = workers if isinstance(workers, Executor) else check_workers(workers)
     if allowed == 1 or sampler is None or isinstance(sampler, str):
         return allowed
@@ -130,7 +130,7 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
         alone = getattr(sampler, "__module__", "") == "__main__" and not hasattr(
             sys.modules["__main__"], "__file__"
         )  # as in a notebook
-    except Exception:  # whatever an object of a user's raises
+    except Exception:  # a user's object may raise anything
         alone = True
     if alone and workers is not None:
         what = f"sampler {plugin_name(sampler)} cannot be imported by other processes"
@@ -140,20 +140,20 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
 
 
 def _record(source: FrameSource) -> dict[str, Any]:
-    """What decides the bytes of a set, as JSON."""
+    """Everything that decides the bytes of a set, as JSON."""
     settings, layout, rig, _ = source
     record = dataclasses.replace(settings, optics=settings.optics.worn(layout.radius)).record()
     if settings.sampler is None:
         del record["sampler"]
     return record | {
         "rig": rig_setting(rig),
-        "rig_digest": rig.digest(),  # a shipped rig may be another one in another release
+        "rig_digest": rig.digest(),  # releases may change a shipped rig
         "layout": dataclasses.asdict(layout),
     }
 
 
 def _make_shards(source: FrameSource, output: Output, workers: int | Executor, progress: Progress) -> None:
-    """Have the shards made that are not there."""
+    """Make the missing shards."""
     there, total = output.sizes(), source.settings.num_frames
     todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
     done = total - sum(_shard_size(total, shard) for shard in todo)
@@ -169,7 +169,7 @@ def _make_shards(source: FrameSource, output: Output, workers: int | Executor, p
 
 
 def _complete(source: FrameSource, output: Output) -> Manifest:
-    """Write the manifest."""
+    """Write the manifest of a set with all its shards."""
     shards = _shards(source.settings.num_frames)
     output.fetch("redrawn-*.json")
     names = sorted(name(shard) for shard in shards for name in (rows_name, hands_name))
@@ -187,32 +187,34 @@ def _complete(source: FrameSource, output: Output) -> Manifest:
 
 
 def _check_space(source: FrameSource, out: Path) -> None:
-    """Refuse a set that is larger than the disk."""
+    """Refuse a set that does not fit on the disk."""
     frames, row = source.settings.num_frames, row_dtype(source.layout.num_markers).itemsize
     people = frames // source.settings.frames_per_hand + 1
     needed = frames * row + people * len(SIDES) * HAND_DTYPE.itemsize
-    if needed > _SMALL:  # before anything counts shards
+    if needed > _SMALL_BYTES:  # checked before shards are counted
         there = sum(file.stat().st_size for file in out.glob("*.npy"))
         check_free(out, needed - there, f"{frames} frames", "ask for fewer frames", error=DatasetError)
 
 
 def _shards(num_frames: int) -> range:
+    """Numbers of the shards of a set."""
     return range(-(-num_frames // ROWS_PER_SHARD))
 
 
 def _shard_size(num_frames: int, shard: int) -> int:
+    """Rows of a shard."""
     return min(ROWS_PER_SHARD, num_frames - shard * ROWS_PER_SHARD)
 
 
 def _is_finished(source: FrameSource, there: dict[str, int], shard: int) -> bool:
-    """Whether a shard is there with all its rows; the last one of a set that grows is made again."""
+    """Whether a shard has all its rows; the last shard of a set that grows does not."""
     size = _shard_size(source.settings.num_frames, shard)
     expected = array_bytes(row_dtype(source.layout.num_markers), size)
     return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
 
 def make_shard(source: FrameSource, out: Path, shard: int) -> int:
-    """Write one shard's hands, counts of redraws and rows; they depend on its number and the seed alone."""
+    """Write one shard's hands, counts of redraws and rows, which depend on its number and the seed alone."""
     settings = source.settings
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(shard,)))
     rows = np.zeros(_shard_size(settings.num_frames, shard), dtype=row_dtype(source.layout.num_markers))

@@ -1,4 +1,4 @@
-"""The simulated capture room: what shines, which cameras see it, and the take that comes of it.
+"""The simulated capture room: its light sources, the cameras that see them, and the recorded take.
 
 How often cameras drop out and how many reflections flash is fitted to the four test captures of Han et al.
 2018: to Table 3 and to the ghost ratios of Table 4 (docs/room_numbers.md says what was fitted to what).
@@ -40,14 +40,14 @@ from handsim.space.transforms import transform_poses
 from train.simulation.scenes import SceneMotion, SimulatedKind
 
 SKIN_CHUNK: Final = 16
-"""Frames whose skins are posed at once: so few stay in the processor's cache."""
+"""Frames whose skins are posed at once, few enough for the processor's cache."""
 _CHUNK: Final = 256  # frames whose lines of sight are in memory at once
 _MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
 
 
 @dataclass(frozen=True, slots=True)
 class RoomConfig(Settings):
-    """What the cameras and the surfaces of the room do to what is seen."""
+    """The optical system, stray reflections and shiny surfaces of a room."""
 
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     """Noise, losses and triangulation of the optical system."""
@@ -114,15 +114,9 @@ def _twin(
     losses: tuple[float, float, float, int],
     draw: int,
 ) -> TwinSettings:
-    """A twin, given Table 3's row and how often blobs and pictures are lost."""
-    blob_loss, dropout, length, cameras = losses
-    optics = OpticsConfig(
-        min_rays_to_start=2,
-        blob_loss=blob_loss,
-        dropout=dropout,
-        dropout_length=length,
-        dropout_cameras=cameras,
-    )
+    """A twin from its row of Table 3, and from four settings of losses."""
+    names = ("blob_loss", "dropout", "dropout_length", "dropout_cameras")
+    optics = OpticsConfig(min_rays_to_start=2, **dict(zip(names, losses, strict=True)))  # type: ignore[arg-type]
     room = RoomConfig(optics=optics, strays=StrayConfig(number=strays))
     return TwinSettings(GapCounts(*paper), ghost_ratio, room, draw)
 
@@ -137,12 +131,12 @@ _SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-h
 
 
 def usual_room(kind: SimulatedKind) -> RoomConfig:
-    """The room of the paper's capture of a kind, or of the one most like it."""
+    """The room of the paper's capture of this kind, or of the most similar one."""
     return RoomConfig() if kind == "calibration" else TWINS[_SAME_ROOM.get(kind, kind)].room
 
 
 class SceneSight:
-    """Where the markers of a scene in motion are, and which cameras of a rig have a free view of each."""
+    """Positions of a scene's markers, and the cameras of a rig with a free view of each."""
 
     def __init__(self, scene: SceneMotion, rig: CameraRig) -> None:
         self.scene, self.rig = scene, rig
@@ -183,17 +177,14 @@ class SceneSight:
         return [(MeshTree(held.rigid_object.vertices, held.rigid_object.faces), held.motion.T_world_body)]
 
     def free_of_hands(self, points: Float[np.ndarray, "T S 3"]) -> Bool[np.ndarray, "T S C"]:
-        """Which cameras have points [m] in view where no capsule of a hand stands between."""
+        """Which cameras see points [m] that no capsule of a hand hides."""
         free = self.rig.in_view(points) & free_rays(points, self.rig.positions, *self.capsules)
         return np.asarray(free)
 
     def visible_markers(
         self, radii: Float[np.ndarray, "P"], *, rng: np.random.Generator
     ) -> Bool[np.ndarray, "T P C"]:
-        """Which cameras have a free view of each marker, past every skin and the object.
-
-        The visible spot lies within these radii [m] of each marker's center.
-        """
+        """Which cameras see each marker, or rather a random spot within a radius [m] of its center."""
         markers, normals = self.markers
         seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
         for first in range(0, self.scene.num_frames, _CHUNK):
@@ -209,7 +200,7 @@ class SceneSight:
     def clear_lines(
         self, frames: slice, starts: Float[np.ndarray, "t P C 3"], candidates: Bool[np.ndarray, "t P C"]
     ) -> Bool[np.ndarray, "t P C"]:
-        """Which candidate lines from the starts [m] to the cameras pass every skin and the object."""
+        """Which candidate lines from the starts [m] to the cameras meet no skin and no object."""
         clear = candidates
         for hand in self.scene.hands:
             vertices = hand.fit.model.skin(hand.qpos[frames])
@@ -222,7 +213,7 @@ class SceneSight:
 def _random_offsets(
     shape: tuple[int, int, int], radii: Float[np.ndarray, "P"], rng: np.random.Generator
 ) -> Float[np.ndarray, "*shape 3"]:
-    """Random offsets in balls around the sources of the second axis, of these radii [m]."""
+    """Random offsets in balls; `radii` are those of the sources along the second axis [m]."""
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
     scale = radii.astype(np.float32)[:, None] * np.cbrt(rng.random(shape, dtype=np.float32))
@@ -232,20 +223,20 @@ def _random_offsets(
 
 
 class LightSources(NamedTuple):
-    """All that shines in a room: markers, their mirror images in shiny objects, and stray reflections."""
+    """The light sources of a room: markers, their mirror images in shiny objects, and stray reflections."""
 
     positions: Float[np.ndarray, "T S 3"]
-    """[m] in the world."""
+    """Centers in the world [m]."""
     visible: Bool[np.ndarray, "T S C"]
     """Cameras with a free view."""
     labels: Int[np.ndarray, "S"]
     """Marker of each source; -1 for a source that is not a marker."""
     radii: Float[np.ndarray, "S"]
-    """[m]."""
+    """Radii of the sources [m]."""
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
-    """All that shines, and which cameras have a free view of it."""
+    """The light sources of a scene, and the cameras that see them."""
     markers, _ = sight.markers
     check_outside(sight.rig, markers)
     labels = np.arange(markers.shape[1])
@@ -253,7 +244,7 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
     if moving_object is not None:
         count = len(moving_object.rigid_object.markers)
         if count < _MIN_BODY_MARKERS:
-            labels[len(labels) - count :] = -1  # points like any other: ghosts
+            labels[len(labels) - count :] = -1  # too few for a rigid body: ghosts
     radii = marker_radii(sight.scene, config.optics)
     visible = sight.visible_markers(config.optics.partial * radii, rng=rng)
     parts = [
@@ -263,23 +254,18 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
     ]
     if sight.scene.others is not None:
         parts.append(_without_label(sight.scene.others, sight.free_of_hands(sight.scene.others)))
-    all_positions, all_visible, all_labels, all_radii = zip(*parts, strict=True)
-    return LightSources(
-        np.concatenate(all_positions, 1),
-        np.concatenate(all_visible, 1),
-        np.concatenate(all_labels),
-        np.concatenate(all_radii),
-    )
+    joined = (np.concatenate(one, axis=1 if one[0].ndim > 1 else 0) for one in zip(*parts, strict=True))
+    return LightSources(*joined)
 
 
 def _without_label(positions: Float[np.ndarray, "T S 3"], visible: Bool[np.ndarray, "T S C"]) -> LightSources:
-    """Sources of the usual size that are no markers of a hand."""
+    """Sources of the usual size that are not markers of a hand."""
     count = positions.shape[1]
     return LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))
 
 
 def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
-    """Radii of the hands' markers, and then of the object's [m]; the optics may give those of all gloves."""
+    """Radii of the hands' markers and then of the object's [m]; the optics may set those of the gloves."""
     layouts = [hand.fit.layout for hand in scene.hands]
     radii = [np.full(layout.num_markers, optics.radius_of(layout.radius)) for layout in layouts]
     if scene.moving_object is not None:
@@ -290,10 +276,7 @@ def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, 
 def mirror_images(
     sight: SceneSight, radii: Float[np.ndarray, "P"], reflectance: float, *, rng: np.random.Generator
 ) -> list[LightSources]:
-    """Mirror images of markers of these radii [m] in the object's shiny patches, those that a camera sees.
-
-    A share of `reflectance` of them is bright enough.
-    """
+    """Mirror images of markers in the object's shiny patches; a share `reflectance` is bright enough."""
     markers, _ = sight.markers
     parts: list[LightSources] = []
     if sight.scene.moving_object is None:
@@ -314,7 +297,7 @@ def mirror_images(
 def stray_reflections(
     sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator
 ) -> list[LightSources]:
-    """Strays carried by hands and object, where no hand stands between them and a camera."""
+    """Stray reflections on hands and object, and the cameras that see them past the hands."""
     scene = sight.scene
     carriers = [
         (bones[:, PALM], np.array([0.6 * hand.fit.model.skeleton.lengths[PALM], 0.0, 0.0]))
@@ -339,7 +322,7 @@ def record_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """What the optical system puts out of a scene in motion, with the truth and these settings."""
+    """The take that an optical system records of a scene, with its truth and these settings."""
     sources = sample_light_sources(SceneSight(scene, rig), config, rng=rng)
     return pack_take(scene, sources, rig, config, settings, rng=rng)
 
@@ -353,14 +336,14 @@ def pack_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """A take of points triangulated from light sources; columns and IDs do not tell the marker."""
+    """A take of points triangulated from light sources, in random columns and with random IDs."""
     optics = config.optics
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
     )
     false_labels = label_false_points(found, sources.positions, sources.labels, optics.max_residual)
     labels = np.hstack([np.tile(sources.labels, (scene.num_frames, 1)), false_labels])
-    order = rng.permutation(labels.shape[1])  # neither IDs nor columns may tell what a point comes from
+    order = rng.permutation(labels.shape[1])  # IDs and columns must not identify markers
     positions = np.concatenate([found.positions, found.false_points], axis=1)[:, order]
     labels = labels[:, order]
     present = np.isfinite(positions).all(axis=-1)
@@ -393,9 +376,9 @@ def label_false_points(
     labels: Int[np.ndarray, "S"],
     max_distance: float,
 ) -> Int[np.ndarray, "T F"]:
-    """Labels of false points: the nearest marker that has no other point, -1 where none is near enough [m].
+    """Labels of false points: the nearest marker without another point, or -1 beyond `max_distance` [m].
 
-    A person who labels a capture takes such a point for the marker, although it is a little off.
+    People who label a capture also take such a point for the marker.
     """
     false_labels = np.full(found.false_points.shape[:2], -1)
     markers = np.flatnonzero(labels >= 0)
@@ -408,7 +391,7 @@ def label_false_points(
             false_labels[frame, point] = labels[missing[marker]]
             distance[point], distance[:, marker] = np.inf, np.inf
     runs = number_runs(np.isfinite(found.false_points[..., 0]))
-    for run in np.unique(runs[false_labels >= 0]):  # an ID stands for one marker, or for none, all its life
+    for run in np.unique(runs[false_labels >= 0]):  # an ID keeps its label
         if len(np.unique(false_labels[runs == run])) > 1:
             false_labels[runs == run] = -1
     return false_labels

@@ -1,4 +1,4 @@
-"""What moves in a take: people in their gloves, and what they do in each kind of capture."""
+"""Scenes in motion: people in gloves, the objects that they hold, and the motions of each kind of capture."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""
 
-_HAND_OFFSET: Final = 0.22  # from the middle to a hand that touches nothing [m]
-_VOLUME: Final = 0.1  # half side of the cube that the wrist of such a hand stays in [m]
-_RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # where a right hand makes room
+_HAND_OFFSET: Final = 0.22  # distance of a hand that touches nothing from the middle of the room [m]
+_VOLUME: Final = 0.1  # half side of the cube around the wrist of such a hand [m]
+_RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand makes room for the left
 _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # standard deviation about each axis [rad]
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
@@ -82,10 +82,7 @@ class SceneMotion:
         return len(self.hands[0].qpos)
 
     def faster(self, times: int) -> SceneMotion:
-        """The same motion this many times as fast: of so many frames only the first is kept.
-
-        Displacements by the skin and markers of others are not kept.
-        """
+        """The same motion at `times` the speed, without displacements by the skin and markers of others."""
         hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
         held = self.moving_object
         if held is not None:
@@ -97,7 +94,7 @@ class SceneMotion:
 def sample_scene_motion(
     kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """Random motion of a right and a left hand, and of the object that the right hand holds."""
+    """Random motion of a right and a left hand, and of the object in the right hand if there is one."""
     right, left = fits
     if kind == "hand-hand":
         both = sample_two_hand_motion(
@@ -126,7 +123,7 @@ def sample_scene_motion(
 def _free_hand(
     model: HandModel, script: str, offset: float, num_frames: int, rng: np.random.Generator
 ) -> HandMotion:
-    """One hand in the air, palm mostly down, that touches nothing; `offset` is its side of the room [m]."""
+    """Motion of a hand in the air, palm mostly down, at `offset` from the middle of the room [m]."""
     qpos = scripted_motion(model, script, num_frames / RATE, rng=rng).qpos[:num_frames].copy()
     config = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_ROTATION)
     qpos[:, :3], qpos[:, 3:7] = wrist_path(num_frames, RATE, config, rng=rng)
@@ -136,20 +133,21 @@ def _free_hand(
 def _gloved(
     fits: Sequence[GloveFit], motions: Sequence[HandMotion], num_frames: int
 ) -> tuple[GlovedHand, ...]:
+    """Hands in their gloves with the first frames of their motions."""
     return tuple(GlovedHand(fit, motion.qpos[:num_frames]) for fit, motion in zip(fits, motions, strict=True))
 
 
 # A calibration capture.
 _MAX_DRAWS: Final = 20
-_STARTS: Final = ("pinch_pad", "pinch_tip")
-_JITTER: Final = np.deg2rad(8.0)
+_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures from which touches start
+_JITTER: Final = np.deg2rad(8.0)  # standard deviation of the starts' joint angles [rad]
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig(Settings):
-    """What the user of a calibration capture does, and the cameras that see it."""
+    """The exercises of a calibration capture, and the cameras that record it."""
 
     free: Annotated[float, Limits(0.0, above=True)] = 40.0
     """Free motion [s]."""
@@ -164,7 +162,7 @@ class CalibrationTakeConfig(Settings):
 def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """The motion of one hand or both in a calibration capture; without rounds, free motion alone."""
+    """The motion of one hand or both in a calibration capture."""
     if not 1 <= len(hands) <= len(SIDES):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
@@ -191,7 +189,7 @@ def calibration_angles(
 
 
 def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Free motion from a pose that can be reached from everywhere."""
+    """Joint angles (T, 20) of free motion that begins at a pose which touches can move to [rad]."""
     for _ in range(_MAX_DRAWS):
         free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
         if can_be_left(model, free[:1]).all():
@@ -200,7 +198,7 @@ def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> 
 
 
 def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Poses (20,) [rad] of the thumb at each fingertip that it reaches, each from a start of its own."""
+    """Poses (20,) [rad] of the thumb at each fingertip within its reach, each from another random start."""
     poses = []
     for finger in FINGERS:
         pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
@@ -208,28 +206,28 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
         try:
             touch = touching_angles(model, finger, start)
         except PoseError:
-            continue  # another finger, or the next round, will do
+            continue  # calibration does not need every finger in every round
         if can_be_left(model, touch[None]).all():
             poses.append(touch)
     return poses
 
 
-# Hands like real ones. The figures are those of the published captures of Han et al. 2018 (docs/room.md):
-# markers are 1.5 mm per axis from any hand that moves as ours does, three tenths of that variance repeat in
-# similar poses, and half of the captures move about twice as far from frame to frame as simulated hands do.
+# Hands like real ones. The figures are those of the published captures of Han et al. 2018 (docs/room.md): no
+# pose of our hand model comes closer to the markers than 1.5 mm per axis, similar poses share three tenths of
+# that variance, and half of the captures are about twice as fast as simulated hands.
 NUM_FRAMES: Final = 3000
-"""Frames of a take of such hands, or of free ones, when no number is given."""
+"""Default number of frames of real-like and free takes."""
 NOISE: Final = 0.00125
 """Standard deviation of the markers' independent noise per axis [m]."""
 FLESH: Final = 0.0008
 """RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
 SPEED: Final = 2
-"""Times that hands move as fast as in the other takes."""
-_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # of a glove, as in training sets
+"""Speed of these hands as a multiple of the speed in the other takes."""
+_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
 
 
 def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
-    """Two hands of anybody, children included, that meet and part, in skin that moves."""
+    """Two hands of an adult or a child that meet and part, with markers that move with the skin."""
     models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
     fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
@@ -237,7 +235,7 @@ def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.ran
 
 
 def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
-    """Displacement of a hand's markers in the world [m]: what repeats with the pose, and noise."""
+    """Displacement of a hand's markers in the world [m]: one part depends on the pose, the other is noise."""
     turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
     moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
     for marker, bone in enumerate(hand.fit.attachment.main_bones):
@@ -249,10 +247,10 @@ def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray
     return moved
 
 
-# Markers of others: they move as bodies do, rigidly with a bone, a thing or a person.
-MOST_OTHERS: Final = 60
-"""Markers of others at most."""
-_STRAIGHT: Final = 0.6  # share of the hand's own direction in the forearm's
+# Markers of others move rigidly with an arm, a thing or a person.
+MAX_OTHERS: Final = 60
+"""Largest number of markers of others."""
+_STRAIGHT: Final = 0.6  # weight of the hand's direction in the forearm's
 _SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, to the side and above them
 _WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
 _ELBOW: Final = (0.26, 0.03, 0.02)
@@ -260,16 +258,13 @@ _FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
 _THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
 _HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
 _BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
-_PERSON: Final = 1.2  # [m] to the one beside
-_SWAY: Final = 0.03  # [m]
+_PERSON: Final = 1.2  # distance of the other person [m]
+_SWAY: Final = 0.03  # half side of the cube that a swaying body stays in [m]
 _BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
 
 
 def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T Q 3"]:
-    """So many markers of others [m], those nearest to the hands first.
-
-    Wrists, elbows and shoulders come first, then a thing in a hand, then head and back, then another person.
-    """
+    """Positions of `count` markers of others [m]: on the arms, a thing, head and back, and another person."""
     wrists = np.stack([hand.qpos[:, :3] for hand in scene.hands], axis=1)
     ahead = np.stack(
         [hand.fit.model.forward_kinematics(hand.qpos)[:, 0, :3, :3] for hand in scene.hands], axis=1
@@ -301,7 +296,7 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
 def _arm(
     wrist: Float[np.ndarray, "T 3"], ahead: Float[np.ndarray, "T 3 3"], shoulder: Float[np.ndarray, "T 3"]
 ) -> Float[np.ndarray, "T 5 3"]:
-    """Markers beside the wrist's joint and on the forearm [m]: two at the wrist, an elbow, two between."""
+    """Markers of an arm [m]: two at the wrist, one on the elbow, two on the forearm."""
     reach = wrist - shoulder
     reach /= np.linalg.norm(reach, axis=1, keepdims=True)
     along = _STRAIGHT * ahead[..., 0] + (1.0 - _STRAIGHT) * reach
@@ -316,6 +311,6 @@ def _arm(
 def _path(
     scene: SceneMotion, center: Float[np.ndarray, "3"], volume: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 3"]:
-    """Slow motion about a place [m]."""
+    """Slow motion in a cube of half side `volume` around a place [m]."""
     config = WristConfig(center=tuple(center), volume=volume, turning=0.0)
     return wrist_path(scene.num_frames, scene.rate, config, rng=rng)[0]

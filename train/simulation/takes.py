@@ -22,7 +22,7 @@ from handsim.settings import Expected, Limits, Settings
 from handsim.space.rig import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
-    MOST_OTHERS,
+    MAX_OTHERS,
     NUM_FRAMES,
     RATE,
     SIMULATED_KINDS,
@@ -43,7 +43,7 @@ BOTH: Final[tuple[Side, Side]] = ("right", "left")
 APART: Final = ("single-hand", "calibration", "free")
 """Kinds of capture in which a hand may be alone."""
 _MAX_PEOPLE: Final = 10
-_SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
+_SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)  # slip of a glove [bone lengths, rad]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class SimulateSettings(Settings):
     hands: tuple[Side, ...] = BOTH
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
     hand-pen, hand-controller and real-like. Of a glove for one hand that hand alone."""
-    others: Annotated[int, Limits(0, MOST_OTHERS)] = 0
+    others: Annotated[int, Limits(0, MAX_OTHERS)] = 0
     """Markers that are not the hands', up to 60, with label -1. Those nearest to the hands come first: on the
     wearer's arms, a thing in a hand, the wearer's head and back, and a person beside."""
 
@@ -130,7 +130,7 @@ def simulate_take(
 def simulate_calibration(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig | None = None, *, rng: np.random.Generator
 ) -> Take:
-    """What cameras see of a certain user who makes a calibration capture with one hand or both."""
+    """A calibration capture of certain hands in their gloves, one or both."""
     config = config or CalibrationTakeConfig()
     scene = sample_calibration_scene(hands, config, rng=rng)
     rig = load_rig(config.rig)
@@ -141,12 +141,12 @@ def simulate_calibration(
 def sample_scene(
     kind: Kind, layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """A random person in gloves who does what this kind of capture asks for, for frames at `RATE`."""
+    """A random person in gloves, in the motion of a kind of capture, at `RATE` frames per second."""
     return _by_somebody(kind, layout, lambda fits: sample_scene_motion(kind, fits, num_frames, rng=rng), rng)
 
 
 def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side, ...]:
-    """The hands that a capture asks for and the glove is for; a `LayoutError` if there are none."""
+    """The simulated hands; a `LayoutError` if the glove is not for them."""
     if len(layout.sides) == 1 and set(settings.hands) == set(BOTH):
         if settings.kind not in APART:
             raise LayoutError(
@@ -160,7 +160,7 @@ def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side,
 
 
 def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.random.Generator) -> SceneMotion:
-    """What moves in a take with these settings, markers of others left out."""
+    """The scene of a take with these settings, without markers of others."""
     kind, count = settings.kind, settings.num_frames
     if kind == "real-like":
         return sample_real_like_scene(layout, count or NUM_FRAMES, rng=rng)
@@ -189,7 +189,7 @@ def _by_somebody(
     act: Callable[[Sequence[GloveFit]], SceneMotion],
     rng: np.random.Generator,
 ) -> SceneMotion:
-    """What the first person does who can."""
+    """The scene of the first random person who can do this kind of capture."""
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
         models = sample_adult_hands(rng=rng)

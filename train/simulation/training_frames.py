@@ -31,13 +31,13 @@ from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angl
 from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
-"""Reason for which a person is drawn again."""
+"""Reason to draw another person."""
 _MAX_PEOPLE: Final = 1000
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
-"""Reason for which a scene of two hands becomes one of a single hand."""
+"""Reason to replace a scene of two hands by one of a single hand."""
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
-"""Reason for which a scene with an object becomes one without."""
-_MAX_LOST_CAMERAS: Final = 6  # that lose their pictures together
+"""Reason to replace a scene with an object by one of an empty hand."""
+_MAX_LOST_CAMERAS: Final = 6  # cameras that lose their pictures together
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class GenerateSettings(Settings):
 
 
 class FrameSource(NamedTuple):
-    """What training frames are drawn with: settings, and the objects that they name."""
+    """The settings of training frames, and the objects that they name."""
 
     settings: GenerateSettings
     layout: MarkerLayout
@@ -116,16 +116,16 @@ class FrameScene(NamedTuple):
 
 
 class HandFrames(NamedTuple):
-    """What a rig and its optical system make of one hand of a scene."""
+    """The markers of one hand of a scene, as they are and as a rig and its optical system capture them."""
 
     markers: Float[np.ndarray, "T M 3"]
     """True centers [m]."""
     cameras: Int[np.ndarray, "T M"]
     """Cameras with a free view, a bit each."""
     observed: Float[np.ndarray, "T M 3"]
-    """Where the system puts each marker [m], NaN where it loses it."""
+    """Captured positions [m], NaN for lost markers."""
     ghosts: Float[np.ndarray, "T 4 3"]
-    """[m], NaN where there is none."""
+    """Ghosts near the hand [m], NaN where there is none."""
 
 
 def sample_hands(
@@ -133,7 +133,7 @@ def sample_hands(
 ) -> tuple[HandModel, ...]:
     """A random person's left and right hand, whose fingers do not overlap at rest.
 
-    Those who were drawn again are counted in `redrawn`, by reason.
+    Redraws are counted in `redrawn`, by reason.
     """
     for _ in range(_MAX_PEOPLE):
         shape = sample_shape(population, side=SIDES[0], rng=rng)
@@ -152,7 +152,7 @@ def sample_hands(
 
 
 def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
-    """Right and left hand of a random adult, for takes."""
+    """Right and left hand of a random adult."""
     shape = sample_shape(ADULTS, side="right", rng=rng)
     return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
 
@@ -165,7 +165,7 @@ def wear_gloves(
     around: float,
     rng: np.random.Generator,
 ) -> tuple[GloveFit, ...]:
-    """The same glove on each hand, its markers slipped along [bone lengths] and around [rad] the bones."""
+    """The same glove on each hand, with random slips along [bone lengths] and around [rad] the bones."""
     return tuple(
         GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
     )
@@ -179,16 +179,16 @@ def simulate_frames(
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> None:
-    """Fill rows with random poses of one person's gloved hands, and what rig and optical system make of them.
+    """Fill rows with random poses of one person's gloved hands, as rig and optical system capture them.
 
-    Where a scene has two hands, the first half of the rows is the right hand's. Scenes that these hands could
-    not do are counted in `redrawn` by reason.
+    Of a scene with two hands, the first half of the rows is the right hand's. Impossible scenes are counted
+    in `redrawn`, by reason.
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
     around = np.deg2rad(settings.slip_around)
     fits = wear_gloves(layout, scene.hands, along=settings.slip_along, around=around, rng=rng)
-    optics = dataclasses.replace(  # another system for every person
+    optics = dataclasses.replace(  # every person has another optical system
         settings.optics,
         blob_loss=rng.uniform(*settings.blob_loss),
         dropout=rng.uniform(*settings.dropout),
@@ -217,10 +217,9 @@ def sample_frame_scene(
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> FrameScene:
-    """A random scene of a person's left and right hand that fills a number of rows, which two hands share.
+    """A random scene of a person's left and right hand for `num_rows` rows, which two hands share.
 
-    Where the hands cannot do it, it is one of a hand alone, counted in `redrawn` by reason. A sampler
-    replaces the poses of single hands.
+    A scene that these hands cannot do is replaced by one of a single hand, and counted in `redrawn`.
     """
     shares = settings.scenes.shares
     kind = int(rng.choice(len(shares), p=shares))
@@ -247,10 +246,9 @@ def sample_single_hand(
 ) -> FrameScene:
     """Poses of one hand in any orientation and anywhere in the volume.
 
-    The wrists are those of a sampler of whole poses, unless it leaves all of them at the origin, as
-    `poses.sample_poses` does.
+    A sampler of whole poses also places the wrists, unless it leaves all of them at the origin.
     """
-    position = _sample_positions(num_frames, settings.volume, rng)
+    position = ROOM_CENTER + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     if sampler is None:
         angles = sample_valid_angles(model, num_frames, settings.poses, rng=rng)
     else:
@@ -271,15 +269,10 @@ def sample_holding_hand(
     rigid_object = named_object(names[rng.integers(len(names))])
     hold = settle_hold(model, rigid_object, rng=rng)
     angles, T_wrist_object = sample_held_poses(model, rigid_object, hold, num_frames, rng=rng)
-    position = _sample_positions(num_frames, volume, rng)
+    position = ROOM_CENTER + rng.uniform(-volume, volume, size=(num_frames, 3))
     quaternion = random_quaternions(num_frames, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
     return FrameScene((model,), (qpos,), rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
-
-
-def _sample_positions(count: int, volume: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Positions (T, 3) [m] in the cube of this half side."""
-    return ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
 
 
 def observe_scene(
@@ -291,7 +284,7 @@ def observe_scene(
     *,
     rng: np.random.Generator,
 ) -> tuple[HandFrames, ...]:
-    """What the rig sees of every hand past all hands (as capsules) and the object, and what becomes of it."""
+    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers."""
     bones = [fit.model.forward_kinematics(qpos) for fit, qpos in zip(fits, scene.qpos, strict=True)]
     worn = [fit.attachment.markers(fit.model, frames) for fit, frames in zip(fits, bones, strict=True)]
     markers, normals = (np.concatenate(parts, axis=1) for parts in zip(*worn, strict=True))
@@ -318,5 +311,6 @@ def observe_scene(
 
 @cache
 def _mesh_tree(name: str) -> MeshTree:
+    """The search tree of a named object's mesh."""
     rigid_object = named_object(name)
     return MeshTree(rigid_object.vertices, rigid_object.faces)

@@ -138,7 +138,7 @@ def echo(number: int) -> int:
 
 
 def test_more_jobs_than_the_scheduler_is_given_at_once(client, monkeypatch):
-    monkeypatch.setattr("handsim.app.workers._IN_FLIGHT", 5)
+    monkeypatch.setattr("handsim.app.workers._MAX_PENDING", 5)
     executor = ClusterExecutor(client)
     assert sorted(run_jobs(echo, range(3, 40), executor)) == list(range(3, 40))
     assert list(run_jobs(echo, [], executor)) == []
@@ -266,7 +266,7 @@ def listening(backlog=5):
 
 
 def test_somebody_who_says_nothing(monkeypatch):
-    monkeypatch.setattr("handsim.app.workers._PATIENCE", 0.2)
+    monkeypatch.setattr("handsim.app.workers._TIMEOUT", 0.2)
     with listening() as (_, address):
         with pytest.raises(HandSimError, match=f"answers at tcp://{address}: none within 0.2 s; expected"):
             chosen(f"tcp://{address}")
@@ -275,7 +275,7 @@ def test_somebody_who_says_nothing(monkeypatch):
 
 
 def test_an_address_that_times_out(monkeypatch):
-    monkeypatch.setattr("handsim.app.workers._PATIENCE", 0.2)
+    monkeypatch.setattr("handsim.app.workers._TIMEOUT", 0.2)
     with listening(backlog=0) as (listener, address), socket.socket() as waiting:
         waiting.connect(listener.getsockname())  # and for another there is no room
         with pytest.raises(HandSimError, match=f"answers at tcp://{address}: timed out; expected"):

@@ -83,7 +83,7 @@ def test_the_first_job_is_done_here(tmp_path):
 
 
 def test_another_executor_does_all_jobs(monkeypatch):
-    monkeypatch.setattr("handsim.app.workers._IN_FLIGHT", 5)
+    monkeypatch.setattr("handsim.app.workers._MAX_PENDING", 5)
     with ThreadPoolExecutor(3) as threads:
         assert sorted(run_jobs(double, range(3, 40), threads)) == list(range(3, 40))
         with pytest.raises(LayoutError, match="number 2 does not fit"):

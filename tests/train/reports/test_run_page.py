@@ -38,7 +38,7 @@ from train.evaluation import (
 )
 from train.labelers.storage import CARD, WEIGHTS
 from train.loop import CHECKPOINT, TrainingState
-from train.reports.hand_plot import LONGEST_NAME, short
+from train.reports.hand_plot import MAX_LETTERS, short
 from train.reports.run_page import (
     MODEL_CARD,
     PAGE,
@@ -257,7 +257,7 @@ def test_reliability_of_few_and_many_points(rng, count):
 
 def test_long_names_are_cut():
     assert short("IndexTip") == "IndexTip"
-    assert len(short("x" * 60)) == LONGEST_NAME and short("x" * 60).endswith("…")
+    assert len(short("x" * 60)) == MAX_LETTERS and short("x" * 60).endswith("…")
 
 
 SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
