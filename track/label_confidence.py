@@ -27,7 +27,7 @@ LABELED: Final = (
     "biases of the hand",
     "improbable digit",
 )
-"""What is told of a point with a label."""
+"""Names of the evidence on a point with a label."""
 UNLABELED: Final = (
     "labels in its life",
     "a free marker within 10 mm",
@@ -38,34 +38,34 @@ UNLABELED: Final = (
     "markers not seen",
     "biases of the hand",
 )
-"""What is told of a point without a label."""
-_LEAST_RESIDUAL: Final = 0.0003  # [m] that a marker is usually off, at least: the noise of optical systems
-_FEWEST: Final = 10  # frames that tell how far a marker is usually off
-_LINK: Final = 0.015  # [m] that a point moves in its hand from frame to frame at most, where IDs do not last
-_EXCHANGE: Final = 0.005  # [m] that points jump at least whose IDs were exchanged
-_BESIDE: Final = 0.1  # [m] within which points are those of one hand
-_SHORT: Final = 20.0  # frames of a life that tells nothing by being short
-_FAR: Final = 1.0  # [m] in the place of what is not there
-_MOST_OFF: Final = 100.0  # usual residuals; more tells no more
+"""Names of the evidence on a point without a label."""
+_LEAST_RESIDUAL: Final = 0.0003  # [m] least usual residual of a marker: the noise of optical systems
+_FEWEST: Final = 10  # frames from which the usual residual of a marker is estimated, at least
+_LINK: Final = 0.015  # [m] largest motion of a point within its hand between frames, where IDs do not last
+_EXCHANGE: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
+_BESIDE: Final = 0.1  # [m] radius within which points belong to one hand
+_SHORT: Final = 20.0  # frames from which on the length of a life is no evidence
+_FAR: Final = 1.0  # [m] distance of a neighbor that does not exist
+_MOST_OFF: Final = 100.0  # usual residuals, at which the evidence of a residual is cut off
 
 
 class Evidence(NamedTuple):
-    """What is told of P points of a take, in the order of its frames."""
+    """Evidence on P points of a take, in the order of its frames."""
 
     points: Int[np.ndarray, "P"]
-    """Which points of the take's list these are."""
+    """Indices of the points in the take's list."""
     labels: Int[np.ndarray, "P"]
-    """Its label, -1 for none."""
+    """Label of each point, -1 for none."""
     markers: Int[np.ndarray, "P"]
-    """Its label, or that of the nearest marker without a point."""
+    """Label of each point, or of the nearest marker without a point."""
     labeled: Float[np.ndarray, "L 7"]
-    """What is told of the points with a label, see `LABELED`."""
+    """Evidence on the points with a label, see `LABELED`."""
     unlabeled: Float[np.ndarray, "U 8"]
-    """What is told of those without one, see `UNLABELED`."""
+    """Evidence on the points without a label, see `UNLABELED`."""
 
 
 def evidence_of(take: Take) -> Evidence:
-    """What a take with poses tells of the labels of its points; those of rigid bodies are left out."""
+    """Evidence on the labels of a take with poses, without those of rigid bodies."""
     count = take.hand_labels[-1].stop
     listed = take.point_list
     chosen = np.flatnonzero(listed.labels < count)
@@ -111,7 +111,7 @@ def evidence_of(take: Take) -> Evidence:
 
 
 def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
-    """How far each marker is usually off its pose [m]."""
+    """Usual distance of each marker from its pose [m]."""
     known = np.isfinite(residuals).sum(axis=0) >= _FEWEST
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
@@ -134,7 +134,7 @@ def _lives(
 def _of_hands(
     take: Take, seen: Bool[np.ndarray, "T K"], owners: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "T H 2"]:
-    """What is told of a hand: its markers that are not seen, and how far off the glove its markers are."""
+    """Evidence on each hand: its share of hidden markers, and the size of its marker biases."""
     values = np.zeros((*take.status.shape, 2))
     for hand, side in enumerate(take.sides):
         values[:, hand, 0] = np.log1p(20.0 * (1.0 - seen[:, owners == hand].mean(axis=1)))

@@ -39,8 +39,8 @@ from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m], the same for points that determine the pose, and in a search
-_TIGHTEST: Final = 0.0005  # [m], the same in a search that finds three points, which may fit by chance
+_TIGHT: Final = 0.001  # [m] largest residual of points that determine the pose, and in a search
+_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that finds three points, which may fit by chance
 _LEAST_WIDTH: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
 _LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m]; markers nearer to each other could exchange labels
 _LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
@@ -59,9 +59,9 @@ _MARKER_KEYS: Final = ("name", "place_mm")
 _MOST_LEARNED_MARKERS: Final = 20
 _COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
 _TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
-_AVERAGING_ROUNDS: Final = 3  # of averaging the markers over all frames
-_LEAST_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
-_LEAST_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
+_AVERAGING_ROUNDS: Final = 3  # rounds of averaging the markers over all frames
+_LEAST_SEEN_SHARE: Final = 0.5  # least share of the body's frames in which a marker is seen
+_LEAST_LABELED_SHARE: Final = 0.8  # least share of all points that are the body's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
