@@ -10,11 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves import Capture, load_layout, write_capture
+from gloves import Capture, Take, load_layout, write_capture
+from gloves.fit import nominal_fit
+from gloves.layout import starter_layout
 from gloves.takes.archives import write_archive
+from handsim import join_qpos
 from handsim.app import messages
 from handsim.cli.main import main
 from tests.sentences import assert_names
+from track import User
 from train import simulate_take
 
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -80,6 +84,10 @@ def files(tmp_path_factory):
     take = simulate_take(num_frames=2)
     take.save(made / "good.truth.npz")
     dataclasses.replace(take, settings={"tracker": {}}).save(made / "tracked.npz")
+    left = nominal_fit(load_layout("dense19"), "M", "left")
+    Take.of_poses([left], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(made / "left.npz")
+    User((left,)).save(made / "user.json")
+    (made / "mine.toml").write_text(starter_layout())
     (made / "photos").mkdir()
     (made / "photos" / "broken.jpg").write_text("no picture")
     load_layout("dense19").save(made / "copy.toml")
@@ -181,6 +189,80 @@ CASES = {
     "rig import good.trc --out out.toml": "good.trc | .toml | .xcp | .mcal | cameras.txt",
     "rig import lab.xcp --out out.json": "--out is out.json | .toml",
     "train . --out out": "manifest.json | . holds none",
+    "glove new mine.txt": "mine.txt | ends in .toml",
+    "glove check gone.toml": "gone.toml | cannot be read",
+    "glove score mine.toml --motion dance": "'dance' | poses, twins or a take",
+    "glove score mine.toml --captures -1": "captures is -1 | 0 or more",
+    "glove score mine.toml --frames 1": "frames is 1 | at least 100",
+    "glove score mine.toml --out page.pdf": "--out is page.pdf | .html",
+    "glove improve mine.toml --out mine.toml": "is the input",
+    "glove improve mine.toml --out new.toml --markers 3": "markers is 3 | 5 to 60",
+    "glove improve mine.toml --out new.toml --keep Tail": "to be kept are Tail",
+    "hand --out hand.txt": ".xml, .urdf, .osim, .glb",
+    "hand --mesh hand.fbx": ".glb, .obj, .ply, .stl",
+    "hand --glove dense18": "'dense18' | 'dense19'",
+    "hand --size S --shape user.json": "--size S | --shape user.json | one of them",
+    "hand --take left.npz --side right": "'right' | left",
+    "hand --shape user.json --glove dense19": "--glove dense19 | --shape user.json",
+    "hand --out hand.urdf --actuators": "--out | .xml",
+    "hand --out hand.osim --actuators": "--out | .xml",
+    "hand --out hand.urdf --glove dense19": "--out | .xml or .osim",
+    "hand --out hand.glb --mesh hand.glb": "two files",
+    "hand --shape nobody.json": "nobody.json | cannot be read",
+    "rig check mine.txt": "or the path of a .toml file",
+    "rig check seven": "or the path of a .toml file",
+    "rig score six --out page.pdf": "--out is page.pdf | .html",
+    "rig score six --frames 1": "frames is 1 | at least 60",
+    "rig score six --volume 1 0 1": "volume is 0 | above 0",
+    "rig score six --center nan 0 1": "center is nan | from -50 to 50",
+    "rig score six --center 0 0 1100": "center is 1100 | from -50 to 50",
+    "rig score six --seed -1": "seed is -1 | 0 or more",
+    "rig score six --json figures.html": "--json is figures.html | .json",
+    "rig plan --cameras 1 --room 4 4 3 --out new.toml": "cameras is 1 | 2 to 32",
+    "rig plan --cameras 6 --room 4 4 3 --keep six --out new.toml": "cameras is 6 | 7 to 32",
+    "rig plan --cameras 6 --room 4 0 3 --out new.toml": "room is 4 x 0 x 3 m | three lengths",
+    "rig plan --cameras 6 --room 4 4 3 --field-of-view 180 --out new.toml": "field_of_view is 180 | 1 to 170",
+    "rig plan --cameras 6 --room 0.8 0.8 1.5 --mounts walls --volume 2 2 3 --out new.toml": "larger room",
+    "simulate --num-frames 432000 --out take.tsv": ".trc, .c3d",
+    "simulate --num-frames 432000 --out take.npz": ".trc, .c3d",
+    "simulate --num-frames 432000 --out take": ".trc, .c3d",
+    "simulate --num-frames 1000000000 --out out.c3d": "1000000000 frames need 20 TB | shorter captures",
+    "render --out out": "expected a take, --poses or --merge",
+    "render good.truth.npz --poses poses.npz --out out": "expected a take, --poses or --merge",
+    "render good.truth.npz --people 3 --out out": "belong to --poses",
+    "report tracked.npz --out page.pdf": "--out is page.pdf | .html",
+    "report missing.npz --out page.html": "missing.npz | cannot be read",
+    "report good.trc --out page.html": "good.trc",
+    "export tracked.npz --out hands.fbx": ".glb, .bvh, .usda, .usdc, .csv, .parquet",
+    "export tracked.npz --out hands.onnx": "cannot write a take",
+    "export dense19 --out hands.glb": ".onnx | takes | .npz | .glb",
+    "export nobody.json --out hand.xml": "nobody.json | cannot be read",
+    "export missing.npz --out hands.glb": "missing.npz | cannot be read",
+    "export tracked.npz --out tracked.npz": "a name that ends in",
+    "export tracked.npz --out x.glb --fps 0": "the rate is 0 Hz | positive",
+    "view": "neither a file nor --live | a file or --live natnet://host",
+    "view good.trc --live natnet://127.0.0.1": "--live natnet://127.0.0.1 | a file or --live",
+    "view --live natnet://127.0.0.1 --out x.toml": ".npz",
+    "view takes.docx": "a file of another kind | a marker layout or camera rig",
+    "view dense91": "no such file, folder or shipped name",
+    "view dense19 --video x.mp4": "dense19 is a layout | nothing in it moves",
+    "view --live natnet://127.0.0.1 --video x.mp4": "a live view is not drawn",
+    "view good.truth.npz --video x.avi": ".mp4",
+    "view good.trc --rig seven": "'seven'",
+    "view good.trc --port 70000": "--port is 70000",
+    "demo --out out --num-frames 0": "0",
+    "demo --out out --seed -1": "-1",
+    "replay good.trc --rate 0": "rate is 0 | above 0",
+    "replay good.trc --port 70000": "port is 70000 | 0 to 65535",
+    "replay good.trc --host 192.0.2.1": "cannot be listened at on 192.0.2.1",
+    "rig import one_camera.toml --out one_camera.toml": "is the input",
+    "track good.trc --out take.npz --send http://localhost:1": "'http://localhost:1' | osc://",
+    "evaluate good.truth.npz --occlude 3": "leave out the corruption | --occlude",
+    "evaluate good.truth.npz --ghosts 1": "leave out the corruption | --occlude",
+    "evaluate good.truth.npz --every 2": "leave out the corruption | --occlude",
+    "evaluate good.trc --every 0": "every is 0 | at least 1",
+    "evaluate good.truth.npz good.trc": ".npz",
+    "simulate --optics.noise -1 --out out.c3d": "noise is -1 | at least 0",
 }
 
 
@@ -190,7 +272,8 @@ def test_a_mistake_is_one_sentence(command, folder, capsys, monkeypatch):
     monkeypatch.setattr(messages, "_lines", lambda *_: contextlib.nullcontext())
     before = {path.name for path in folder.iterdir()}
     assert main(command.split()) == 1
-    said = capsys.readouterr().err
+    *announced, said = capsys.readouterr().err.splitlines()
+    assert set(announced) <= {"getting ready", "putting the glove on"}
     assert said.startswith(f"handsim {command.split()[0]}: ")
     assert_names(said, CASES[command])
     assert {path.name for path in folder.iterdir()} == before, "something was left behind"

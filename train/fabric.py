@@ -1,4 +1,4 @@
-"""The device of this process, joined by Fabric with those of the others that torchrun or srun started."""
+"""The device of this process, and by Fabric those of other processes that torchrun or srun started."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _LOOPBACK: Final = {"linux": "lo", "darwin": "lo0"}
 
 
 def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
-    """The device of this process, a GPU where there is one, and the writer of the curves.
+    """Fabric with the device of this process, a GPU if there is one, and the writer of the curves.
 
-    Waits for the other processes of the run, if there are any.
+    It waits for the other processes of the run.
     """
     environment, here, nodes = _processes()
     if settings.batch < here * nodes:
@@ -43,7 +43,7 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
             "for each GPU"
         )
     torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages are not about this run
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages do not concern users
     warnings.filterwarnings("ignore", module="lightning_fabric")
     if nodes == 1 and sys.platform in _LOOPBACK:  # connections on one machine stay off the network
         os.environ.setdefault("GLOO_SOCKET_IFNAME", _LOOPBACK[sys.platform])
@@ -62,9 +62,9 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
 
 
 def _processes() -> tuple[ClusterEnvironment, int, int]:
-    """What started this process, the number of processes on each machine, and the number of machines.
+    """The environment of this process, the number of processes on each machine, and of machines.
 
-    A batch script that Slurm runs without srun is one process, however many tasks the job may have.
+    A batch script that Slurm runs without srun is one process, whatever the job's number of tasks.
     """
     if TorchElasticEnvironment.detect():
         here = int(os.environ["LOCAL_WORLD_SIZE"])
@@ -82,25 +82,25 @@ def _processes() -> tuple[ClusterEnvironment, int, int]:
 
 
 def _leave() -> None:
-    """End gloo's threads while there is an interpreter: one that drops a tensor later aborts the process."""
+    """End gloo's threads before the interpreter, because one that frees a tensor later aborts the process."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
 
 @contextmanager
 def lost_peers_told() -> Iterator[None]:
-    """Within the block a connection that breaks is an error that says so: another process has ended."""
+    """Within the block a broken connection is a `HandSimError` that says so."""
     try:
         yield
     except RuntimeError as error:
-        # gloo has no class of errors for a process that is lost.
+        # gloo has no class of errors for a lost process.
         if not (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
             raise
         raise HandSimError("another process of this run ended, and tells why") from error
 
 
 def _takes_bf16(precision: str) -> bool:
-    """Whether the forward pass runs in bf16; without instructions for it a CPU is many times slower."""
+    """Whether to run the forward pass in bf16, which is slow on CPUs without instructions for it."""
     if precision != "auto":
         return precision == "bf16"
     if torch.cuda.is_available():

@@ -19,7 +19,7 @@ from handsim.hand.model import build_spec
 from handsim.hand.shape import EVERYBODY
 from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR
-from tests.handsim.hand.blending import blend_skin
+from tests.meshes import blend_skin
 
 MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
 

@@ -45,6 +45,7 @@ from poses.object_motion import (
 )
 from poses.shapes import MAX_PENETRATION, is_valid, resting_angles
 from poses.two_hands import two_hands_penetration
+from tests.meshes import winding
 
 FACETS = 0.0008  # a mesh of few triangles lies inside the round part it stands for [m]
 
@@ -58,15 +59,6 @@ def held() -> dict[str, tuple[HandModel, RigidObject, Hold]]:
         obj = named_object(name)
         holds[name] = model, obj, settle_hold(model, obj, rng=np.random.default_rng(number))
     return holds
-
-
-def winding(solid: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """How often a closed surface goes around points (Van Oosterom and Strackee's solid angles): 1 inside."""
-    a, b, c = (solid.triangles[None, :, k] - points[:, None] for k in range(3))
-    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
-    dot = np.einsum("pfi,pfi->pf", a, b) * lc + np.einsum("pfi,pfi->pf", b, c) * la
-    dot += np.einsum("pfi,pfi->pf", c, a) * lb + la * lb * lc
-    return 2 * np.arctan2(np.einsum("pfi,pfi->pf", a, np.cross(b, c)), dot).sum(axis=1) / (4 * np.pi)
 
 
 def depth_in_mesh(model: HandModel, obj: RigidObject, angles: np.ndarray, pose: np.ndarray) -> float:

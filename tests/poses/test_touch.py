@@ -15,6 +15,7 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.shape import DIGITS, SIDES, SIZES
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
 from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
+from tests.sentences import error_names
 
 
 def _measured(model: HandModel, angles: np.ndarray, finger: str) -> tuple[float, np.ndarray]:
@@ -114,9 +115,7 @@ def test_only_thumb_and_finger_move_from_a_start():
 
 def test_bad_touches_are_told():
     model = HandModel.named("M")
-    with pytest.raises(
-        ArgumentError, match="unknown finger 'thumb'; valid names: index, middle, ring, little"
-    ):
+    with error_names(ArgumentError, "unknown finger 'thumb'; valid names: index, middle, ring, little"):
         touching_angles(model, "thumb")
     with pytest.raises(ArgumentError, match=r"start has shape \(19,\), expected \(..., 20\)"):
         touching_angles(model, "index", np.zeros(19))

@@ -258,16 +258,3 @@ def test_arguments(tmp_path):
     path = saved(tmp_path, qpos=BASE, person=[0, 1])
     with pytest.raises(CaptureError, match="leave out --people"):
         load_poses(PoseFile(path, people=3))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("", "expected a take, --poses or --merge"),
-        ("take.npz --poses poses.npz", "expected a take, --poses or --merge"),
-        ("take.npz --people 3", "belong to --poses"),
-    ],
-)
-def test_the_command_wants_one_source(tmp_path, capsys, words, message):
-    assert main(["render", *words.split(), "--out", str(tmp_path / "out")]) == 1
-    assert message in capsys.readouterr().err

@@ -15,6 +15,7 @@ from gloves import Capture, Status, Take
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions, rigid_fit
+from tests.sentences import error_names
 from track import RigidTemplate
 from track.rigid_body import BodyError, BodyFrame, BodyTracker, learn_body, load_bodies, load_body, save_body
 from train import simulate_take
@@ -244,9 +245,8 @@ def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
 )  # fmt: skip
 def test_constellations_that_tell_no_pose_are_refused(places, words):
     names = tuple(f"m{i}" for i in range(len(places)))
-    with pytest.raises(ArgumentError) as caught:
+    with error_names(ArgumentError, words):
         RigidTemplate("thing", names, np.array(places, dtype=float))
-    assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_mirrored_constellation_is_another_one(rng):
@@ -390,9 +390,7 @@ def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
 
 
 def test_unknown_bodies_are_told(tmp_path):
-    with pytest.raises(
-        ArgumentError, match=r"unknown body 'mugg' \(did you mean 'mug'\?\); valid names: contr"
-    ):
+    with error_names(ArgumentError, "unknown body 'mugg' (did you mean 'mug'?); valid names: contr"):
         load_body("mugg")
     with pytest.raises(ArgumentError, match="pen: 1 markers, expected at least 3"):
         load_body("pen")
@@ -407,9 +405,7 @@ def test_bodies_that_are_tracked_together_have_names_of_their_own(tmp_path):
     for name, other in (("mug", "mug"), ("left", "box")):
         path = tmp_path / "body.toml"
         path.write_text(text(head=f'name = "{name}"'))
-        with pytest.raises(
-            ArgumentError, match=f"body.toml: a body is named '{name}', expected a name of its own"
-        ):
+        with error_names(ArgumentError, f"body.toml: a body is named '{name}', expected a name of its own"):
             load_bodies([other, path])
 
 
@@ -463,14 +459,10 @@ def test_one_frame_is_not_enough_to_be_so_right(rng):
 def test_captures_of_anything_else_are_told(rng):
     take = twin_take()
     hands = np.where(((take.labels >= 0) & (take.labels < 38))[..., None], take.points, np.nan)
-    with pytest.raises(
-        CalibrationError, match="points per frame, expected 3 to 20: one body and nothing else"
-    ):
+    with error_names(CalibrationError, "points per frame, expected 3 to 20: one body and nothing else"):
         learn_body(capture_of(hands), "wand")
     fingers = np.where(np.isin(take.labels, (3, 6, 9, 12, 15))[..., None], take.points, np.nan)
-    with pytest.raises(
-        CalibrationError, match="% of the points keep their positions on one rigid body, expected"
-    ):
+    with error_names(CalibrationError, "% of the points keep their positions on one rigid body, expected"):
         learn_body(capture_of(fingers), "wand")
     with pytest.raises(CalibrationError, match="a capture of 0 points per frame"):
         learn_body(Capture(("a",), np.full((5, 1, 3), np.nan), 120.0), "wand")

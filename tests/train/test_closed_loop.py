@@ -16,18 +16,7 @@ from track import track_capture
 from train import Dataset, simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
-SMALL = [
-    "--samples",
-    "80000",
-    "--batch",
-    "128",
-    "--network.width",
-    "32",
-    "--network.gates",
-    "8",
-    "--network.depth",
-    "3",
-]
+SMALL = "--samples 80000 --batch 128 --network.width 32 --network.gates 8 --network.depth 3".split()
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +124,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
         (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "ghosts is -1, expected 0 to 100"),
         (["train", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
-        (
-            ["train", "SET", "--out", "RUN", "--seed", "5"],
-            "begun with other settings (train.batch: ",
-        ),
+        (["train", "SET", "--out", "RUN", "--seed", "5"], "begun with other settings (train.batch: "),
     ],
 )
 def test_mistakes_end_in_one_sentence(run, tmp_path, capsys, arguments, sentence):

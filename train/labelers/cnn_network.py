@@ -4,11 +4,11 @@ Han et al. 2018, Table 1. Its filters are valid (no padding): 52 → 50 → 48, 
 The outputs are positions in the image's view frame (`train.labelers.cnn_labeler.ViewFrames`), in the
 layout's marker order; labels come from matching them with the points (equation 1).
 
-On a CPU the first filters are computed only where an image differs from its background. A depth image has a
-point in about 20 of 2,704 pixels. Convolutions without padding leave the others uniform, so the features of a
-layer are one background and the pixels that differ from it: 7 % of the first layer, 18 % of the second, 55 %
-of the third. The results are those of the dense layers, batch statistics included; two of every three
-multiplications of these layers are left out.
+On a CPU the first filters are computed only where an image differs from its background. A depth image has
+points in about 20 of its 2,704 pixels. Convolutions without padding keep the others uniform, so that the
+features of a layer are one background and the pixels that differ from it: 7 % of the first layer, 18 % of the
+second, 55 % of the third. The results, with batch statistics, are those of the dense layers at a third of
+the multiplications.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _TAPS = 9  # of a 3x3 filter
 
 
 class SparseFeatures(NamedTuple):
-    """Features of a batch of images."""
+    """Features of a batch of images with a uniform background."""
 
     pixels: Int32[np.ndarray, "B S S"]
     """Row of each pixel in `values`, -1 where it is background."""
     values: Float[Tensor, "P C"]
-    """Features of the pixels that are not background, less the background."""
+    """Features of the other pixels minus the background's."""
     background: Float[Tensor, "C"]
 
     def dense(self) -> Float[Tensor, "B C S S"]:
@@ -87,7 +87,7 @@ def _convolve(features: SparseFeatures, layer: nn.Conv2d) -> SparseFeatures:
 
 
 class _Convolution(torch.autograd.Function):
-    """Each input times the nine taps, then for each output the sum of the products that reach it."""
+    """Multiply each input by the nine taps, then sum the products that reach each output."""
 
     @staticmethod
     def forward(
@@ -100,7 +100,7 @@ class _Convolution(torch.autograd.Function):
         count, channels = len(values), weight.shape[1] // _TAPS
         products = values.new_empty(count * _TAPS + 1, channels)
         torch.mm(values, weight, out=products[:-1].view(count, weight.shape[1]))
-        products[-1] = 0.0  # what the background adds
+        products[-1] = 0.0  # contribution of the background
         context.save_for_backward(values, weight, targets)
         return functional.embedding_bag(sources, products, mode="sum")
 
@@ -115,7 +115,7 @@ class _Convolution(torch.autograd.Function):
 
 
 def _normalize(features: SparseFeatures, layer: nn.BatchNorm2d) -> SparseFeatures:
-    """Batch normalization over all pixels, the background's among them."""
+    """Batch normalization over all pixels, including the background."""
     pixels, values, background = features
     assert layer.running_mean is not None and layer.running_var is not None
     if layer.training:
@@ -131,7 +131,7 @@ def _normalize(features: SparseFeatures, layer: nn.BatchNorm2d) -> SparseFeature
     else:
         offset, variance = layer.running_mean - background, layer.running_var
     scale = layer.weight * torch.rsqrt(variance + layer.eps)
-    # Batch statistics cancel the background; a gradient of 0 is what several devices expect, not none.
+    # Batch statistics cancel the background, but several devices expect a gradient of 0 rather than none.
     shift = layer.bias - offset * scale + 0.0 * background
     return SparseFeatures(pixels, values * scale, shift)
 
@@ -203,7 +203,7 @@ def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDA
     return reached, sources[:outputs]
 
 
-_SPARSE: Final = 10  # layers up to the third filter, which leave a large part of an image uniform
+_NUM_SPARSE: Final = 10  # layers up to the third filter, after which much of an image is still uniform
 
 
 class DeepLabelCNN(nn.Module):
@@ -230,11 +230,11 @@ class DeepLabelCNN(nn.Module):
         )
 
     def forward(self, images: Float[Tensor, "B 1 52 52"]) -> Float[Tensor, "B M 3"]:
-        """Marker positions in view units, those of occluded markers too."""
+        """Positions of all markers in view units, including occluded ones."""
         if _computes_sparsely(images):
             layers = list(self.features)
-            features = filter_sparse(images, layers[:_SPARSE]).dense()
-            for layer in layers[_SPARSE:]:
+            features = filter_sparse(images, layers[:_NUM_SPARSE]).dense()
+            for layer in layers[_NUM_SPARSE:]:
                 features = layer(features)
             positions: Tensor = self.positions(features)
         else:
@@ -243,7 +243,7 @@ class DeepLabelCNN(nn.Module):
 
 
 class _MeanHandBuffers(nn.Module):
-    """A mean hand (`train.labelers.cnn_labeler.MeanHand`) that is saved with the weights."""
+    """A `MeanHand` that is saved with the weights."""
 
     def __init__(self, num_labels: int) -> None:
         super().__init__()
@@ -260,7 +260,7 @@ class _MeanHandBuffers(nn.Module):
 
 
 def _computes_sparsely(images: Tensor) -> bool:
-    """Whether images are filtered where they are not background: on a CPU, in 32 bits, not while exported."""
+    """Whether to use sparse filters: on a CPU, in 32 bits, except for exports."""
     return not (images.is_cuda or torch.is_autocast_enabled("cpu") or torch.jit.is_tracing())  # type: ignore[no-untyped-call, attr-defined]
 
 
@@ -278,7 +278,7 @@ def cnn_loss(
     rng: np.random.Generator,
     part: Part,
 ) -> Tensor:
-    """Loss of a part of one batch, each cloud in a view of its own (section 3.1 of the paper)."""
+    """Loss of a part of one batch, each cloud in its own random view (section 3.1 of the paper)."""
     points, present = batch.cloud.points, batch.cloud.present
     if config.cnn.views == "aligned":
         hand = network.mean_hand.get()  # type: ignore[operator, union-attr]

@@ -1,9 +1,9 @@
 """A labeler for any layout, without a training set: one network that takes the layout as an input.
 
-What it must know of a layout comes from a few seconds of simulation: the distribution of the distance between
-every two markers over people and poses, and the pose prior (`train.labelers.pose_prior`). A minute of
-training makes it better. Such a labeler is kept in the user's cache folder, under a digest of all that
-decides it: the layout, the cameras, the shipped weights and the version.
+A few seconds of simulation describe a layout: they give the distribution of the distance between every two
+markers over people and poses, and the pose prior (`train.labelers.pose_prior`). A minute of training makes
+the labeler better. The user's cache folder keeps it under a digest of the layout, the cameras, the shipped
+weights and the version.
 """
 
 from __future__ import annotations
@@ -58,16 +58,16 @@ from train.simulation.training_frames import (
 )
 
 NUM_POSES: Final = 40_000
-"""Poses from which a layout is known; fewer make a coarser pose prior."""
+"""Poses that describe a layout; fewer make a coarser pose prior."""
 WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
-_CHUNK: Final = 500  # poses
-_POSES_EACH: Final = 100  # of a person
+_CHUNK: Final = 500  # poses whose features are in memory at once
+_POSES_PER_PERSON: Final = 100
 
 
 class LayoutLabeler:
-    """Labels a glove that no network was trained on, of which it gets the `mean_features` of distances."""
+    """Labels a glove by the network for any layout and the glove's `mean_features`."""
 
     def __init__(
         self,
@@ -81,14 +81,14 @@ class LayoutLabeler:
 
     @classmethod
     def at_once(cls, layout: MarkerLayout, *, num_poses: int = NUM_POSES, seed: int = 0) -> Self:
-        """The shipped network with what a few seconds of simulation tell of a layout."""
+        """The shipped network for a layout that a few seconds of simulation describe."""
         rng = np.random.default_rng(seed)
         markers = sample_worn_markers(layout, num_poses, rng=rng)
         network, prior = shipped_network(), learn_pose_prior(markers, rng=rng)
         return cls(layout, network, mean_features(markers, network.config)[None], prior)
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
-        """All that it has learned, by name, for a file."""
+        """All weights, features and the prior by name, for a file."""
         parts = {f"{_NETWORK}{name}": value.numpy() for name, value in self.network.state_dict().items()}
         prior = {} if self.prior is None else self.prior.tensors()
         parts |= {f"{_PRIOR}{name}": value for name, value in prior.items()}
@@ -96,7 +96,7 @@ class LayoutLabeler:
 
     @classmethod
     def of_tensors(cls, layout: MarkerLayout, tensors: Mapping[str, NDArray[np.generic]]) -> Self:
-        """The labeler out of a file's tensors."""
+        """The labeler from the tensors of a file."""
         network = LayoutNetwork(LayoutNetworkConfig())
         parts, prior = (
             {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
@@ -124,7 +124,7 @@ class LayoutLabeler:
 
 
 def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConfig) -> Float[Tensor, "M M K"]:
-    """Mean over poses of the distance features between a layout's markers [m]."""
+    """Mean over poses of the `distance_features` of a layout's markers [m]."""
     centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
     sums = [
         distance_features(centered[first : first + _CHUNK], config).sum(0)
@@ -135,7 +135,7 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
 
 @cache
 def shipped_network() -> LayoutNetwork:
-    """The network that comes with handsim."""
+    """The shipped network for any layout."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -171,12 +171,12 @@ def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -
 def sample_worn_markers(
     layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T M 3"]:
-    """Markers [m] of right hands in valid poses; each hundred are another person's, whose glove slipped."""
+    """Markers [m] of right hands in valid poses, with another person and glove fit every hundred frames."""
     config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts = []
-    for first in range(0, num_frames, _POSES_EACH):
-        count = min(_POSES_EACH, num_frames - first)
+    for first in range(0, num_frames, _POSES_PER_PERSON):
+        count = min(_POSES_PER_PERSON, num_frames - first)
         right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
         scene = sample_single_hand(right, count, config, rng=rng)
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
@@ -184,20 +184,20 @@ def sample_worn_markers(
     return np.concatenate(parts)
 
 
-MOST: Final = 32
-"""Labelers that are kept; one takes about four megabytes."""
+MAX_KEPT: Final = 32
+"""Labelers in the cache; one takes about four megabytes."""
 NUM_CLOUDS: Final = 15_000
 _BATCH: Final = 64
 _PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
 
 
 def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
-    """Whether a glove was learned before."""
+    """Whether the cache holds a labeler of a glove."""
     return _file_of(layout, rig).exists()
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
-    """The labeler of a glove: learned within a minute the first time, later read within a second."""
+    """The labeler of a glove: learned within a minute the first time, and read from the cache later."""
     file = _file_of(layout, rig)
     found = _read(file, layout)
     if found is not None:
@@ -206,28 +206,29 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
     try:
         _write(file, learned)
     except OSError:
-        return learned  # a cache that cannot be written costs time, no labels
+        return learned  # a cache that cannot be written costs time only
     return _read(file, layout) or learned
 
 
-@functools.lru_cache(maxsize=MOST)
+@functools.lru_cache(maxsize=MAX_KEPT)
 def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
-    """Digest of all that decides a labeler."""
-    decides = {
+    """Digest of everything that a labeler depends on."""
+    dependencies = {
         "layout": dataclasses.asdict(layout),
         "rig": load_rig(rig).record(),
         "weights": checksum(SHIPPED / WEIGHTS),
         "version": __version__,
     }
-    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:32]
+    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+    """Path of a glove's labeler in the cache."""
     return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
 
 
 def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
-    """A kept labeler; None where there is none, or a damaged one, which is removed."""
+    """A labeler from the cache; None if it is missing or damaged. A damaged file is removed."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -245,13 +246,13 @@ def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
 
 
 def _write(file: Path, labeler: LayoutLabeler) -> None:
+    """Write a labeler into the cache, and remove the least recently used ones."""
     from safetensors.numpy import save
 
-    tensors: dict[str, NDArray[np.generic]] = labeler.tensors()
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(file) as temporary:
-        temporary.write_bytes(save(dict(tensors)))
-    for old in learned_gloves()[MOST:]:
+        temporary.write_bytes(save(labeler.tensors()))
+    for old in learned_gloves()[MAX_KEPT:]:
         old.unlink(missing_ok=True)
 
 
@@ -262,14 +263,14 @@ def fine_tuned_labeler(
     num_clouds: int = NUM_CLOUDS,
     seed: int = 0,
 ) -> LayoutLabeler:
-    """A labeler for any layout that has learned more of this one, as a rig sees it, from so many clouds."""
+    """A labeler for any layout after training on clouds of one layout, as a rig sees them."""
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler.at_once(layout, seed=seed)
     source = FrameSource(GenerateSettings(), layout, load_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
-    for first in range(0, len(rows), _POSES_EACH):
+    for first in range(0, len(rows), _POSES_PER_PERSON):
         models = sample_hands(source.settings.population, rng=rng)
-        simulate_frames(rows[first : first + _POSES_EACH], models, source, rng=rng)
+        simulate_frames(rows[first : first + _POSES_PER_PERSON], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
     optimizer = new_optimizer(network)
@@ -283,7 +284,7 @@ def fine_tuned_labeler(
 
 
 def new_optimizer(network: LayoutNetwork) -> torch.optim.Optimizer:
-    """What trains a network for any layout."""
+    """The optimizer of a network for any layout."""
     return torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
 
 
@@ -294,7 +295,7 @@ def layout_step(
     cloud: Cloud,
     layouts: Float[Tensor, "G M M K"],
 ) -> tuple[float, Float[Tensor, "B N M+1"]]:
-    """Make one gradient step at a share of the peak rate; the loss before it, and the scores of points."""
+    """Make a gradient step at a share of the peak rate, and return the loss and point scores before it."""
     for group in optimizer.param_groups:
         group["lr"] = float(_PEAK_RATE * rate)
     points, present = torch.from_numpy(cloud.points.astype(np.float32)), torch.from_numpy(cloud.present)

@@ -1,10 +1,10 @@
-"""Training of the network for any layout: every batch holds new random layouts, none of them twice.
+"""Training of the network for any layout, with new random layouts in every batch.
 
 python -m train.labelers.layout_training FOLDER [--steps N]
 
-A layout is a choice among many places on the skin, whose positions in many poses of many people are known.
-It writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and goes on from the
-checkpoint there. The figures of the shipped weights are in train/weights/README.md.
+A layout is a choice among many places on the skin, whose positions in many poses of many people are sampled
+once. The run writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and continues
+from the checkpoint there. The figures of the shipped weights are in train/weights/README.md.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance
 from train.labelers.protocol import torch_threads
 from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
-_MOST_MISSED: Final = 500  # draws in a row without a free place
-_APART: Final = 0.0025  # [m] between two places of a bank, at least
-_PALM_SHARE: Final = 5.0  # of places, against a finger's bone
-_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
-_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)
+_MAX_MISSED: Final = 500  # draws in a row without a free place
+_MIN_DISTANCE: Final = 0.0025  # between two places of a bank [m]
+_PALM_SHARE: Final = 5.0  # places on the palm for each one on a finger's bone
+_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # places along and across the palm [bone lengths]
+_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # places along a finger's bone and its last bone
 _AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [deg]
-_MOST_AROUND: Final = 100.0  # [deg]
+_MAX_AROUND: Final = 100.0  # greatest such angle [deg]
 _RADIUS: Final = 0.0032  # of the markers [m]
-_POSES_EACH: Final = 64  # of a person
+_POSES_PER_PERSON: Final = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinBank:
-    """Places on the back and the sides of right hands, and where they are in poses."""
+    """Places on the back and the sides of right hands, and their positions in random poses."""
 
     places: tuple[MarkerPlace, ...]
     positions: Float16[np.ndarray, "T C 3"]
-    """[m], around their mean; left hands are mirrored."""
+    """Positions around their mean [m]; left hands are mirrored."""
 
     @property
     def bones(self) -> Int[np.ndarray, "C"]:
-        """Index of each place's bone."""
+        """Index of the bone under each place."""
         return np.array([BONE_NAMES.index(place.bone) for place in self.places])
 
     def mean_distances(self, num_poses: int = 1000) -> Float[np.ndarray, "C C"]:
@@ -68,10 +68,7 @@ class SkinBank:
 
 
 def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generator) -> SkinBank:
-    """Poses of random people as training sets have them, alone, together and holding something.
-
-    Each person strikes up to 64 poses with one slip of every marker.
-    """
+    """Places, and their positions in up to 64 poses of each random person, with one slip of each marker."""
     places = sample_places(num_places, rng=rng)
     gloves = [
         MarkerLayout("places", places[first : first + MOST_MARKERS], _RADIUS)
@@ -86,15 +83,15 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
 
 
 def sample_places(
-    num_places: int, *, rng: np.random.Generator, apart: float = _APART
+    num_places: int, *, rng: np.random.Generator, apart: float = _MIN_DISTANCE
 ) -> tuple[MarkerPlace, ...]:
-    """Random places on the skin of the back and the sides of the flat hand; fewer where no more fit."""
+    """Random places on the back and the sides of the flat hand; fewer if no more fit."""
     model = HandModel.named("M")
     share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
     places: list[MarkerPlace] = []
     points: list[Float[np.ndarray, "3"]] = []
     missed = 0
-    while len(places) < num_places and missed < _MOST_MISSED:
+    while len(places) < num_places and missed < _MAX_MISSED:
         bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
         name = BONE_NAMES[bone]
         if bone == PALM:
@@ -102,7 +99,7 @@ def sample_places(
             across = rng.uniform(-_PALM_ACROSS, _PALM_ACROSS)
         else:
             along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
-            around, across = np.clip(_AROUND * rng.standard_normal(), -_MOST_AROUND, _MOST_AROUND), 0.0
+            around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
         place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
         point = _point_of(place, model)
         if point is not None and all(np.linalg.norm(point - other) > apart for other in points):
@@ -115,22 +112,20 @@ def sample_places(
 
 
 def _point_of(place: MarkerPlace, model: HandModel) -> Float[np.ndarray, "3"] | None:
-    """Where a place is on the flat hand [m]; None where it meets no skin."""
+    """Position of a place on the flat hand [m]; None if it is off the skin."""
     copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
     try:
-        point: Float[np.ndarray, "3"] = attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[
-            0
-        ]
+        points = attach_markers(MarkerLayout("place", copies, _RADIUS), model).points
     except LayoutError:
         return None
-    return point
+    return np.asarray(points[0])
 
 
 def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
-    """Places of one person in some poses; None where a place misses the skin of the hand."""
+    """Positions of all places on a random person in some poses; None if a place is off the skin."""
     config = GenerateSettings()
     models = sample_hands(config.population, rng=rng)
-    scene = sample_frame_scene(models, _POSES_EACH, config, rng=rng)
+    scene = sample_frame_scene(models, _POSES_PER_PERSON, config, rng=rng)
     model = scene.hands[0]
     bones = model.forward_kinematics(scene.qpos[0])
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
@@ -146,15 +141,15 @@ def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[
 
 
 PLACES, PEOPLE = 480, 1600
-_LAYOUTS, _CLOUDS = 8, 24  # of a batch; clouds of each layout
-_MARKERS: Final = (5, 31)  # of a layout: least, and one more than most
+_LAYOUTS, _CLOUDS = 8, 24  # layouts in a batch; clouds of each layout
+_MARKERS: Final = (5, 31)  # range of the number of markers; the upper end is excluded
 _WARM_UP: Final = 200  # steps until the peak learning rate is reached
 _STRETCH: Final = 0.03  # anisotropy of a hand
-_JITTER: Final = 0.0015  # of a batch, at most [m]
-_GAP: Final = (0.006, 0.014)  # least distance of two markers [m]
+_JITTER: Final = 0.0015  # largest jitter of a batch [m]
+_GAP: Final = (0.006, 0.014)  # range of the least distance between two markers [m]
 _HIDDEN: Final = 0.3  # share of batches in which neighbors are lost together
-_HIDDEN_RADIUS: Final = 0.05  # [m]
-_LEAST_SEEN: Final = 4  # markers
+_HIDDEN_RADIUS: Final = 0.05  # largest radius in which they are lost [m]
+_MIN_SEEN: Final = 4  # markers of a cloud that are never lost so
 _CONFIG: Final = LayoutNetworkConfig()
 _FEATURE_POSES: Final = 3000
 _SAVED_EVERY, _TOLD_EVERY = 500, 100  # steps
@@ -174,7 +169,7 @@ class LayoutBatches:
         self._bones = bank.bones
 
     def draw(self) -> tuple[Cloud, Float[np.ndarray, "G M M K"]]:
-        """Clouds [m] of some layouts with equally many markers, and what is known of each layout."""
+        """Clouds [m] of layouts with equally many markers, and the mean distance features of each layout."""
         rng = self._rng
         count = int(rng.integers(*_MARKERS))
         layouts = [self._layout(count) for _ in range(_LAYOUTS)]
@@ -194,7 +189,7 @@ class LayoutBatches:
         return cloud, np.array([self._features[np.ix_(layout, layout)] for layout in layouts], np.float32)
 
     def _layout(self, count: int) -> Int[np.ndarray, "M"]:
-        """Places of a random layout, evenly or unevenly over the bones, and not too near to each other."""
+        """Places of a random layout, spread evenly or unevenly over the bones, with a gap between them."""
         rng, bones = self._rng, self._bones
         while True:
             share = rng.dirichlet(np.full(bones.max() + 1, rng.choice([0.3, 1.0, 4.0])))
@@ -209,17 +204,17 @@ class LayoutBatches:
                     return np.array(chosen)
 
     def _hide_neighbors(self, markers: Float[np.ndarray, "B M 3"]) -> Float[np.ndarray, "B M 3"]:
-        """Most markers around a random one are lost, as behind another hand."""
+        """Clouds [m] without most markers around a random one, as if another hand hid them."""
         rng, (batch, count, _) = self._rng, markers.shape
         center = markers[np.arange(batch), rng.integers(count, size=batch)][:, None]
         radius = rng.uniform(0.0, _HIDDEN_RADIUS, size=(batch, 1))
         lost = (np.linalg.norm(markers - center, axis=-1) < radius) & (rng.random((batch, count)) < 0.8)
-        lost[lost.sum(axis=1) > count - _LEAST_SEEN] = False
+        lost[lost.sum(axis=1) > count - _MIN_SEEN] = False
         return np.where(lost[..., None], np.nan, markers)
 
 
 class LayoutTraining:
-    """Network and optimizer of a run of so many steps."""
+    """The state of a training run."""
 
     def __init__(self, steps: int, config: LayoutNetworkConfig = _CONFIG) -> None:
         torch.manual_seed(0)
@@ -228,7 +223,7 @@ class LayoutTraining:
         self.optimizer = new_optimizer(self.network)
 
     def step(self, cloud: Cloud, layouts: Float[np.ndarray, "G M M K"]) -> tuple[float, float]:
-        """Make one gradient step; returns the loss before it, and the share of markers labeled right."""
+        """Make a gradient step, and return the loss and the share of markers labeled right before it."""
         progress = self.done / self.steps
         rate = min(1.0, (self.done + 1) / _WARM_UP) * (0.01 + 0.495 * (1.0 + np.cos(np.pi * progress)))
         loss, scores = layout_step(self.network, self.optimizer, rate, cloud, torch.from_numpy(layouts))
@@ -240,14 +235,8 @@ class LayoutTraining:
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
         buffer = io.BytesIO()
-        torch.save(
-            {
-                "network": self.network.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "done": self.done,
-            },
-            buffer,
-        )
+        states = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+        torch.save(states | {"done": self.done}, buffer)
         with atomic_write(path) as temporary:
             temporary.write_bytes(buffer.getbuffer())
 

@@ -1,6 +1,6 @@
-"""The set labeler with weights, one cloud at a time: compiled, and without torch.
+"""The trained set labeler for one cloud at a time, compiled and without torch.
 
-For so few points torch's time goes to its calls. Operations in their order are those of
+With so few points torch spends its time on calls. The order of operations is that of
 `train.labelers.networks`.
 """
 
@@ -25,8 +25,8 @@ Weights = Mapping[str, Floats]
 
 _EPSILON: Final = np.float32(1e-5)  # of torch's LayerNorm
 _NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
-_COUNT: Final = np.float32(20.0)  # points that sums over a cloud are measured by
-_MESSAGES: Final = np.float32(5.0)  # messages that sums over senders are measured by
+_COUNT: Final = np.float32(20.0)  # divisor of sums over the points of a cloud
+_MESSAGES: Final = np.float32(5.0)  # divisor of sums over the senders of messages
 # exp(x) = 2^n exp(r) with r = x - n log(2), and exp(r) as a polynomial: exact to two units of the last place.
 _LIMIT: Final = np.float32(80.0)  # beyond it the logistic function is 0 or 1 in single precision
 _LOG2E: Final = np.float32(1.4426950408889634)
@@ -38,7 +38,7 @@ _P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
 
 
 class TrainedSetLabeler:
-    """The set labeler with weights, later changes of which have no effect, and a prior of hands."""
+    """The set labeler with copied weights and a prior of hands."""
 
     def __init__(
         self,
@@ -56,6 +56,7 @@ class TrainedSetLabeler:
         return [self._label(cloud) for cloud in check_clouds(frames)]
 
     def _label(self, cloud: NDArray[np.float64]) -> Labeling:
+        """Label the points of one cloud [m]."""
         if not len(cloud):
             return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
         by_point, by_label = self._scorer.score(cloud)
@@ -91,7 +92,7 @@ class _Rounds(NamedTuple):
 
 
 class _Ends(NamedTuple):
-    """What comes before the rounds and after them; D is 1."""
+    """The layers before and after the rounds; D is 1."""
 
     embed: _Linear
     embed_again: _Linear
@@ -102,7 +103,7 @@ class _Ends(NamedTuple):
 
 
 class CloudScorer:
-    """Scores of one cloud without padding, by weights of the names and shapes of `weight_shapes`."""
+    """Scores single clouds by weights with the names and shapes of `weight_shapes`."""
 
     def __init__(self, config: SetLabelerConfig, weights: Weights) -> None:
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
@@ -134,7 +135,7 @@ class CloudScorer:
     def score(
         self, points: Float[np.ndarray, "N 3"]
     ) -> tuple[Float32[np.ndarray, "N M+1"], Float32[np.ndarray, "M N+1"]]:
-        """Log-probabilities of one point or more [m], as in `train.labelers.networks.LabelScores`."""
+        """Log-probabilities of points and labels, as in `train.labelers.networks.LabelScores`."""
         return _score(
             np.ascontiguousarray(points, dtype=np.float64),
             self._centers,
@@ -145,7 +146,7 @@ class CloudScorer:
 
 
 def weight_shapes(config: SetLabelerConfig) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a network's weights, as torch has them: a linear layer is (outputs, inputs)."""
+    """Names and shapes of a network's weights in torch, where a linear layer is (outputs, inputs)."""
     width, labels = config.width, config.num_labels
     linear = {
         "embed.0": (width, config.num_distances + 1),
@@ -172,14 +173,14 @@ def weight_shapes(config: SetLabelerConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _centers(config: SetLabelerConfig) -> Float32[np.ndarray, "K"]:
-    """Distances around which the bumps stand [m]; torch's linspace counts the second half from its end."""
+    """Centers of the distance bumps [m], computed like torch's linspace: the second half from its end."""
     reach, count = np.float32(config.reach), config.num_distances
     steps = np.arange(count) * np.float64(reach / np.float32(count - 1))
     return np.where(np.arange(count) < count // 2, steps, reach - steps[::-1]).astype(np.float32)
 
 
 def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
-    """A linear layer of some parts of the network, by its name there."""
+    """A linear layer of this name in each of some parts of the network."""
     return _Linear(
         np.stack([np.ascontiguousarray(weights[f"{part}{name}.weight"].T) for part in parts]),
         np.stack([weights[f"{part}{name}.bias"] for part in parts]),
@@ -187,7 +188,7 @@ def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
 
 
 def _norm(weights: Weights, parts: list[str], name: str) -> _Norm:
-    """A layer norm of some parts of the network, by its name there."""
+    """A layer norm of this name in each of some parts of the network."""
     weight, bias = (
         np.stack([weights[f"{part}{name}.{kind}"] for part in parts]) for kind in ("weight", "bias")
     )
@@ -202,7 +203,7 @@ def _score(
     rounds: _Rounds,
     ends: _Ends,
 ) -> tuple[Floats, Floats]:
-    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels; bumps stand around `centers` [m]."""
+    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels; `centers` are those of bumps [m]."""
     count, width = len(points), ends.embed.weight.shape[2]
     bits = np.empty(max(len(centers) * count * count, 2 * width * count), dtype=np.int32)
     scale = bits.view(np.float32)
@@ -247,7 +248,7 @@ def _bumps(
     bits: Int32[np.ndarray, "B"],
     scale: Float32[np.ndarray, "B"],
 ) -> Floats:
-    """How near the distance of each pair of points (K, N * N) is to each center, 0 to 1."""
+    """Gaussian bumps (K, N * N) of the distances between points around each center, 0 to 1."""
     count = len(points)
     near = np.empty((count, 3), dtype=np.float32)
     for axis in range(3):
@@ -278,12 +279,12 @@ def _exchange(
     bits: Int32[np.ndarray, "B"],
     scale: Float32[np.ndarray, "B"],
 ) -> None:
-    """Add to features what the points tell one another in a round."""
+    """Add the gated messages of a round to the features."""
     count, width, num_gates = len(features), features.shape[1], rounds.distance_gate.shape[1]
     normed = _layer_norm(features, rounds.norm, one)
     ends = _dense(normed, rounds.ends, one)  # receivers, then senders
     gate = np.dot(rounds.distance_gate[one], bumps)
-    for g in range(num_gates):  # bumps are alike both ways: receivers lie next to one another
+    for g in range(num_gates):  # bumps are symmetric, so that receivers may be contiguous
         for j in range(count):
             for i in range(count):
                 gate[g, j * count + i] += ends[i, g] + ends[j, num_gates + g]
@@ -373,7 +374,7 @@ def _silu(
 
 @kernel
 def _log_softmax(values: Float32[np.ndarray, "R C"]) -> None:
-    """Along the last axis, in place."""
+    """The logarithm of the softmax along the last axis, in place."""
     for row in range(len(values)):
         most = values[row].max()
         total = _ZERO

@@ -7,8 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from benchmarks.paper.paper_tracker import GATE, PaperTracker
+from benchmarks.paper.paper_tracker import GATE, PaperTracker, cluster_points, labeler_cloud
+from benchmarks.paper.plain_hand import label_by_proximity
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
 from gloves import GloveFit, Status, Take
@@ -203,3 +207,76 @@ def test_frames_without_points_are_frames(users, labeler):
     frame = tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), 0.0)
     assert len(frame.labels) == len(frame.confidence) == 0
     assert [hand.status for hand in frame.hands] == [Status.LOST] * 2
+
+
+PLACES = arrays(np.float64, st.tuples(st.integers(0, 40), st.just(3)), elements=st.floats(-0.5, 0.5))
+
+
+@settings(deadline=None, max_examples=50)
+@given(PLACES, st.integers(1, 25))
+def test_every_point_is_in_one_cluster_and_none_is_too_large(points, most):
+    clusters = cluster_points(points, most=most)
+    assert sorted(np.concatenate([np.zeros(0, dtype=int), *clusters]).tolist()) == list(range(len(points)))
+    assert all(len(cluster) <= most for cluster in clusters)
+    centers = [points[cluster].mean(axis=0) for cluster in clusters]
+    for place, one in enumerate(clusters):
+        for other in range(place):
+            far = np.linalg.norm(centers[place] - centers[other]) > 0.2 - 1e-9
+            assert far or len(one) + len(clusters[other]) > most, "nothing is left to join"
+
+
+def test_centers_count_and_not_the_points_between():
+    chain = np.zeros((6, 3))
+    chain[:, 0] = np.arange(6) * 0.15
+    assert [cluster.tolist() for cluster in cluster_points(chain, most=22)] == [[0, 1], [2, 3], [4, 5]]
+
+
+def test_two_hands_apart_are_two_clusters_whatever_the_order(rng):
+    hands = rng.uniform(-0.08, 0.08, size=(2, 19, 3))
+    hands[1, :, 0] += 0.4
+    points, order = hands.reshape(-1, 3), rng.permutation(38)
+    clusters = cluster_points(points[order], most=22)
+    assert sorted(sorted(order[cluster].tolist()) for cluster in clusters) == [
+        list(range(19)),
+        list(range(19, 38)),
+    ]
+
+
+def test_clusters_do_not_grow_beyond_the_most():
+    points = np.random.default_rng(5).uniform(-0.05, 0.05, size=(45, 3))
+    sizes = [len(cluster) for cluster in cluster_points(points, most=22)]
+    assert max(sizes) <= 22 and len(sizes) >= 3
+
+
+SOME = arrays(np.float64, st.tuples(st.integers(0, 9), st.just(3)), elements=st.floats(0.0, 0.03))
+
+
+@settings(deadline=None, max_examples=80)
+@given(SOME, SOME)
+def test_names_are_one_to_one_near_and_leave_no_pair(points, places):
+    names = label_by_proximity(points, places, 0.015)
+    named = names[names >= 0]
+    assert len(np.unique(named)) == len(named)
+    apart = np.linalg.norm(points[:, None] - places, axis=-1)
+    assert (apart[names >= 0, named] < 0.015).all()
+    left = np.delete(apart[names < 0], named, axis=1)
+    assert not (left < 0.015).any()
+
+
+def test_the_nearest_pair_goes_first():
+    points, places = np.array([[0.010, 0, 0], [0.001, 0, 0]]), np.array([[0.004, 0, 0], [0.016, 0, 0]])
+    assert label_by_proximity(points, places, 0.015).tolist() == [1, 0]
+    assert label_by_proximity(points[:1], places[:1] + [0.021, 0, 0], 0.015).tolist() == [-1], "not nearer"
+
+
+def test_a_place_at_infinity_is_nobodys():
+    assert label_by_proximity(np.zeros((2, 3)), np.full((3, 3), np.inf), 0.015).tolist() == [-1, -1]
+
+
+def test_a_cloud_is_the_hand_and_the_nearest_free_points():
+    points = np.zeros((9, 3))
+    points[:, 0] = [0.0, 0.02, 0.05, 0.04, 0.1, 0.19, 0.3, 0.06, 0.03]
+    named, free = np.arange(9) < 2, (np.arange(9) >= 2) & (np.arange(9) < 8)
+    assert labeler_cloud(points, named, free, most=5, radius=0.2).tolist() == [0, 1, 3, 2, 7]
+    assert labeler_cloud(points, named, free, most=22, radius=0.2).tolist() == [0, 1, 3, 2, 7, 4, 5]
+    assert labeler_cloud(points, named, free, most=2, radius=0.2).tolist() == [0, 1]

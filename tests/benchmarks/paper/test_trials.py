@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import seen_frame, true_users
-from benchmarks.paper.trials import (
-    FEWEST_FRAMES,
-    hide_points,
-    initialization_times,
-    recovery_times,
-)
+from benchmarks.paper.trials import FEWEST_FRAMES, hide_points, initialization_times, recovery_times
 from gloves import Status, Take
 from handsim.errors import ArgumentError
 from track import TrackedFrame, TrackedHand, Tracker

@@ -54,10 +54,7 @@ def test_results_do_not_go_into_the_benchmark(benchmark, capsys):
 
 def test_what_is_no_benchmark_is_told(tmp_path, capsys):
     (tmp_path / "results").mkdir()
-    for words in (
-        ["score", str(tmp_path), str(tmp_path / "results")],
-        ["run", str(tmp_path), "--out", "x"],
-    ):
+    for words in (["score", str(tmp_path), str(tmp_path / "results")], ["run", str(tmp_path), "--out", "x"]):
         assert command(words) == 1
         assert "holds no finished benchmark, expected a folder from python -m benchmarks.public make" in (
             capsys.readouterr().err

@@ -10,16 +10,7 @@ import pytest
 
 from gloves import Capture, read_capture
 from handsim.errors import CaptureError
-from tests.gloves.captures.test_formats import (
-    DEVICES,
-    LABELED,
-    QUOTED,
-    UNLABELED,
-    motive,
-    nexus,
-    qtm,
-    trc,
-)
+from tests.gloves.captures.test_formats import DEVICES, LABELED, QUOTED, UNLABELED, motive, nexus, qtm, trc
 
 ROWS = [f"{row}\t{row / 119.88:.6f}\t{row}.25\t-0.05\t3.00\t\t\t" for row in range(4)]
 PLAIN = {

@@ -45,15 +45,6 @@ def test_demo_leaves_a_page_with_its_pictures(tmp_path: Path, capsys: pytest.Cap
     assert occluded > 75
 
 
-@pytest.mark.parametrize(("option", "value"), [("--num-frames", "0"), ("--seed", "-1")])
-def test_impossible_numbers_are_told(
-    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["demo", "--out", str(tmp_path / "demo"), option, value]) == 1
-    assert value in capsys.readouterr().err
-    assert not (tmp_path / "demo").exists()
-
-
 def test_page_escapes_what_it_shows(tmp_path: Path) -> None:
     section = Section(
         "a < b", "text", pictures=[("x.png", 'a "b" & c')], table=[["<i>"], ["1"]], notes=["<n>"]

@@ -80,10 +80,7 @@ def test_a_probe_tells_its_last_line_or_its_error() -> None:
     ],
 )
 def test_exit_code_and_report(
-    findings: list[Finding],
-    code: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    findings: list[Finding], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: findings)
     assert doctor.doctor() == code

@@ -128,27 +128,6 @@ def test_a_take_without_a_hand_is_refused(folder, tmp_path, capsys):
     assert "there is no hand in any frame, expected one to export" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("source", "out", "words"),
-    [
-        ("tracked.npz", "hands.fbx", ", ".join(ENDINGS)),
-        ("tracked.npz", "hands.onnx", "cannot write a take"),
-        ("dense19", "hands.glb", "expected a name that ends in .onnx; takes, which end in .npz, become .glb"),
-        ("user.json", "hand.xml", "user.json: cannot be read"),
-        ("missing.npz", "hands.glb", "cannot be read"),
-        ("tracked.npz", "tracked.npz", "expected a name that ends in"),
-    ],
-)
-def test_mistakes_are_one_line_and_leave_nothing(folder, source, out, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    given = str(folder / source) if (folder / source).exists() else source
-    assert main(["export", given, "--out", out]) == 1
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-    assert main(["export", str(folder / "tracked.npz"), "--out", "x.glb", "--fps", "0"]) == 1
-
-
 def test_an_output_that_is_the_take_is_refused(folder, tmp_path, capsys):
     link = tmp_path / "hands.glb"
     link.symlink_to(folder / "tracked.npz")

@@ -54,27 +54,6 @@ def test_mesh_is_the_skin(suffix: str, tmp_path: Path) -> None:
     assert loaded.volume > 0  # faces look outwards
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--out", "hand.txt"], "ends in .xml, .urdf, .osim, .glb"),
-        (["--mesh", "hand.fbx"], "ends in .glb, .obj, .ply, .stl"),
-        (["--glove", "dense18"], "did you mean 'dense19'?"),
-    ],
-)
-def test_mistakes_are_one_line_and_leave_nothing(
-    args: list[str],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["hand", *args]) == 1
-    assert words in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two people: a user of two calibrated hands, and a take of one left hand."""
@@ -130,33 +109,3 @@ def test_servos_go_where_they_are_told(tmp_path: Path, rng: np.random.Generator)
     for _ in range(500):  # a second
         mujoco.mj_step(opened, data)
     np.testing.assert_allclose(data.qpos[7:], goal, atol=0.02)  # fingers may touch
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (
-            ["--size", "S", "--shape", "user.json"],
-            "given --size S and --shape user.json, expected one of them",
-        ),
-        (["--take", "one.truth.npz", "--side", "right"], "unknown hand 'right'; valid names: left"),
-        (["--shape", "user.json", "--glove", "dense19"], "given --glove dense19 and --shape user.json"),
-        (["--out", "hand.urdf", "--actuators"], "expected an --out that ends in .xml with it"),
-        (["--out", "hand.osim", "--actuators"], "expected an --out that ends in .xml with it"),
-        (["--out", "hand.urdf", "--glove", "dense19"], "an --out that ends in .xml or .osim with it"),
-        (["--out", "hand.glb", "--mesh", "hand.glb"], "expected two files"),
-        (["--shape", "nobody.json"], "nobody.json: cannot be read"),
-    ],
-)
-def test_options_that_contradict_each_other(
-    args: list[str],
-    words: str,
-    files: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(files)
-    before = sorted(files.iterdir())
-    assert main(["hand", *args]) == 1
-    assert words in capsys.readouterr().err
-    assert sorted(files.iterdir()) == before

@@ -1,3 +1,5 @@
+"""None"""
+
 from __future__ import annotations
 
 import io
@@ -12,7 +14,7 @@ from typing import Any
 import pytest
 
 import handsim
-from handsim.cli.main import COMMANDS, main, run
+from handsim.cli.main import COMMANDS, load, main, run
 from handsim.errors import LayoutError
 from handsim.files.signals import Stopped
 
@@ -133,11 +135,7 @@ def test_a_returned_number_is_the_exit_code(invoke: Callable[..., int]) -> None:
     ],
 )
 def test_what_a_user_can_set_right_is_told_in_one_line(
-    error: BaseException,
-    code: int,
-    line: str,
-    invoke: Callable[..., int],
-    capsys: pytest.CaptureFixture[str],
+    error: BaseException, code: int, line: str, invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert invoke(raising(error)) == code
     err = capsys.readouterr().err
@@ -246,3 +244,42 @@ def test_completion_knows_commands_and_options(tmp_path: Path) -> None:
     assert complete("handsim", "track", "--si") == ["--size"]
     assert "list" in complete("handsim", "glove", "")
     assert shell("handsim --print-completion ksh").returncode == 2
+
+
+def helps() -> list[object]:
+    found = []
+    for name, (target, _) in COMMANDS.items():
+        command = load(target)
+        words = [[name, inner] for inner in command] if isinstance(command, dict) else []
+        found += [pytest.param(one, id=" ".join(one)) for one in [[name], *words]]
+    return found
+
+
+@pytest.mark.parametrize("words", helps())
+def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        main([*words, "--help"])
+    assert not stop.value.code
+    said = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert f"usage: handsim {words[0]}" in said
+    for odd in ("{None}", "None|", "(default: )", "(default: None)", "(fixed", "~T", "<class"):
+        assert odd not in said, odd
+
+
+LIGHT = (
+    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "report",
+    "track", "view",
+)  # fmt: skip
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from handsim.cli.main import main\n"
+        "for name in sys.argv[1:]:\n"
+        "    try: main([name, '--help'])\n"
+        "    except SystemExit: pass\n"
+        "    heavy = sorted(set(sys.modules) & {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib', 'cv2'})\n"
+        "    assert not heavy, (name, heavy)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, "--help", *LIGHT], capture_output=True, text=True, check=True)

@@ -37,23 +37,6 @@ def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
     assert ("mean hands of size M" in page) == (name == "tracked.npz")
 
 
-@pytest.mark.parametrize(
-    ("source", "out", "words"),
-    [
-        ("tracked.npz", "page.pdf", "--out is page.pdf, expected a file name that ends in .html"),
-        ("missing.npz", "page.html", "cannot be read"),
-        ("take.c3d", "page.html", "take.c3d"),
-    ],
-)
-def test_mistakes_are_one_line_and_leave_nothing(folder, source, out, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    given = str(folder / source) if (folder / source).exists() else source
-    assert main(["report", given, "--out", out]) == 1
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_output_that_is_the_take_is_refused(folder, tmp_path, capsys):
     link = tmp_path / "page.markers.csv"
     link.symlink_to(folder / "tracked.npz")

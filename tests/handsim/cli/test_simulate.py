@@ -88,27 +88,13 @@ def test_a_full_disk_leaves_no_half_pair(older, step, tmp_path, monkeypatch, cap
     assert left == before, "what was there stays"
 
 
-def test_the_optics_are_options_of_the_command(tmp_path, capsys):
+def test_the_optics_are_options_of_the_command(tmp_path):
     out = tmp_path / "take.c3d"
     command = ["simulate", "--num-frames", "20", "--out", str(out)]
     assert main([*command, "--optics.blob-loss", "0.9"]) == 0
     truth = load_take(out.with_suffix(".truth.npz"))
     assert truth.settings["room"]["optics"]["blob_loss"] == 0.9
     assert truth.markers_present().mean() < 0.8
-    capsys.readouterr()
-    assert main([*command, "--optics.noise", "-1"]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "noise is -1, expected a number of at least 0" in said
-
-
-@pytest.mark.parametrize("name", ["take.tsv", "take.npz", "take"])
-def test_another_suffix_is_refused_before_the_work(name, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    # An hour of frames would take minutes.
-    assert main(["simulate", "--num-frames", "432000", "--out", name]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and ".trc, .c3d" in said
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
@@ -128,29 +114,17 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
     assert found["frames"] == 2 * FRAMES
     assert found["figures"]["slot_accuracy"] > 0.8
     assert set(found["slot_accuracy_by_marker"]) == set(load_take(truth).hands[0].layout.names)
-    for option in (["--occlude", "3"], ["--ghosts", "1"], ["--every", "2"]):
-        assert main(["evaluate", str(truth), *option]) == 1
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1 and "leave out the corruption (--occlude" in said
     assert main(["evaluate", str(truth), str(truth)]) == 0
     assert "240 hands in frames" in capsys.readouterr().out
 
 
-def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
+def test_every_nth_frame_of_a_capture_is_evaluated(tmp_path):
     capture, figures = tmp_path / "capture.trc", tmp_path / "figures.json"
     markers = held_out_markers("dense19", 40, seed=0)
     write_capture(capture, Capture(load_layout("dense19").names, markers, 100.0))
     assert main(["evaluate", str(capture), "--every", "15", "--json", str(figures)]) == 0
     found = json.loads(figures.read_text())
     assert (found["every"], found["frames"]) == (15, 3)
-    assert main(["evaluate", str(capture), "--every", "0"]) == 1
-    assert "every is 0, expected at least 1" in capsys.readouterr().err
-
-
-def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):
-    assert main(["evaluate", str(taken.with_suffix(".truth.npz")), str(taken)]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and ".npz" in said
 
 
 def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
@@ -160,10 +134,3 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said
-
-
-def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):
-    assert main(["simulate", "--num-frames", "1000000000", "--out", str(tmp_path / "take.c3d")]) == 1
-    said = capsys.readouterr().err
-    assert "1000000000 frames need 20 TB of memory" in said and "shorter captures" in said
-    assert list(tmp_path.iterdir()) == []

@@ -35,7 +35,7 @@ from handsim.hand.skin import (
     vertex_normals,
 )
 from handsim.space.transforms import axis_angle_matrix, euler_matrix, random_quaternions
-from tests.handsim.hand.blending import blend_skin
+from tests.meshes import blend_skin, winding
 
 CUBE = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -245,20 +245,8 @@ def test_webs_lie_near_the_middle_of_the_first_phalanx():
             first[:3, 3] + places[:, None] * lengths[0] * first[:3, 0]
             + second[:3, 3] + places[:, None] * lengths[1] * second[:3, 0]
         )  # fmt: skip
-        crotch = places[np.argmin(_inside(mesh, between))]
+        crotch = places[np.argmin(winding(mesh, between) > 0.5)]
         assert 0.4 < crotch < 0.6, DIGITS[digit]
-
-
-def _inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Winding numbers say which points lie inside, without a ray engine."""
-    a, b, c = (mesh.triangles[:, i][None] - points[:, None] for i in range(3))
-    lengths = [np.linalg.norm(v, axis=-1) for v in (a, b, c)]
-    numerator = (a * np.cross(b, c)).sum(-1)
-    denominator = (
-        lengths[0] * lengths[1] * lengths[2]
-        + (a * b).sum(-1) * lengths[2] + (b * c).sum(-1) * lengths[0] + (c * a).sum(-1) * lengths[1]
-    )  # fmt: skip
-    return np.arctan2(numerator, denominator).sum(axis=1) / (2 * np.pi) > 0.5
 
 
 @pytest.mark.parametrize("size", ["XS", "M", "XL"])

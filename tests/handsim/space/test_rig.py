@@ -14,16 +14,10 @@ from hypothesis import strategies as st
 
 from handsim import CameraRig, HandModel, Population, join_qpos, load_rig, look_at, sample_shape
 from handsim.errors import ArgumentError, RigError
-from handsim.space.rig import (
-    HAND_REACH,
-    check_outside,
-    check_outside_volume,
-    list_rigs,
-    rig_setting,
-)
+from handsim.space.rig import HAND_REACH, check_outside, check_outside_volume, list_rigs, rig_setting
 from handsim.space.rig_formats import load_cameras
 from tests.rigs import mixed_rig, square_rig
-from tests.sentences import assert_names
+from tests.sentences import error_names
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"
@@ -258,9 +252,8 @@ def test_mistakes_in_a_file_are_told(tmp_path, case):
     path = tmp_path / "rig.toml"
     text, words = MISTAKES[case]
     path.write_text(text)
-    with pytest.raises(RigError) as told:
+    with error_names(RigError, f"{path} | {words}"):
         load_rig(path)
-    assert_names(told.value, f"{path} | {words}")
 
 
 @pytest.mark.parametrize(
@@ -272,9 +265,8 @@ def test_mistakes_in_a_file_are_told(tmp_path, case):
     ],
 )
 def test_unknown_rigs_are_told(name, words):
-    with pytest.raises(RigError) as told:
+    with error_names(RigError, words):
         load_rig(name)
-    assert_names(told.value, words)
 
 
 def test_binary_files_are_told(tmp_path):
@@ -289,13 +281,9 @@ def test_cameras_in_the_hand_are_refused():
     check_outside(rig, far)
     check_outside(rig, np.full((4, 3), np.nan))
     near = model.skin(join_qpos(np.zeros((1, 20)), position=rig.positions[2] + [0.0, 0.0, 0.04]))
-    with pytest.raises(
-        ArgumentError, match=r"camera 3 of rig 'six' is 0\.0\d+ m from the hand, expected at least 0.05 m"
-    ):
+    with error_names(ArgumentError, "camera 3 of rig 'six' is 0.0 | m from the hand | at least 0.05 m"):
         check_outside(rig, np.concatenate([far, near]))
-    with pytest.raises(
-        ArgumentError, match=r"camera 3 of rig 'six' is .* m from the pen, expected at least 3 m"
-    ):
+    with error_names(ArgumentError, "camera 3 of rig 'six' is | m from the pen, expected at least 3 m"):
         check_outside(
             CameraRig("six", [rig.cameras[number] for number in (3, 4, 0)]),
             [2.0, 0.0, 3.5],
@@ -307,10 +295,7 @@ def test_cameras_in_the_hand_are_refused():
 def test_cameras_in_the_volume_are_refused():
     rig = load_rig("six")
     check_outside_volume(rig, CENTER, 0.6)
-    with pytest.raises(
-        ArgumentError,
-        match=r"camera 5 of rig 'six' is 0.14 m from the space that wrists move in, expected at least 0.25 m",
-    ):
+    with error_names(ArgumentError, "camera 5 of rig 'six' is 0.14 m | wrists | at least 0.25 m"):
         check_outside_volume(rig, CENTER + [0.0, 0.44, 0.0], 0.5)
     with pytest.raises(ArgumentError, match=r"camera 1 of rig 'six' is 0 m from"):
         check_outside_volume(rig, CENTER, 2.0)

@@ -17,16 +17,7 @@ from handsim.errors import RigError
 from handsim.space import rig_formats
 from handsim.space.rig_formats import LabCamera, import_cameras, load_cameras, read_xml
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
-from tests.handsim.space.known_rig import (
-    MCAL,
-    PIXELS,
-    POINT,
-    POSITIONS,
-    QUALISYS,
-    XCP,
-    check,
-    written,
-)
+from tests.handsim.space.known_rig import MCAL, PIXELS, POINT, POSITIONS, QUALISYS, XCP, check, written
 from tests.rigs import mixed_rig
 
 KINDS = ("vicon", "qualisys", "server", "intri", "extri", "json", "nested")

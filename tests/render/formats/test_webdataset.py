@@ -43,11 +43,7 @@ def polynomial(kind: str, flat: np.ndarray, k: list[float]) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "lens",
-    [
-        Lens(),
-        Lens("brown", (0.1, -0.05, 0.01, -0.02, 0.03)),
-        Lens("fisheye", (0.05, -0.01, 0.004, -0.001)),
-    ],
+    [Lens(), Lens("brown", (0.1, -0.05, 0.01, -0.02, 0.03)), Lens("fisheye", (0.05, -0.01, 0.004, -0.001))],
 )
 def test_a_reader_projects_as_we_do(camera: Camera, lens: Lens, rng: np.random.Generator) -> None:
     bent = dataclasses.replace(camera, lens=lens)

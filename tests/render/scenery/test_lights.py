@@ -11,13 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from render import Backgrounds, SkinLook
-from render.scenery.lights import (
-    expose_for,
-    irradiance,
-    sample_lighting,
-    sample_surroundings,
-    surround,
-)
+from render.scenery.lights import expose_for, irradiance, sample_lighting, sample_surroundings, surround
 
 
 def test_lightings_are_plain_values_and_repeat() -> None:

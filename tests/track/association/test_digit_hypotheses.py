@@ -46,12 +46,7 @@ def digit_model(solver, qpos, missing):
     variance = np.full(19, SPREAD**2)
     seen = predict_markers(solver.hand, solver.on_part, qpos, target, prior, (0.01, 0.1), variance, SPREAD)
     return DigitModel(
-        prior,
-        seen,
-        variance,
-        peak_log_odds(variance, STRAYS),
-        np.zeros(19),
-        digit_ranges(solver.hand),
+        prior, seen, variance, peak_log_odds(variance, STRAYS), np.zeros(19), digit_ranges(solver.hand)
     )
 
 
@@ -90,13 +85,7 @@ def test_every_set_of_points_has_the_assignment_that_fits_best(hand, seed):
 def by_hand(solver, model_of_digit, points):
     """Score and labels of the best hypothesis, every one fitted with SciPy."""
     prediction, precision = np.empty(4), np.empty((4, 4))
-    digit_prior(
-        model_of_digit.joint_prior,
-        model_of_digit.predicted,
-        INDEX,
-        prediction,
-        precision,
-    )
+    digit_prior(model_of_digit.joint_prior, model_of_digit.predicted, INDEX, prediction, precision)
     posed, root = model_of_digit.predicted.qpos.copy(), np.linalg.cholesky(precision).T
     place = slice(7 + 4 * INDEX, 11 + 4 * INDEX)
 

@@ -144,10 +144,7 @@ PARTS = np.array([0, 0, 0, 1, 1, 1, -1])
 def candidates_of(points, assigned, evidence=12.0):
     evidences = np.broadcast_to(np.asarray(evidence, dtype=float), (len(points),)).copy()
     return find_candidates(
-        np.asarray(points, dtype=float),
-        evidences,
-        MarkerTable(PLACES, PARTS, np.array(assigned)),
-        2,
+        np.asarray(points, dtype=float), evidences, MarkerTable(PLACES, PARTS, np.array(assigned)), 2
     )
 
 

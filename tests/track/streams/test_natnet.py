@@ -1,8 +1,15 @@
-"""NatNet packets: what is packed is read, everything else is stepped over or refused, whatever the bytes."""
+"""NatNet: what is packed is read, everything else is refused, and the real client gets every frame."""
 
 from __future__ import annotations
 
+import functools
+import itertools
+import math
+import socket
 import struct
+import threading
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +17,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from track import StreamedFrame
+from gloves import Capture, Status, Take
+from handsim import HandSimError
+from handsim.errors import ArgumentError, CaptureError
+from handsim.space.objects import named_object
+from tests.sentences import error_names
+from tests.waiting import LONG, wait_for
+from track import LiveStream, ReplayServer, RigidTemplate, StreamedFrame, open_source
+from track.rigid_body import BodyTracker
+from track.streams import natnet
 from track.streams.natnet import (
     NEWEST,
     DamagedPacket,
     Kind,
+    PointStream,
     ServerInfo,
+    open_stream,
     pack,
     pack_connect,
     pack_frame,
@@ -24,6 +41,7 @@ from track.streams.natnet import (
     parse_server_info,
     unpack,
 )
+from train import simulate_take
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
 COUNTS = st.integers(0, 60)
@@ -178,8 +196,7 @@ def test_a_count_takes_no_memory():
 
 
 @pytest.mark.parametrize(
-    "info",
-    [ServerInfo("Motive", (3, 1), 1511, "239.255.42.99"), ServerInfo("a" * 255, (4, 1), 50000, None)],
+    "info", [ServerInfo("Motive", (3, 1), 1511, "239.255.42.99"), ServerInfo("a" * 255, (4, 1), 50000, None)]
 )
 def test_server_infos_are_read(info):
     kind, payload = unpack(pack_server_info(info))
@@ -191,3 +208,371 @@ def test_a_greeting_says_which_layout_is_wanted():
     kind, payload = unpack(pack_connect())
     assert kind == Kind.CONNECT and len(payload) == 270
     assert payload[:8] == b"handsim\0" and payload[265:269] == bytes((4, 1, 0, 0))
+
+
+LOOPBACK = "127.0.0.1"
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A server is waited for, however busy the machine is."""
+    monkeypatch.setattr(natnet, "_PATIENCE", LONG)
+
+
+def opened(url: str, **options: object) -> LiveStream:
+    """A server's frames in order; none is dropped, however busy the machine is."""
+    stream = LiveStream(open_stream(url), **options)  # type: ignore[arg-type]
+    stream.forgiven_until = math.inf
+    return stream
+
+
+@functools.cache
+def twin() -> Take:
+    return simulate_take(kind="hand-controller", num_frames=60, seed=5)
+
+
+class Puppet:
+    """A server that says what a test tells it to, and answers a greeting."""
+
+    def __init__(self, *infos: ServerInfo | bytes, deaf: int = 0) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOOPBACK, 0))
+        self.socket.settimeout(0.05)
+        self.url = f"natnet://{LOOPBACK}:{self.socket.getsockname()[1]}"
+        self.heard: list[int] = []
+        self._answers = [info if isinstance(info, bytes) else natnet.pack_server_info(info) for info in infos]
+        self._deaf, self._ended = deaf, threading.Event()
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
+
+    def _answer(self) -> None:
+        while not self._ended.is_set():
+            try:
+                packet, self.client = self.socket.recvfrom(4096)
+            except TimeoutError:
+                continue
+            self.heard.append(natnet.unpack(packet)[0])
+            if self.heard[-1] == Kind.CONNECT and len(self.heard) > self._deaf:
+                for answer in self._answers:
+                    self.socket.sendto(answer, self.client)
+
+    def say(self, packet: bytes) -> None:
+        self.socket.sendto(packet, self.client)
+
+    def __enter__(self) -> Puppet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.socket.close()
+
+
+def unicast(version: tuple[int, int]) -> ServerInfo:
+    return ServerInfo("puppet", version, 1511, None)
+
+
+def frame(number: int, version: tuple[int, int]) -> bytes:
+    points = np.array([[number, 0.0, 1.0]]) / 128.0
+    return natnet.pack_frame(StreamedFrame(number, number / 100.0, points, np.array([number])), version)
+
+
+@pytest.mark.parametrize("version", [(3, 0), (4, 0), (4, 1)])
+def test_a_take_arrives_whole(version):
+    take = twin()
+    with ReplayServer(take, version=version) as server, opened(server.url) as stream:
+        info = stream._frames.server
+        assert info.version == version and info.application == "handsim replay"
+        got = list(itertools.islice(stream, take.num_frames))
+        assert (stream.counts["damaged_packets"], stream.counts["late_frames"]) == (0, 0)
+    for number, one in enumerate(got):
+        there = np.isfinite(take.points[number, :, 0])
+        assert (one.number, one.silent) == (number, False)
+        assert one.time == pytest.approx(number / take.rate)
+        np.testing.assert_array_equal(one.points, np.float32(take.points[number, there]))
+        np.testing.assert_array_equal(one.ids, take.ids[number, there])
+
+
+def test_frames_are_played_at_their_rate(monkeypatch):
+    take, now = twin(), [50.0]
+    monkeypatch.setattr(natnet, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    with ReplayServer(take) as server, opened(server.url, silence=LONG) as stream:
+        assert next(stream).number == 0
+        for last in (1, 10, 11, 40):
+            now[0] = 50.0 + (last + 0.5) / take.rate
+            while next(stream).number < last:
+                pass
+            wait_for(lambda last=last: server.sent > last)
+            assert server.sent == last + 1, "those whose time has come"
+
+
+def test_a_body_is_tracked_live():
+    take = twin()
+    tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
+    with ReplayServer(take) as server, opened(server.url) as stream:
+        words = [
+            tracker.step(one.points, one.ids, one.time).status
+            for one in itertools.islice(stream, take.num_frames)
+        ]
+    assert words == [Status.INITIALIZED] + [Status.TRACKED] * (take.num_frames - 1)
+
+
+def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
+    positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
+    positions[1, 0] = np.nan
+    with ReplayServer(Capture(("a", "b"), positions, 100.0)) as server, opened(server.url) as stream:
+        ids = [list(one.ids) for one in itertools.islice(stream, 4)]
+    assert ids == [[0, 1], [1], [2, 1], [2, 1]]
+
+
+def test_a_stream_that_stops_says_so():
+    take = twin()
+    server = ReplayServer(SimpleNamespace(points=take.points[:3], ids=take.ids[:3], rate=take.rate))
+    with server, opened(server.url, silence=0.2) as stream:
+        wait_for(lambda: server.finished)
+        got = list(itertools.islice(stream, 5))
+    assert [one.silent for one in got] == [False] * 3 + [True] * 2
+    assert got[3].number == 2 and got[2].time < got[3].time < got[4].time
+    assert got[3].points.shape == (0, 3) and got[3].ids.shape == (0,)
+
+
+def test_bad_packets_are_counted_and_left_out():
+    rng = np.random.default_rng(0)
+    with Puppet(unicast((4, 0))) as server, opened(server.url, silence=LONG) as stream:
+        for number in range(20):
+            packet = frame(number, (4, 0))
+            for bad in (
+                packet[: rng.integers(len(packet))],
+                rng.bytes(rng.integers(1, 300)),
+                natnet.pack(Kind.FRAME, rng.bytes(200)),
+                natnet.pack(Kind.SERVER_INFO, b"short"),
+            ):
+                server.say(bad)
+            server.say(natnet.pack(Kind.KEEP_ALIVE))  # good, but no frame
+            server.say(packet)
+        got = list(itertools.islice(stream, 20))
+    assert [one.number for one in got] == list(range(20))
+    assert stream.counts["damaged_packets"] >= 60
+
+
+def test_only_bad_packets_are_silence():
+    with Puppet(unicast((4, 0))) as server, opened(server.url, silence=0.3) as stream:
+        ended = threading.Event()
+
+        def babble() -> None:
+            while not ended.wait(0.005):
+                server.say(b"\x07\x00\xff\xff?")
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        while stream.counts["damaged_packets"] <= 10:
+            assert next(stream).silent
+        ended.set()
+        thread.join()
+
+
+def test_frames_out_of_order_are_left_out_but_a_take_may_start_again():
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        for number in (500, 501, 501, 500, 502, 503, 504, 0, 1, 2, 3, 4):
+            server.say(frame(number, (4, 1)))
+        got = list(itertools.islice(stream, 10))
+    assert [one.number for one in got] == [500, 501, 502, 503, 504, 0, 1, 2, 3, 4]
+    assert stream.counts["doubled_frames"] == 2
+
+
+@pytest.mark.parametrize(("said", "spoken"), [((4, 1), (3, 1)), ((3, 1), (4, 1)), ((4, 7), (4, 1))])
+def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, spoken):
+    with Puppet(unicast(said)) as server, opened(server.url, silence=LONG) as stream:
+        for number in range(3):
+            server.say(frame(number, spoken))
+        assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+        assert stream.counts["damaged_packets"] == 0
+
+
+def test_packets_of_others_are_not_heard():
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            try:
+                stranger.bind(("127.0.0.2", 0))
+            except OSError:
+                pytest.skip("this machine has one loopback address only")
+            stranger.sendto(frame(9, (4, 1)), server.client)
+        server.say(frame(10, (4, 1)))
+        assert next(stream).number == 10
+
+
+def test_the_client_listens_on_loopback_only_and_takes_leave():
+    with Puppet(unicast((4, 1)), deaf=1) as server:
+        with opened(server.url) as stream:
+            assert server.client[0] == LOOPBACK
+            assert stream._frames._sockets[0].getsockname()[0] == LOOPBACK
+        assert list(stream) == []
+        wait_for(lambda: server.heard[-1] == Kind.DISCONNECT)
+        calls = server.heard[:-1]
+        assert len(calls) >= 2 and set(calls) == {Kind.CONNECT}, "called again, as it was deaf once"
+
+
+def frames(stream: PointStream) -> list[int]:
+    """The numbers of the frames that arrive."""
+    arrived: list[int] = []
+    wait_for(lambda: arrived.extend(one.number for one in stream.poll(0.05)) or bool(arrived))
+    return arrived
+
+
+def test_a_quiet_server_is_greeted_anew(monkeypatch):
+    now = [50.0]
+    monkeypatch.setattr(natnet, "_KEEP_ALIVE", 0.1)
+    monkeypatch.setattr(natnet, "_ATTENDED", 0.01)
+    monkeypatch.setattr(natnet, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    with Puppet(unicast((4, 1))) as server:
+        stream = open_stream(server.url)
+        for heard in (2, 4, 6):
+            stream._heard = 0.0  # long ago
+            now[0] += 0.11
+            wait_for(lambda heard=heard: len(server.heard) == 1 + heard)
+            server.say(natnet.pack(Kind.KEEP_ALIVE))  # good, but no frame
+            server.say(frame(heard, (4, 1)))
+            assert frames(stream) == [heard]
+        assert server.heard == [Kind.CONNECT, *[Kind.KEEP_ALIVE, Kind.CONNECT] * 3]
+        server.heard.clear()
+        for number in range(10):
+            server.say(frame(10 + number, (4, 1)))
+            assert frames(stream) == [10 + number]
+            now[0] += 0.03
+        wait_for(lambda: server.heard)
+        stream.close()
+        wait_for(lambda: server.heard[-1:] == [Kind.DISCONNECT])
+    assert set(server.heard[:-1]) == {Kind.KEEP_ALIVE}
+
+
+def test_multicast_is_heard_on_loopback():
+    group = "239.255.42.98"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((LOOPBACK, 0))
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
+        port = sender.getsockname()[1]  # servers send from their data port
+        with Puppet(ServerInfo("puppet", (4, 1), port, group)) as server:
+            try:
+                stream = opened(server.url, silence=LONG)
+                sender.sendto(frame(0, (4, 1)), (group, port))
+            except (CaptureError, OSError):
+                pytest.skip("no multicast on this machine's loopback")
+            with stream:
+                sender.sendto(frame(1, (4, 1)), (group, port))
+                assert [one.number for one in itertools.islice(stream, 2)] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
+     "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
+)  # fmt: skip
+def test_addresses_that_are_none_are_told(url):
+    with pytest.raises(ArgumentError, match=r"natnet://host|a port from 1 to 65535"):
+        open_source(url)
+
+
+def test_servers_that_cannot_be_used_are_told(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(natnet, "_PATIENCE", 0.2)
+        patch.setattr(natnet, "_RETRY", 0.1)
+        with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers; in Motive"):
+            opened(server.url)
+        with (
+            Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
+            pytest.raises(CaptureError, match="no Nat"),
+        ):
+            opened(server.url)
+    with (
+        Puppet(unicast((2, 10))) as server,
+        pytest.raises(CaptureError, match=r"speaks NatNet 2\.10, expected 3\.0"),
+    ):
+        opened(server.url)
+    with (
+        Puppet(ServerInfo("x", (4, 1), 1511, "10.0.0.1")) as server,
+        pytest.raises(CaptureError, match=r"10\.0\.0\.1"),
+    ):
+        opened(server.url)
+    with pytest.raises(CaptureError, match="cannot be reached"):
+        open_stream("natnet://no-such-host.invalid")
+    with pytest.raises(CaptureError, match="cannot be reached"):
+        open_stream("natnet://127.0.0.1", local="192.0.2.7")
+
+
+def test_what_cannot_be_replayed_is_told():
+    points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
+    for arguments, options, words in (
+        ((points, ids[:1], 100.0), {}, "expected (T, N, 3) and (T, N)"),
+        ((points, ids, 100.0), {"rate": 0.0}, "rate is 0, expected a number above 0"),
+        ((points, ids, 100.0), {"version": (2, 9)}, "unknown NatNet version '2.9'"),
+        ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
+    ):  # fmt: skip
+        with error_names(HandSimError, words):
+            ReplayServer(
+                SimpleNamespace(**dict(zip(("points", "ids", "rate"), arguments, strict=True))), **options
+            )
+    with ReplayServer(Capture(("a",), points[:, :1], 100.0)) as server:
+        port = int(server.url.rpartition(":")[2])
+        with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
+            ReplayServer(Capture(("a",), points[:, :1], 100.0), port=port)
+
+
+def test_only_the_server_s_ports_are_heard():
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.bind((LOOPBACK, 0))
+            for number in range(5):
+                stranger.sendto(frame(900 + number, (4, 1)), server.client)
+        for number in range(3):
+            server.say(frame(number, (4, 1)))
+        assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+        assert stream.counts["foreign_packets"] == 5
+
+
+def test_the_port_for_data_is_the_server_s_too():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as data:
+        data.bind((LOOPBACK, 0))
+        info = ServerInfo("puppet", (4, 1), data.getsockname()[1], None)
+        with Puppet(info) as server, opened(server.url, silence=LONG) as stream:
+            for number in range(3):
+                data.sendto(frame(number, (4, 1)), server.client)
+            assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+
+
+def test_one_wild_time_does_not_end_a_stream():
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        for number in range(20):
+            for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
+                server.say(
+                    natnet.pack_frame(StreamedFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1))
+                )
+            server.say(frame(number, (4, 1)))
+        got = list(itertools.islice(stream, 20))
+        stream.end()
+        assert not [one.number for one in stream]
+        assert [one.number for one in got] == list(range(20))
+        assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
+
+
+def test_a_stream_ends_while_frames_arrive():
+    ended = threading.Event()
+    with (
+        ReplayServer(twin(), rate=1000.0, loop=True) as server,
+        opened(server.url, ended=ended.is_set) as stream,
+    ):
+        list(itertools.islice(stream, 10))
+        ended.set()
+        end = time.monotonic() + LONG
+        assert all(time.monotonic() < end for _ in stream)
+
+
+def test_a_stream_ends_when_it_is_told_to():
+    ended = threading.Event()
+    with Puppet(unicast((4, 1))) as server, opened(server.url, ended=ended.is_set, silence=1.0) as stream:
+        for number in (0, 1, 3):  # the last one is held, because one is missing before it
+            server.say(frame(number, (4, 1)))
+        got = [next(stream), next(stream)]
+        threading.Timer(0.3, ended.set).start()
+        rest = list(itertools.islice(stream, round(LONG)))
+        assert len(rest) < LONG, "it goes on"
+        assert [one.number for one in (*got, *rest) if not one.silent] == [0, 1, 3]

@@ -10,6 +10,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from handsim.errors import ArgumentError, DatasetError
+from tests.sentences import error_names
 from train import CloudStream, Corruption, Dataset, generate_dataset
 
 
@@ -72,9 +73,8 @@ def test_a_corruption_of_ones_own_may_be_a_function(dataset):
     ],
 )
 def test_mistakes_are_told(dataset, options, sentence):
-    with pytest.raises(ArgumentError) as error:
+    with error_names(ArgumentError, sentence):
         CloudStream(**{"dataset": dataset, **options})
-    assert sentence in str(error.value)
 
 
 def test_a_folder_that_is_no_set_is_told(tmp_path):

@@ -132,7 +132,7 @@ def test_a_damaged_file_is_learned_anew(quickly_learned):
 
 @pytest.mark.slow
 def test_the_least_recently_used_go(quickly_learned, monkeypatch):
-    monkeypatch.setattr(layout_labeler, "MOST", 1)
+    monkeypatch.setattr(layout_labeler, "MAX_KEPT", 1)
     for name in ("starter6", "tips8"):
         learned_labeler(load_layout(name))
     assert not is_learned(load_layout("starter6")) and is_learned(load_layout("tips8"))

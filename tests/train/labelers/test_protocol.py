@@ -14,11 +14,7 @@ from train.labelers.storage import OnnxLabeler, export_onnx
 NAMES = tuple(f"marker{number}" for number in range(19))
 
 
-CONFIGS = {
-    "set": SetLabelerConfig(),
-    "cnn": CNNConfig(),
-    "cnn, random views": CNNConfig(views="random"),
-}
+CONFIGS = {"set": SetLabelerConfig(), "cnn": CNNConfig(), "cnn, random views": CNNConfig(views="random")}
 
 
 @pytest.fixture(scope="module", params=[*CONFIGS, "set, onnx", "cnn, onnx"])

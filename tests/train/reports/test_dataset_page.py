@@ -74,10 +74,10 @@ def test_ghosts_are_counted_and_measured_to_the_nearest_marker(rows):
     np.testing.assert_allclose(report.ghost_distances(rows), [0.013, 0.005, 0.020], rtol=1e-6)
 
 
-def test_nearest_neighbors(rows, monkeypatch):
-    monkeypatch.setattr(report, "_CHUNK", 3)  # the last frame comes in a part of its own
-    apart = report.neighbor_distances(rows)
-    np.testing.assert_allclose(apart, [[0.03, 0.03, 0.04]] * 3 + [[0.01, 0.01, 0.06]], rtol=1e-6)
+def test_nearest_neighbors(rows):
+    apart = report.neighbor_distances(np.tile(rows, 300))  # in several parts
+    expected = [[0.03, 0.03, 0.04]] * 3 + [[0.01, 0.01, 0.06]]
+    np.testing.assert_allclose(apart, np.tile(expected, (300, 1)), rtol=1e-6)
 
 
 def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_path):

@@ -23,13 +23,7 @@ from handsim.errors import ArgumentError, DatasetError
 from handsim.files.signals import Stopped
 from render import RenderConfig, render_take
 from render.session import left_out_frames
-from tests.handsim.app.object_stores.stored_set import (
-    CONFIG,
-    contents,
-    copied,
-    names,
-    write_three,
-)
+from tests.handsim.app.object_stores.stored_set import CONFIG, contents, copied, names, write_three
 from train import Dataset
 from train.data.shards import MANIFEST, array_bytes, row_dtype, rows_name, save_array
 from train.simulation.generation import make_dataset

@@ -17,6 +17,7 @@ from gloves import load_layout
 from gloves.fit import nominal_fit
 from handsim.errors import ArgumentError
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
+from tests.sentences import error_names
 from track.live_message import FORMATS, document_format, frame_document, header_document
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
@@ -24,12 +25,7 @@ DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
 @pytest.mark.parametrize("name", FORMATS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    number=st.integers(0, 2**40),
-    seed=st.integers(0, 99),
-    lost=st.booleans(),
-    points=st.integers(0, 9),
-)
+@given(number=st.integers(0, 2**40), seed=st.integers(0, 99), lost=st.booleans(), points=st.integers(0, 9))
 def test_a_frame_comes_back(name, message, number, seed, lost, points):
     one = message(number, seed=seed, lost=lost, points=points)
     there = DECODE[name](document_format(name, points=True).frame(one))
@@ -74,15 +70,13 @@ def test_a_frame_of_two_hands_takes_three_kilobytes(message):
 
 def test_a_missing_package_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "msgpack", None)
-    with pytest.raises(
-        ArgumentError, match=r"format=msgpack needs the package msgpack.*pip install 'handsim\[send\]'"
-    ):
+    with error_names(ArgumentError, "format=msgpack needs the package msgpack | pip install 'handsim[send]'"):
         document_format("msgpack")
 
 
 def test_the_page_shows_what_is_sent(message):
     """Keys and kinds of values in docs/live_output.md are those of real documents."""
-    page = Path(__file__).parents[3] / "docs" / "live_output.md"
+    page = Path(__file__).parents[2] / "docs" / "live_output.md"
     shown = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", page.read_text(), re.DOTALL)]
     one = message(lost=True)
     header, frame = header_document(one.header), frame_document(one)

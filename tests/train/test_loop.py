@@ -105,8 +105,7 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
 
 def test_a_loss_that_is_no_number_ends_the_run(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "train.loop.batch_loss",
-        lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True),
+        "train.loop.batch_loss", lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True)
     )
     with pytest.raises(TrainingError, match=r"the loss is nan after 32 samples; .* below 0.002"):
         train_labeler(dataset, tmp_path / "run", CONFIG)

@@ -1,0 +1,555 @@
+"""Sinks over real sockets: addresses, OSC and documents, the Lab Streaming Layer, and WebSocket clients."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgpack
+import numpy as np
+import pytest
+from pythonosc.dispatcher import Dispatcher
+from pythonosc.osc_bundle import OscBundle
+from pythonosc.osc_server import BlockingOSCUDPServer
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from gloves import Status, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandSimError, HandSimWarning
+from handsim.errors import ArgumentError
+from tests.sentences import error_names
+from tests.waiting import LONG, wait_for
+from track import SinkGroup, StreamedFrame, TrackedFrame, TrackedHand, open_sinks, sinks
+from track.sinks import VALID, channels_of, open_sink, osc_format, sample_of
+
+SOURCE = """
+class Counter:
+    sent, closed = [], False
+    def __init__(self, step="1"):
+        self.step = int(step)
+    def send(self, message):
+        Counter.sent.append(message.number * self.step)
+    def close(self):
+        Counter.closed = True
+
+class NoSink:
+    pass
+
+class Failing(Counter):
+    def send(self, message):
+        raise ValueError("not today")
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    (tmp_path / "own_sinks.py").write_text(SOURCE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    sys.modules.pop("own_sinks", None)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name", "localhost:9000", "a b:c",
+     "ws:8765", "9module:name"],
+)  # fmt: skip
+def test_what_is_no_address_is_told_with_the_valid_ones(address):
+    with pytest.raises(ArgumentError) as caught:
+        open_sink(address)
+    assert str(caught.value) == f"'{address}' is not an address to send to, expected {', '.join(VALID)}"
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("osc://localhost", "expected osc://host:port"),
+        ("osc://localhost:0", "expected a port from 1 to 65535"),
+        ("ws://localhost:99999", "expected ws://host:port"),
+        ("udp://localhost:9000/path", "expected udp://host:port"),
+        ("udp://user@localhost:9000", "expected udp://host:port"),
+        ("udp://localhost:9000?format", "expected udp://host:port"),
+        ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
+        ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?); valid names: format, points"),
+        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format', there are none"),
+    ],
+)
+def test_wrong_parts_are_told(address, words):
+    with error_names(ArgumentError, words):
+        open_sink(address)
+
+
+@pytest.mark.parametrize(("address", "package"), [("ws://:0", "websockets"), ("lsl:hands", "pylsl")])
+def test_a_missing_package_is_told(address, package, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ArgumentError) as caught:
+        open_sink(address)
+    assert f"needs the package {package}" in str(caught.value)
+    assert "run `pip install 'handsim[send]'`" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_sink_of_the_user_s_own(own, message):
+    with open_sinks(["own_sinks:Counter?step=3"]) as sinks:
+        import own_sinks
+
+        (sink,) = sinks._sinks.values()
+        for number in range(3):
+            sink.send(message(number))
+    assert own_sinks.Counter.sent == [0, 3, 6] and own_sinks.Counter.closed
+
+
+def test_what_is_no_sink_is_told(own):
+    with pytest.raises(ArgumentError, match="own_sinks:NoSink has no method send, expected the methods"):
+        open_sink("own_sinks:NoSink")
+    with pytest.raises(ArgumentError, match=r"does not take the arguments \(, stop=...\)|unexpected keyword"):
+        open_sink("own_sinks:Counter?stop=1")
+    with pytest.raises(HandSimError, match="ValueError: invalid literal"):
+        open_sink("own_sinks:Counter?step=x")
+    with pytest.raises(ArgumentError, match="No module named 'no_such_module'"):
+        open_sink("no_such_module:Sink")
+
+
+def test_an_address_twice_and_a_bad_one_leave_nothing_open():
+    with pytest.raises(ArgumentError, match="osc://:9000 is given twice"):
+        open_sinks(["osc://:9000", "osc://:9000"])
+    first = open_sink("ws://:0")
+    port = first.port
+    first.close()
+    with pytest.raises(ArgumentError):
+        open_sinks([f"ws://:{port}", "nonsense"])
+    open_sink(f"ws://:{port}").close()  # the port is free again
+
+
+class Keeper:
+    def __init__(self, fails: int | None = None, dropped: int = 0) -> None:
+        self.got, self.closed, self.fails, self.dropped = [], 0, fails, dropped
+
+    def send(self, message):
+        if message.number == self.fails:
+            raise RuntimeError("full")
+        self.got.append(message)
+
+    def close(self):
+        self.closed += 1
+        if self.fails is not None:
+            raise OSError("gone")
+
+
+def frame(number: int):
+    lost = np.full(27, np.nan)
+    hand = TrackedHand("right", Status.LOST, lost, np.nan, np.zeros((19, 3)), np.zeros(0, dtype=int))
+    points = np.zeros((0, 3))
+    none = np.zeros(0, dtype=int)
+    return StreamedFrame(number, number / 100, points, none), TrackedFrame(0.0, (hand,), none, none)
+
+
+def test_a_sink_that_fails_is_told_and_left_out():
+    good, bad = Keeper(dropped=3), Keeper(fails=2)
+    hands = [nominal_fit(load_layout("dense19"), "M", "right")]
+    with SinkGroup({"good": good, "bad": bad}) as sinks:
+        sinks.start(hands, ())
+        with pytest.warns(HandSimWarning) as told:
+            for number in range(5):
+                sinks.send(*frame(number))
+        assert [str(one.message) for one in told] == [
+            "bad failed and gets no further frame (RuntimeError: full)",
+            "bad could not be closed (OSError: gone)",
+        ]
+        assert sinks.notes() == ("5 frames sent to good", "good: 3 frames dropped")
+    assert [one.number for one in good.got] == list(range(5)) and len(bad.got) == 2
+    assert good.got[0].header is good.got[-1].header
+    assert (good.closed, bad.closed) == (1, 1)
+
+
+def test_nothing_is_sent_before_the_tracker_is_there():
+    keeper = Keeper()
+    with SinkGroup({"keeper": keeper}) as sinks:
+        sinks.send(*frame(0))
+        assert sinks and not sinks.notes()
+    assert not keeper.got and not SinkGroup({})
+
+
+ENCODER = osc_format()
+
+
+@pytest.fixture
+def receiver():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        one.settimeout(LONG)
+        yield one
+
+
+def test_frames_reach_an_osc_server(message):
+    heard, dispatcher = [], Dispatcher()
+    dispatcher.set_default_handler(lambda address, *values: heard.append((address, values)))
+    with BlockingOSCUDPServer(("127.0.0.1", 0), dispatcher) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        sink = open_sink(f"osc://localhost:{server.server_address[1]}")
+        for number in range(20):
+            sink.send(message(number))
+        sink.close()
+        wait_for(lambda: sum(address == "/handsim/frame" for address, _ in heard) == 20)
+        server.shutdown()
+    frames = [values[0] for address, values in heard if address == "/handsim/frame"]
+    assert frames == list(range(20)) and heard[0] == ("/handsim/schema", (1,))
+    assert len(next(values for address, values in heard if address == "/handsim/left/angles")) == 20
+
+
+@pytest.mark.parametrize(("query", "decode"), [("", json.loads), ("?format=msgpack", msgpack.unpackb)])
+def test_documents_reach_a_socket(query, decode, receiver, message):
+    sink = open_sink(f"udp://:{receiver.getsockname()[1]}{query}")
+    for number in range(3):
+        sink.send(message(number))
+    got = [decode(receiver.recv(65536)) for _ in range(4)]
+    assert got[0]["type"] == "header" and [one["number"] for one in got[1:]] == [0, 1, 2]
+    assert "points" not in got[1]
+    sink.close()
+
+
+def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
+    now = [50.0]
+    monkeypatch.setattr(sinks, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    sink = open_sink(f"udp://127.0.0.1:{receiver.getsockname()[1]}?points=yes")
+    for number in range(8):
+        sink.send(message(number))
+        now[0] += 0.25
+    got = [json.loads(receiver.recv(65536)) for _ in range(10)]
+    assert [one["type"] for one in got] == ["header", *["frame"] * 4] * 2
+    assert len(got[1]["points"]) == len(got[1]["labels"]) == 5
+    sink.close()
+
+
+def test_nobody_listening_is_no_error_and_too_much_is_counted(receiver, message):
+    port = receiver.getsockname()[1]
+    receiver.close()
+    sink = open_sink(f"udp://127.0.0.1:{port}?points=yes")
+    for number in range(5):
+        sink.send(message(number))
+    assert sink.dropped == 0
+    sink.send(message(5, points=5000))  # no datagram holds it
+    assert sink.dropped == 1
+    sink.close()
+
+
+def test_an_unknown_host_is_told():
+    with pytest.raises(ArgumentError, match=r"host 'no-such-host\.invalid' cannot be sent to"):
+        open_sink("osc://no-such-host.invalid:9000")
+
+
+def read(datagram: bytes) -> dict[str, list]:
+    assert OscBundle.dgram_is_bundle(datagram)
+    return {one.address: list(one.params) for one in OscBundle(datagram)}
+
+
+def test_a_frame(message):
+    one = message(7)
+    got = read(ENCODER.frame(one))
+    assert got.pop("/handsim/frame") == [7, one.time, 0]
+    for hand in one.hands:
+        assert got.pop(f"/handsim/{hand.side}/status") == ["tracked"]
+        wrist = [*hand.position, *hand.quaternion]
+        np.testing.assert_array_equal(got.pop(f"/handsim/{hand.side}/wrist"), np.float32(wrist))
+        np.testing.assert_array_equal(got.pop(f"/handsim/{hand.side}/angles"), np.float32(hand.angles))
+        positions = np.reshape(got.pop(f"/handsim/{hand.side}/positions"), (21, 3))
+        np.testing.assert_array_equal(positions, np.float32(hand.positions))
+    assert got.pop("/handsim/body/mug/status") == ["tracked"]
+    np.testing.assert_allclose(got.pop("/handsim/body/mug/pose"), [0.1, 0.2, 0.3, 1, 0, 0, 0], rtol=1e-6)
+    assert not got
+
+
+def test_of_a_lost_hand_only_the_status_is_sent(message):
+    got = read(ENCODER.frame(message(lost=True)))
+    assert got["/handsim/left/status"] == got["/handsim/body/mug/status"] == ["lost"]
+    assert [address for address in got if "left" in address or "mug" in address] == [
+        "/handsim/left/status",
+        "/handsim/body/mug/status",
+    ]
+
+
+def test_the_names(message):
+    header = message().header
+    got = read(ENCODER.header(header))
+    assert got["/handsim/schema"] == [1] and got["/handsim/sides"] == ["right", "left"]
+    assert got["/handsim/angles"] == list(header.angles)
+    assert got["/handsim/positions"] == list(header.positions)
+    assert got["/handsim/bodies"] == ["mug"]
+
+
+def test_names_of_bodies_become_parts_of_addresses(message):
+    one = message()
+    odd = dataclasses.replace(one.bodies[0], name="my pen #2/ä")
+    got = read(ENCODER.frame(dataclasses.replace(one, bodies=(odd,))))
+    assert "/handsim/body/my_pen__2__/status" in got
+
+
+def test_a_late_number_is_one_of_osc_s(message):
+    assert read(ENCODER.frame(message(2**31 + 5)))["/handsim/frame"][0] == 5
+
+
+def test_two_hands_fit_into_one_packet_of_ethernet(message):
+    assert len(ENCODER.frame(message())) < 1472
+
+
+def test_every_channel_has_a_name_and_a_unit(message):
+    one = message(5)
+    channels = list(channels_of(one.header))
+    sample = dict(zip([channel.label for channel in channels], sample_of(one), strict=True))
+    assert len(sample) == len(channels), "no name twice"
+    assert (sample["frame"], sample["time"]) == (5, one.time)
+    assert sample["left_wrist_position_y"] == one.hands[1].position[1]
+    assert (
+        sample["right_index_PIP_flexion"] == one.hands[0].angles[one.header.angles.index("index_PIP_flexion")]
+    )
+    assert sample["right_ring_tip_z"] == one.hands[0].positions[one.header.positions.index("ring_tip"), 2]
+    units = {channel.label: channel.unit for channel in channels}
+    assert units["right_index_PIP_flexion"] == "radians" and units["mug_position_x"] == "meters"
+
+
+def test_a_lost_hand_is_nan(message):
+    one = message(lost=True)
+    labels = [channel.label for channel in channels_of(one.header)]
+    sample = sample_of(one)
+    assert sample[labels.index("left_status")] == 3.0
+    left = [label.startswith(("left_", "mug_", "lag")) and not label.endswith("status") for label in labels]
+    assert np.isnan(sample[left]).all(), "and it did not come live"
+    assert np.isfinite(sample[~np.array(left)]).all()
+
+
+def test_an_inlet_gets_samples_and_the_description(message, tmp_path):
+    """In a process of its own: the library reads its configuration once; this one stays on the machine."""
+    settings = tmp_path / "lsl_api.cfg"
+    settings.write_text(
+        "[multicast]\nResolveScope = machine\n[lab]\nKnownPeers = {127.0.0.1}\n[log]\nlevel = -3\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    code = """
+import json
+import pylsl
+from tests.track.conftest import make_message
+from track.sinks import open_sink
+sink = open_sink("lsl:hands")
+sink.send(make_message(0))
+(info,) = pylsl.resolve_byprop("name", "hands", timeout=120.0)
+inlet = pylsl.StreamInlet(info)
+inlet.open_stream(timeout=120.0)
+for number in range(1, 6):
+    sink.send(make_message(number))
+samples = [inlet.pull_sample(timeout=120.0)[0] for _ in range(5)]
+described = inlet.info(timeout=120.0)
+labels, units = described.get_channel_labels(), described.get_channel_units()
+print(json.dumps([samples, labels, units, described.type(), described.desc().child_value("schema")]))
+sink.close()
+"""
+    environment = {**os.environ, "LSLAPICFG": str(settings), "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    samples, labels, units, kind, schema = json.loads(done.stdout.splitlines()[-1])
+    assert [sample[0] for sample in samples] == [1, 2, 3, 4, 5] and (kind, schema) == ("MoCap", "1")
+    channels = list(channels_of(message().header))
+    assert labels == [channel.label for channel in channels]
+    assert [unit or "" for unit in units] == [channel.unit for channel in channels]
+    np.testing.assert_array_equal(samples[-1], sample_of(message(5)))
+
+
+@pytest.fixture
+def sink():
+    one = open_sink("ws://:0")
+    yield one
+    one.close()
+
+
+def url(sink) -> str:
+    return f"ws://127.0.0.1:{sink.port}"
+
+
+def received(client, count: int) -> list[dict]:
+    return [json.loads(client.recv(timeout=LONG)) for _ in range(count)]
+
+
+def test_clients_get_the_header_and_every_frame(sink, message):
+    with connect(url(sink)) as one, connect(url(sink)) as two:
+        wait_for(lambda: sink.num_clients == 2)
+        for number in range(100):
+            sink.send(message(number))
+        for client in (one, two):
+            header, *frames = received(client, 101)
+            assert header["type"] == "header" and [frame["number"] for frame in frames] == list(range(100))
+    assert sink.dropped == 0
+    wait_for(lambda: sink.num_clients == 0)
+
+
+def test_a_late_client_gets_the_header_first(sink, message):
+    with connect(url(sink)) as early:
+        wait_for(lambda: sink.num_clients == 1)
+        for number in range(10):
+            sink.send(message(number))
+        received(early, 11)
+        with connect(url(sink)) as late:
+            wait_for(lambda: sink.num_clients == 2)
+            sink.send(message(10))
+            header, frame = received(late, 2)
+    assert header["type"] == "header" and frame["number"] == 10
+    assert header["angles"][0] == "thumb_CMC_abduction"
+
+
+def test_a_slow_client_loses_frames_and_delays_nobody(message):
+    """It reads nothing at all: sending goes on, and the other client gets everything."""
+    sink = open_sink("ws://:0?points=yes")
+    slow = raw_client(sink.port)
+    with connect(url(sink)) as quick:
+        wait_for(lambda: sink.num_clients == 2)
+        got: list[str] = []
+        reader = threading.Thread(target=lambda: got.extend(read_until_closed(quick)))
+        reader.start()
+        frame, sent = message(0, points=800), 0  # large: they soon fill the system's buffers
+        while sink.dropped < 50 and sent < 5000:
+            sink.send(frame)
+            sent += 1
+            wait_for(lambda least=sent - sinks._WAITING // 2: len(got) > least)
+        assert sink.dropped >= 50, "the slow client lost frames"
+        wait_for(lambda: len(got) == sent + 1)
+        slow.close()
+        sink.close()
+        reader.join()
+
+
+def read_until_closed(client):
+    try:
+        while True:
+            yield client.recv()
+    except ConnectionClosed:
+        return
+
+
+def raw_client(port: int, origin: str = "") -> socket.socket:
+    """A client that has shaken hands and reads no further."""
+    one = socket.socket()
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    one.connect(("127.0.0.1", port))
+    one.sendall(
+        f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n{origin}\r\n".encode()
+    )
+    assert one.recv(13) == b"HTTP/1.1 101 "
+    return one
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [
+        b"\x00" * 64,
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"POST /x HTTP/1.1\r\nHost: a\r\n\r\n",
+        b"\xff" * 20000,
+        b"GET ",
+    ],
+)
+def test_junk_is_refused_and_says_nothing(junk, sink, message, caplog, capfd):
+    with caplog.at_level(logging.DEBUG), connect(url(sink)) as client:
+        wait_for(lambda: sink.num_clients == 1)
+        with socket.create_connection(("127.0.0.1", sink.port)) as stranger:
+            stranger.sendall(junk)
+            time.sleep(0.05)
+        sink.send(message(3))
+        assert received(client, 2)[1]["number"] == 3
+    assert capfd.readouterr() == ("", "") and "handsim.websocket" not in caplog.text
+
+
+def test_what_a_client_says_is_not_read(sink, message):
+    with connect(url(sink)) as client, connect(url(sink)) as babbler:
+        wait_for(lambda: sink.num_clients == 2)
+        client.send("hello")
+        client.send(b"\x00" * 1000)
+        for _ in range(200):
+            babbler.send("x" * 1000)
+        babbler.send("x" * 10_000)  # longer than a server that is told nothing has to take
+        wait_for(lambda: sink.num_clients == 1)
+        sink.send(message(1))
+        assert received(client, 2)[1]["number"] == 1
+
+
+def test_pages_of_other_machines_are_refused(sink):
+    for origin in ("http://localhost:8000", "http://127.0.0.1", "https://[::1]:5173"):
+        connect(url(sink), origin=origin).close()
+    for origin in ("https://example.com", "http://localhost.example.com", "null", "http://127.0.0.1.evil"):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(url(sink), origin=origin)
+
+
+def test_an_address_of_the_network_serves_all_pages():
+    sink = open_sink("ws://0.0.0.0:0")
+    try:
+        connect(url(sink), origin="https://example.com").close()
+    finally:
+        sink.close()
+
+
+def test_it_listens_on_loopback(sink):
+    assert sink._socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
+    monkeypatch.setattr(sinks, "_FLUSH", LONG)
+    sink = open_sink("ws://:0?format=msgpack")
+    got: list[bytes] = []
+    with connect(url(sink)) as client:
+        wait_for(lambda: sink.num_clients == 1)
+        reader = threading.Thread(target=lambda: got.extend(read_until_closed(client)))
+        reader.start()
+        for number in range(200):
+            sink.send(message(number))
+        sink.close()
+        reader.join()
+    assert [msgpack.unpackb(one)["number"] for one in got[1:]] == list(range(200))
+
+
+def test_a_stalled_client_does_not_hold_up_the_end(sink, message):
+    stalled = raw_client(sink.port)
+    wait_for(lambda: sink.num_clients == 1)
+    frame = message(0)
+    for _ in range(3000):
+        sink.send(frame)
+    wait_for(lambda: sink.dropped > 0)
+    sink.close()
+    stalled.settimeout(LONG)
+    with contextlib.suppress(ConnectionResetError):
+        while stalled.recv(1 << 16):
+            pass  # until it is cut off
+    stalled.close()
+
+
+def test_a_server_starts_again_at_the_same_port(message):
+    port = 0
+    for number in range(3):
+        sink = open_sink(f"ws://127.0.0.1:{port}")
+        port = sink.port
+        with connect(url(sink)) as client:
+            wait_for(lambda sink=sink: sink.num_clients == 1)
+            sink.send(message(number))
+            assert [one["type"] for one in received(client, 2)] == ["header", "frame"]
+            sink.close()
+
+
+def test_a_port_in_use_is_told(sink):
+    with error_names(ArgumentError, f"port {sink.port} of 127.0.0.1 cannot be listened at (Address"):
+        open_sink(f"ws://127.0.0.1:{sink.port}")
+    with pytest.raises(ArgumentError, match="cannot be listened at"):
+        open_sink("ws://192.0.2.7:8765")
