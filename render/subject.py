@@ -37,33 +37,36 @@ from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
-from render.frames import Doubles, Flags
+from render.frames import Doubles
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"
 MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
-_FARTHEST: Final = 50.0  # [m] of a wrist from the origin
-_BEYOND: Final = np.deg2rad(10.0)  # out of a joint's range that is told
+_FARTHEST: Final = 50.0  # largest coordinate of a wrist [m]
+_BEYOND: Final = np.deg2rad(10.0)  # angle beyond a joint's range from which on users are warned
 
 
 class OwnPoses(NamedTuple):
     """Poses that a user made: T frames, H hands."""
 
     qpos: Float[np.ndarray, "T H 27"]
-    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand is not there."""
-    times: Float[np.ndarray, "T"] | None = None  # increasing [s]; None for poses that are no motion
-    person: Int[np.ndarray, "T"] | None = None  # who is in each frame; None where the poses do not say
-    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None where the poses do not say
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand is absent."""
+    times: Float[np.ndarray, "T"] | None = None  # increasing times [s]; None for poses without motion
+    person: Int[np.ndarray, "T"] | None = None  # number of the person in each frame; None if not given
+    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None if not given
 
 
 def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[OwnPoses, tuple[Side, ...]]:
-    """Poses of an `.npz` that `numpy.savez` wrote, or of a `.csv` of `handsim export`; and whose they are.
-
-    docs/rendering.md has the arrays, docs/motion_files.md the columns.
-    """
+    """Poses and their sides from an `.npz` (docs/rendering.md) or a `.csv` of `handsim export`."""
     if path.suffix.lower() == CSV:
-        arrays, sides = _columns(path, sides)
+        table = read_joint_csv(path)
+        sides = tuple(sides or table.sides)
+        for side in sides:
+            if side not in table.sides:
+                raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
+        qpos = table.qpos[:, [table.sides.index(side) for side in sides]]
+        arrays: dict[str, NDArray[Any]] = {"qpos": qpos, "times": table.times}
     else:
         arrays, sides = _arrays(path), tuple(sides or ("right",))
     try:
@@ -79,17 +82,6 @@ def _own_poses(
 ) -> OwnPoses:
     qpos = _stored_qpos(arrays, num_hands)
     return OwnPoses(qpos, _times(arrays, len(qpos)), _person(arrays, len(qpos), shapes), shapes)
-
-
-def _columns(path: Path, sides: Sequence[Side] | None) -> tuple[dict[str, NDArray[Any]], tuple[Side, ...]]:
-    """A table's poses and times, as the arrays of an `.npz` of these hands."""
-    table = read_joint_csv(path)
-    chosen = tuple(sides or table.sides)
-    for side in chosen:
-        if side not in table.sides:
-            raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
-    qpos = table.qpos[:, [table.sides.index(side) for side in chosen]]
-    return {"qpos": qpos, "times": table.times}, chosen
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -114,16 +106,21 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
     if "qpos" in arrays:
         qpos = _floats(arrays, "qpos", (count, NUM_QPOS))
         lost = np.asarray(np.isnan(qpos).any(axis=-1))
-        _check_unit_quaternions(qpos[..., 3:7], lost)
+        lengths = np.where(lost, 1.0, np.linalg.norm(qpos[..., 3:7], axis=-1))
+        worst = np.abs(lengths - 1.0).argmax()
+        if abs(lengths.flat[worst] - 1.0) > 1e-2:
+            raise ArgumentError(
+                f"qpos has a quaternion (numbers 3 to 6, wxyz) of length {lengths.flat[worst]:.4g} in frame "
+                f"{worst // lengths.shape[1]}, expected 1"
+            )
     else:
         angles, wrist = _floats(arrays, "angles", (count, NUM_JOINTS)), _wrists(arrays, count)
         if len(angles) != len(wrist):
             raise ArgumentError(f"angles has {len(angles)} frames and T_world_wrist {len(wrist)}")
         lost = np.asarray(np.isnan(angles).any(axis=-1) | np.isnan(wrist).any(axis=(-2, -1)))
-        turned = rotation_quaternions(
-            np.where(lost[..., None, None], np.eye(3), wrist[..., :3, :3]).reshape(-1, 3, 3)
-        )
-        qpos = np.concatenate([wrist[..., :3, 3], turned.reshape(*lost.shape, 4), angles], axis=-1)
+        rotations = np.where(lost[..., None, None], np.eye(3), wrist[..., :3, :3]).reshape(-1, 3, 3)
+        quaternions = rotation_quaternions(rotations).reshape(*lost.shape, 4)
+        qpos = np.concatenate([wrist[..., :3, 3], quaternions, angles], axis=-1)
     qpos[lost] = np.nan
     if lost.all():
         raise ArgumentError("there is no hand in any frame, expected one to draw")
@@ -133,7 +130,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
 
 
 def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Doubles:
-    """An array (T, ...) or, for one hand, (T, ...) without the axis of hands; NaN is allowed."""
+    """An array (T, *shape), NaN allowed; for one hand, its axis of hands may be missing."""
     given = arrays[name]
     if given.dtype.kind not in "fiu":
         raise ArgumentError(f"{name} is of type {given.dtype}, expected numbers")
@@ -145,7 +142,7 @@ def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...
         expected = ", ".join(map(str, shape))
         raise ArgumentError(f"{name} has shape {given.shape}, expected (T, {expected}) for {hands}")
     if np.isinf(values).any():
-        raise ArgumentError(f"{name} holds infinite numbers; a hand that is not there is NaN")
+        raise ArgumentError(f"{name} holds infinite numbers; an absent hand is NaN")
     return values
 
 
@@ -162,16 +159,6 @@ def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
     if bad.any():
         raise ArgumentError(f"T_world_wrist is not a rigid transform in frame {np.argwhere(bad)[0][0]}")
     return poses
-
-
-def _check_unit_quaternions(quaternions: Doubles, lost: Flags) -> None:
-    lengths = np.where(lost, 1.0, np.linalg.norm(quaternions, axis=-1))
-    worst = np.abs(lengths - 1.0).argmax()
-    if abs(lengths.flat[worst] - 1.0) > 1e-2:
-        raise ArgumentError(
-            f"qpos has a quaternion (numbers 3 to 6, wxyz) of length {lengths.flat[worst]:.4g} in frame "
-            f"{worst // lengths.shape[1]}, expected 1"
-        )
 
 
 def _check_bounds(qpos: Doubles) -> None:
@@ -215,7 +202,7 @@ def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> Doubles | None:
 def _person(
     arrays: Mapping[str, NDArray[Any]], frames: int, shapes: tuple[HandShape, ...] | None
 ) -> Int[np.ndarray, "T"] | None:
-    """Who is in each frame: told, or a person a frame, or one for all; None where nothing tells."""
+    """Number of the person in each frame: as given, the frame's own, or 0; None without people."""
     if "person" in arrays:
         person = arrays["person"]
         most = MOST_PEOPLE if shapes is None else len(shapes)
@@ -255,7 +242,7 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
     return tuple(shape_from_measures(float(length), float(breadth)) for length, breadth in sizes)
 
 
-_SECOND: Final = 1.0  # [s] between frames without times, which are poses without a motion
+_SECOND: Final = 1.0  # time between frames without times, which are poses without a motion [s]
 
 Model = HandModel | HandShape | str
 """A hand, or its shape, or the name of its size: XS, S, M, L or XL."""
@@ -263,19 +250,19 @@ Model = HandModel | HandShape | str
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
-    """Who is in each frame, where poses are struck by others than those whose hands a take has."""
+    """People who strike poses in the place of those whose hands a take has."""
 
-    seed: int  # of what the people draw: their hands, where there are no `shapes`, and their skins
+    seed: int  # seed of random hands and skins
     person: Int[np.ndarray, "T"] | None = None
-    """Number of the person in each frame; None: another person in every shard."""
-    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None: adults who are drawn
+    """Number of the person in each frame; None for another person in every shard."""
+    shapes: tuple[HandShape, ...] | None = None  # hands of the people; None for random adults
 
     def person_in(self, frame: int, shard: int) -> int:
         """Number of the person in a frame of a shard."""
         return shard if self.person is None else int(self.person[frame])
 
     def rng(self, person: int) -> np.random.Generator:
-        """The source of a person's skin, the same wherever the person appears."""
+        """A generator for a person's skin, the same in all frames."""
         return SpawnKey.PERSON.rng(self.seed, person, 1)
 
     def hands(self, person: int, worn: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
@@ -290,14 +277,13 @@ class Cast:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """What pictures show."""
+    """Poses, rigid bodies and people in pictures."""
 
-    take: Take  # poses, NaN where a hand is not there; rigid bodies; points of the optical system
-    name: str  # what a rendering's settings call it: its file, or the digest of what is in memory
-    cast: Cast | None = None  # who is in each frame; None: those whose hands these are
-    is_motion: bool = True  # whether frames follow one another; else they are poses of their own
-    poses: dict[str, Any] | None = None
-    """What else decides the pictures of poses, as JSON; None for a take."""
+    take: Take  # poses, rigid bodies, points of the optical system
+    name: str  # name in a rendering's settings: that of the file, or a digest of arrays
+    cast: Cast | None = None  # people; None if the take's hands are drawn
+    is_motion: bool = True  # whether frames follow one another in time
+    poses: dict[str, Any] | None = None  # other settings of poses, as JSON; None for a take
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.take.qpos[..., 0]).any():
@@ -332,11 +318,11 @@ class PoseFile:
 
 
 Source = Path | PoseFile | Subject
-"""Where a subject comes from; files are read again by every process that draws."""
+"""A subject or its file; every process that draws reads files again."""
 
 
 def source_of(source: Take | str | Path | PoseFile | ArrayLike, *, seed: int = 0, **options: Any) -> Source:
-    """What a public function was given, as a source; the options are those of `subject_of_poses`."""
+    """The source that a user gave; the options are those of `subject_of_poses`."""
     given = {name: value for name, value in options.items() if value is not None}
     if not isinstance(source, Take | str | Path | PoseFile):
         return subject_of_poses(source, seed=seed, **given)
@@ -396,9 +382,7 @@ def subject_of_poses(
     arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
     poses = _own_poses(arrays, len(models), shapes)
     _tell_beyond("poses", poses.qpos)
-    cast = None
-    if model is None or people is not None:
-        cast = _cast(poses, count, seed)
+    cast = _cast(poses, count, seed) if model is None or people is not None else None
     hands = [pack_hand(shape) for shape in (*(one.shape for one in models), *(shapes or ()))]
     told = (array for array in (poses.qpos, poses.times, poses.person) if array is not None)
     name = _digest(*told, np.array(hands, dtype=HAND_DTYPE))
@@ -420,7 +404,7 @@ def _load_poses(file: PoseFile, seed: int) -> Subject:
 
 
 def _cast(poses: OwnPoses, people: int | None, seed: int) -> Cast:
-    """The people of poses: as told, distributed over the frames at random, or another in every shard."""
+    """The people of poses: as given, distributed over the frames at random, or another in every shard."""
     if people is None or poses.person is not None:
         return Cast(seed, poses.person, poses.shapes)
     return Cast(seed, SpawnKey.PEOPLE_OF_FRAMES.rng(seed).integers(people, size=len(poses.qpos)))
@@ -434,6 +418,7 @@ def _posed(
     cast: Cast | None,
     record: dict[str, Any],
 ) -> Subject:
+    """The subject of poses on these hands in gloves."""
     hands = tuple(attach(layout, HandModel(model.shape.with_side("right"))) for model in models)
     hands = tuple(fit.with_side(model.shape.side) for fit, model in zip(hands, models, strict=True))
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
@@ -465,7 +450,7 @@ def _check_people(people: int | None) -> None:
 
 
 def _digest(*arrays: np.ndarray) -> str:
-    """What tells these arrays from others."""
+    """A digest of arrays."""
     content = hashlib.sha256()
     for array in arrays:
         content.update(np.ascontiguousarray(array).tobytes())

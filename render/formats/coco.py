@@ -29,7 +29,6 @@ from handsim import __version__
 from handsim.errors import DatasetError
 from handsim.hand.model import KEYPOINT_NAMES, SKELETON
 from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
-from handsim.space.camera import Camera
 from render.formats.records import (
     CENTER,
     as_sensed,
@@ -54,14 +53,13 @@ from render.formats.shards import (
     one_sentence,
     save_text,
 )
-from render.frames import Doubles, HandTruth, RenderedFrame
+from render.frames import HandTruth, RenderedFrame
 from render.skin.look import SkinLook, tone_name
 
-INFO: Final[dict[str, Any]] = {
+INFO: Final[dict[str, Any]] = {  # without a date, so that the same frames give the same bytes
     "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
     "version": __version__,
 }
-"""What a file tells of itself. It has no date, so that the same frames give the same bytes."""
 CATEGORY: Final[dict[str, Any]] = {
     "id": 1,
     "name": "hand",
@@ -72,7 +70,7 @@ CATEGORY: Final[dict[str, Any]] = {
 
 
 def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-    """The picture and its hands, still without COCO's numbers."""
+    """COCO's records of a picture and its hands, without ids."""
     camera = frame.camera
     image = {
         "file_name": file_name,
@@ -93,7 +91,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
 
 
 def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-    """Images and their annotations with COCO's numbers, in the order of the records."""
+    """Images and their annotations with ids, in the order of the records."""
     annotation_id = 0
     for image_id, record in enumerate(records, start=1):
         hands = []
@@ -104,13 +102,12 @@ def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any]
 
 
 def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
+    """COCO's annotation of a hand, without ids."""
     flags, mask = keypoint_flags(hand, frame.camera.size), hand_mask(frame, number)
     pixels = rounded(np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0), 5)
     record = {
         "category_id": CATEGORY["id"],
-        "keypoints": [
-            value for (u, v), flag in zip(pixels, flags.tolist(), strict=True) for value in (u, v, flag)
-        ],
+        "keypoints": [x for uv, flag in zip(pixels, flags.tolist(), strict=True) for x in (*uv, flag)],
         "num_keypoints": int((flags > 0).sum()),
         "bbox": rounded(hand.box, 3),
         "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
@@ -158,16 +155,14 @@ kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}
 class CocoWriter(FolderWriter):
     """`images/shard-00000/KEY.jpg`, `depth/shard-00000/KEY.png` ..., and `annotations.json` beside them."""
 
+    _record_of = staticmethod(picture_record)
+
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         if as_sensed(frame).rgb is None:
             raise without_colors(type(self).__name__.removesuffix("Writer").lower())
-        record = self._record(frame, f"{name}/{frame.key}.jpg")
+        record = self._record_of(frame, f"{name}/{frame.key}.jpg")
         record["image"] |= self._add_pictures(folder, frame, name)
         return record
-
-    def _record(self, frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-        """The picture and its hands, still without COCO's numbers."""
-        return picture_record(frame, file_name)
 
     def finish(self) -> None:
         """Write `annotations.json`."""
@@ -191,10 +186,7 @@ class YoloWriter(CocoWriter):
 
 
 def _coco_file(records: Callable[[], Iterable[dict[str, Any]]], category: dict[str, Any]) -> Iterator[str]:
-    """Pieces of a COCO file; the shards are read twice, so that they need not fit into memory.
-
-    Its list of licenses is empty, because pictures belong to who draws them.
-    """
+    """Pieces of a COCO file; `records` reads the shards twice, so that they need not fit into memory."""
     yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json([category])},\n"images":'
     yield from json_list(image for image, _ in numbered(records()))
     yield ',\n"annotations":'
@@ -208,11 +200,22 @@ _ORDER: Final[tuple[Side, Side]] = (SIDES[1], SIDES[0])  # right, left
 
 
 def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-    """The picture, its camera and its joints, still without numbers."""
+    """The picture, its camera and its joints, without ids."""
     hands = by_side(frame)
     seen = [hand.box for hand in frame.hands if is_seen(hand)]
-    joints, valid = _joints(hands)
+    annotation, (joints, valid), K = None, _joints(hands), centered_K(frame.camera)
     kind = "interacting" if len(hands) == 2 else next(iter(hands), "right")
+    if seen:
+        corners = np.array(seen)
+        low, high = corners[:, :2].min(axis=0), (corners[:, :2] + corners[:, 2:]).max(axis=0)
+        annotation = {
+            "bbox": rounded(np.concatenate([low, high - low]), 3),
+            "joint_valid": valid,
+            "hand_type": kind,
+            "hand_type_valid": 1,
+            "category_id": 1,
+            "iscrowd": 0,
+        }
     return {
         "image": {
             "file_name": file_name,
@@ -223,18 +226,14 @@ def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
             "seq_name": "handsim",
             "frame_idx": frame.number,
         },
-        "annotation": {
-            "bbox": rounded(_union(seen), 3),
-            "joint_valid": valid,
-            "hand_type": kind,
-            "hand_type_valid": 1,
-            "category_id": 1,
-            "iscrowd": 0,
-        }
-        if seen
-        else None,
+        "annotation": annotation,
         "camera_name": frame.camera.name,
-        "camera": _camera(frame.camera),
+        "camera": {
+            "campos": (1e3 * frame.camera.T_world_camera[:3, 3]).tolist(),
+            "camrot": frame.camera.T_world_camera[:3, :3].T.tolist(),
+            "focal": [K[0, 0], K[1, 1]],
+            "princpt": K[:2, 2].tolist(),
+        },
         "joints": {
             "world_coord": joints,
             "joint_valid": [[value] for value in valid],
@@ -245,7 +244,7 @@ def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
 
 
 def _with_numerals(records: Iterable[dict[str, Any]], cameras: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """COCO's records of pictures; `cameras` gets a numeral and a record for each pose of a camera."""
+    """Records for COCO's file; each pose of a camera is added to `cameras` with a numeral and a record."""
     for record in records:
         pose = to_json([record["camera_name"], record["camera"]])
         numeral, _ = cameras.setdefault(pose, (str(len(cameras)), record["camera"]))
@@ -255,7 +254,7 @@ def _with_numerals(records: Iterable[dict[str, Any]], cameras: dict[str, Any]) -
 
 
 def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Joints of every frame number, however many cameras saw it."""
+    """Joints of every frame, once for all of its cameras."""
     known: dict[int, int] = {}
     for record in records:
         number, joints = record["image"]["frame_idx"], record["joints"]
@@ -285,7 +284,7 @@ def skeleton_lines() -> str:
 
 
 def _joints(hands: dict[Side, HandTruth]) -> tuple[list[list[float]], list[int]]:
-    """42 joints in the world [mm], zero for a hand that is not there, and which of them are."""
+    """42 joints in the world [mm], zero for an absent hand, and flags of those that are present."""
     joints, valid = np.zeros((2 * NUM_KEYPOINTS, 3)), np.zeros(2 * NUM_KEYPOINTS, dtype=int)
     for number, side in enumerate(_ORDER):
         if side in hands:
@@ -294,31 +293,13 @@ def _joints(hands: dict[Side, HandTruth]) -> tuple[list[list[float]], list[int]]
     return rounded(joints, 6), valid.tolist()
 
 
-def _camera(camera: Camera) -> dict[str, Any]:
-    K = centered_K(camera)
-    return {
-        "campos": (1e3 * camera.T_world_camera[:3, 3]).tolist(),
-        "camrot": camera.T_world_camera[:3, :3].T.tolist(),
-        "focal": [K[0, 0], K[1, 1]],
-        "princpt": K[:2, 2].tolist(),
-    }
-
-
-def _union(boxes: list[Doubles]) -> Doubles:
-    """Smallest box (left, top, width, height) around some."""
-    corners = np.array(boxes)
-    low, high = corners[:, :2].min(axis=0), (corners[:, :2] + corners[:, 2:]).max(axis=0)
-    return np.concatenate([low, high - low])
-
-
 class InterhandWriter(CocoWriter):
     """`images/train/shard-00000/KEY.jpg`, and InterHand2.6M's JSON files in `annotations/train`."""
 
+    _record_of = staticmethod(interhand_record)
+
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, part=SPLIT)
-
-    def _record(self, frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-        return interhand_record(frame, file_name)
 
     def finish(self) -> None:
         """Write the files in `annotations`."""

@@ -6,43 +6,52 @@ InterHand2.6M, UmeTrack and COCO's keypoints, count from the first center: `CENT
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import struct
 import zlib
 from collections.abc import Mapping
-from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import HandSimError
 from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.color_sensor import linear_of
-from render.frames import FOREARM, PARTS_A_HAND, Doubles, Flags, Floats, HandTruth, Pictures, RenderedFrame
+from render.frames import (
+    FOREARM,
+    PARTS_A_HAND,
+    Doubles,
+    Flags,
+    Floats,
+    HandTruth,
+    Integers,
+    Pictures,
+    RenderedFrame,
+)
 
 CENTER: Final = 0.5
-"""Where our count of pixels has the first one's center [px]."""
+"""Center of the first pixel in our count [px]."""
 
 
 def shifted_K(camera: Camera) -> Doubles:
-    """K for pixels that are counted from the first one's center; a lens is left to its coefficients."""
+    """Camera matrix for pixels that are counted from the first one's center."""
     K = camera.K.copy()
     K[:2, 2] -= CENTER
     return K
 
 
 def centered_K(camera: Camera) -> Doubles:
-    """`shifted_K` of a pinhole, which alone projects points; other lenses are refused."""
+    """`shifted_K` of a pinhole camera; other lenses, which it does not describe, are refused."""
     if camera.lens.kind != "pinhole":
         raise HandSimError(
             f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
@@ -52,16 +61,9 @@ def centered_K(camera: Camera) -> Doubles:
 
 
 def as_sensed(frame: RenderedFrame) -> Pictures:
-    """The frame's pictures as its camera has them: the noisy ones where there are any."""
-    ideal, noisy = frame.ideal, frame.noisy
-    return Pictures(
-        rgb=ideal.rgb if noisy.rgb is None else noisy.rgb,
-        depth=ideal.depth if noisy.depth is None else noisy.depth,
-        normals=ideal.normals,
-        parts=ideal.parts,
-        instances=ideal.instances,
-        markers=ideal.markers,
-    )
+    """The frame's pictures as its camera has them: noisy ones in the place of ideal ones."""
+    noisy = {name: getattr(frame.noisy, name) for name in ("rgb", "depth")}
+    return dataclasses.replace(frame.ideal, **{name: one for name, one in noisy.items() if one is not None})
 
 
 def is_seen(hand: HandTruth) -> bool:
@@ -69,14 +71,14 @@ def is_seen(hand: HandTruth) -> bool:
     return bool(np.isfinite(hand.box).all())
 
 
-def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Int[np.ndarray, "21"]:
-    """COCO's flags of keypoints in a picture of this size [px]: 0 outside it, 1 hidden, 2 seen."""
-    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # never so for NaN
+def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Integers:
+    """COCO's flags (21,) of keypoints in a picture of this size [px]: 0 outside, 1 hidden, 2 visible."""
+    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # False for NaN
     return np.where(inside, np.where(hand.visible, 2, 1), 0)
 
 
-def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:
-    """Mask of one hand of a frame with its markers, without its forearm; None without an id picture."""
+def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
+    """Mask (H, W) of one hand with its markers, without its forearm; None without an id picture."""
     parts, instances = frame.ideal.parts, frame.ideal.instances
     first = 1 + PARTS_A_HAND * hand
     if instances is not None:
@@ -87,8 +89,8 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None
     return None
 
 
-def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """COCO's uncompressed run lengths: of alternating zeros and ones, zeros first, column by column."""
+def run_lengths(mask: Flags) -> list[int]:
+    """COCO's uncompressed run lengths of a mask (H, W): zeros and ones in turn, column by column."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     ends = np.concatenate([[0], changes, [flat.size]])
@@ -112,8 +114,8 @@ def without_colors(name: str) -> HandSimError:
     return HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
 
 
-def rigid_record(transform: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    """A rigid transform as quaternion (wxyz) and translation [m]."""
+def rigid_record(transform: Doubles) -> dict[str, list[float]]:
+    """A rigid transform (4, 4) as quaternion (wxyz) and translation [m]."""
     return {
         "quaternion_wxyz": rotation_quaternions(transform[None, :3, :3])[0].tolist(),
         "translation_xyz": transform[:3, 3].tolist(),
@@ -121,7 +123,7 @@ def rigid_record(transform: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
 
 
 def shape_record(shape: HandShape) -> dict[str, Any]:
-    """A person's hand as JSON; the fields of `HandShape`."""
+    """The fields of a `HandShape` as JSON."""
     fields = {name: getattr(shape, name) for name in HandShape.__dataclass_fields__}
     return {name: _listed(x) if isinstance(x, np.ndarray | np.generic) else x for name, x in fields.items()}
 
@@ -135,7 +137,7 @@ def to_json(content: Any) -> str:
     """JSON of plain values and arrays; null for NaN, which strict readers refuse."""
     try:
         return json.dumps(content, default=_listed, allow_nan=False, separators=(",", ":"))
-    except (TypeError, ValueError):  # something the quick way has no word for
+    except (TypeError, ValueError):  # NaN, or a type that only the slow way knows
         return json.dumps(_plain(content), allow_nan=False, separators=(",", ":"))
 
 
@@ -169,22 +171,14 @@ def _plain(content: Any) -> Any:
 ABSENT: Final = -1
 """Index of a joint that we lack."""
 _WRIST: Final = 0
-_THUMB, _INDEX, _MIDDLE, _RING, _LITTLE = _DIGITS = tuple(
-    tuple(range(4 * digit + 1, 4 * digit + 5)) for digit in range(5)
-)
-
-
-def _flat(*parts: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(chain.from_iterable(parts))
-
-
 _OURS: Final = tuple(range(NUM_KEYPOINTS))
-_TIPS: Final = tuple(digit[3] for digit in _DIGITS)
-_MANO: Final = _flat((_WRIST,), *(digit[:3] for digit in (_INDEX, _MIDDLE, _LITTLE, _RING, _THUMB)), _TIPS)
-_INTERHAND: Final = _flat(*(digit[::-1] for digit in _DIGITS), (_WRIST,))
-_HANDS17: Final = _flat((_WRIST,), tuple(digit[0] for digit in _DIGITS), *(digit[1:] for digit in _DIGITS))
-_WEBXR: Final = _flat((_WRIST,), _THUMB, *((ABSENT, *digit) for digit in _DIGITS[1:]))
-_UMETRACK: Final = _flat(_TIPS, (_WRIST,), _THUMB[1:3], *(digit[:3] for digit in _DIGITS[1:]))
+_DIGITS: Final = tuple(_OURS[first : first + 4] for first in range(1, NUM_KEYPOINTS, 4))
+_TIPS: Final = _OURS[4::4]
+_MANO: Final = (_WRIST, *(joint for digit in (1, 2, 4, 3, 0) for joint in _DIGITS[digit][:3]), *_TIPS)
+_INTERHAND: Final = (*(joint for digit in _DIGITS for joint in digit[::-1]), _WRIST)
+_HANDS17: Final = (_WRIST, *_OURS[1::4], *(joint for digit in _DIGITS for joint in digit[1:]))
+_WEBXR: Final = (_WRIST, *_DIGITS[0], *(joint for digit in _DIGITS[1:] for joint in (ABSENT, *digit)))
+_UMETRACK: Final = (*_TIPS, _WRIST, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3]))
 
 JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
     "handsim": _OURS,
@@ -205,31 +199,17 @@ JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
 """Index in `KEYPOINT_NAMES` of every joint of an order."""
 
 
-def joint_order(name: str) -> tuple[int, ...]:
-    """One of `JOINT_ORDERS`."""
-    check_choice(name, JOINT_ORDERS, noun="joint order")
-    return JOINT_ORDERS[name]
-
-
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Our keypoints, or other rows with one per keypoint, in one of `JOINT_ORDERS`; NaN for those we lack."""
-    order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
+    """Rows of our keypoints in one of `JOINT_ORDERS`; NaN for joints that we lack."""
     nowhere = np.full_like(points[..., :1, :], np.nan)
-    return np.concatenate([points, nowhere], axis=-2)[..., order, :]
-
-
-def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:
-    points = np.asarray(points)
-    if points.ndim < 2 or points.shape[-2] != count:
-        raise ArgumentError(f"{noun} have shape {points.shape}, expected (..., {count}, k)")
-    return points if np.issubdtype(points.dtype, np.floating) else points.astype(np.float64)
+    return np.concatenate([points, nowhere], axis=-2)[..., list(JOINT_ORDERS[name]), :]
 
 
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m]."""
 _KEYWORD: Final = b"metres_per_unit"
 _FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
-_MOST: Final = 65535
+_LARGEST: Final = 65535  # largest depth in these units
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
 _JPEG_QUALITY: Final = 95
 
@@ -246,10 +226,7 @@ def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QU
 
 
 def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
-    """Depth [m] as 16-bit gray PNG, with its unit in a text chunk `metres_per_unit`.
-
-    0, NaN and what does not fit into 65535 units become 0.
-    """
+    """Depth [m] as 16-bit gray PNG, whose text chunk `metres_per_unit` has the unit; 0 if it does not fit."""
     data = _encode(".png", _depth_steps(np.ascontiguousarray(depth)))
     text = _KEYWORD + b"\0" + repr(METERS_PER_UNIT).encode("ascii")
     end = _FIRST_CHUNK.stop
@@ -258,18 +235,18 @@ def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
 
 @kernel
 def _depth_steps(depth: Floats) -> Any:
-    """Depth (H, W) in whole units; 0 for what does not fit."""
+    """Depth (H, W) in whole units; 0 for NaN and for depth beyond 65535 units."""
     steps = np.zeros(depth.shape, np.uint16)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             step = np.rint(depth[row, column] / METERS_PER_UNIT)
-            if 0.0 < step <= _MOST:  # never so for NaN
+            if 0.0 < step <= _LARGEST:  # False for NaN
                 steps[row, column] = int(step)
     return steps
 
 
 def encode_ids(pictures: Pictures) -> bytes | None:
-    """Parts, instances and markers as red, green and blue of one PNG; None when there are none of them."""
+    """Parts, instances and markers as red, green and blue of one PNG; None for pictures without ids."""
     layers = (pictures.parts, pictures.instances, pictures.markers)
     known = [layer for layer in layers if layer is not None]
     if not known:
@@ -284,7 +261,7 @@ def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
 
 @kernel
 def _normal_levels(normals: Floats) -> Any:
-    """Normals (H, W, 3) as bytes, z first as OpenCV has blue."""
+    """Normals (H, W, 3) as bytes, z first, because OpenCV has blue first."""
     levels = np.zeros(normals.shape, np.uint8)
     for row in range(normals.shape[0]):
         for column in range(normals.shape[1]):
@@ -297,9 +274,8 @@ def _normal_levels(normals: Floats) -> Any:
 
 
 def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]:
-    """Files of a frame's pictures as its camera has them, and of ideal depth beside noisy, by suffix."""
-    pictures = as_sensed(frame)
-    files: dict[str, bytes] = {}
+    """Files of a frame's pictures by suffix: those of its camera, and ideal depth beside noisy depth."""
+    pictures, files = as_sensed(frame), dict[str, bytes]()
     if pictures.rgb is not None:
         files[".png" if lossless else ".jpg"] = (encode_png if lossless else encode_jpeg)(pictures.rgb)
     if pictures.depth is not None:
@@ -316,7 +292,7 @@ def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]
 
 def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None) -> bytes:
     done, data = cv2.imencode(suffix, np.ascontiguousarray(picture), options or [])
-    assert done, "these formats take any picture"
+    assert done, "PNG and JPEG hold any picture"
     return data.tobytes()
 
 
@@ -335,10 +311,8 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
     """Write all pictures of a frame and its camera."""
     import OpenEXR
 
-    channels = {
-        **_channels(frame.ideal),
-        **{_SENSOR + name: values for name, values in _channels(frame.noisy).items()},
-    }
+    noisy = {_SENSOR + name: values for name, values in _channels(frame.noisy).items()}
+    channels = _channels(frame.ideal) | noisy
     record = frame.camera.record()
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,

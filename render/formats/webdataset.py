@@ -31,11 +31,11 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
 from render.formats.records import (
     CENTER,
+    JOINT_ORDERS,
     METERS_PER_UNIT,
     by_side,
     encode_pictures,
     is_seen,
-    joint_order,
     rigid_record,
     rounded,
     shape_record,
@@ -62,7 +62,7 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
         k1, k2, p1, p2, k3 = coefficients
         coefficients = [k1, k2, k3, p1, p2]
     elif lens.kind == "fisheye":
-        coefficients += [0.0] * 4  # it has four tangential ones too
+        coefficients += [0.0] * 4  # four tangential coefficients
     focal_center = [K[0, 0], K[1, 1], K[0, 2] - CENTER, K[1, 2] - CENTER]
     return {
         "calibration": {
@@ -82,7 +82,7 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
 
 
 def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
-    """`hands.json` of one time, a frame a stream: `left` and `right`, null for a hand that is not there."""
+    """`hands.json` of the frames of one time: `left` and `right`, null for a hand that is absent."""
     streams = [(frame.camera.name, by_side(frame)) for frame in frames]
     record: dict[str, Any] = {"left": None, "right": None}
     for side, hand in streams[0][1].items():
@@ -104,13 +104,8 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     return record
 
 
-def hand_shapes_record(shape: HandShape) -> dict[str, Any]:
-    """`__hand_shapes.json__`, shared by both hands of a clip; without MANO parameters."""
-    return {"mano": [], "umetrack": umetrack_hand(shape)}
-
-
 def objects_record(frame: RenderedFrame) -> dict[str, Any]:
-    """`objects.json`: poses of the rigid things by name."""
+    """`objects.json`: poses of the rigid bodies by name."""
     record: dict[str, Any] = {}
     for body in frame.bodies:
         entry = {"object_name": body.name, "T_world_from_object": rigid_record(body.T_world_body)}
@@ -119,7 +114,7 @@ def objects_record(frame: RenderedFrame) -> dict[str, Any]:
 
 
 def markers_record(frame: RenderedFrame) -> dict[str, Any]:
-    """`markers.json`: what the optical system saw, whose points they are, and where the markers were [m]."""
+    """`markers.json`: points of the optical system [m], their labels, and the markers' true positions [m]."""
     return {
         "points": rounded(frame.points, 9),
         "labels": frame.labels,
@@ -132,7 +127,7 @@ def markers_record(frame: RenderedFrame) -> dict[str, Any]:
 
 
 def frame_record(frame: RenderedFrame) -> dict[str, Any]:
-    """The ground truth of a frame without its skin: meters, world axes, pixels from the corner."""
+    """The ground truth of a frame without vertices, in meters, world axes, and pixels from the corner."""
     return {
         "number": frame.number,
         "time": frame.time,
@@ -162,27 +157,24 @@ def _truth(hand: HandTruth) -> dict[str, Any]:
     }
 
 
-def umetrack_wrist(T_world_wrist: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """`T_world_from_wrist` of a hand whose wrist is there."""
-    pose: Doubles = np.array(T_world_wrist, dtype=np.float64)
+def umetrack_wrist(T_world_wrist: Doubles) -> Doubles:
+    """UmeTrack's `T_world_from_wrist` (4, 4) of our wrist pose."""
+    pose = T_world_wrist.copy()
     pose[:3, :3] = pose[:3, :3] @ _UMETRACK_FROM_OURS.T
     return pose
 
 
 def umetrack_hand(shape: HandShape) -> dict[str, Any]:
-    """The hand model of a person, the same for both sides; lengths in millimeters, as UmeTrack has them."""
+    """UmeTrack's hand model of a person, the same for both sides, in millimeters."""
     model = HandModel(shape.with_side("left"))
     bones = [joint.bone for joint in JOINTS]
     rest = model.rest_transforms[bones]
     axes = np.einsum("jab,jb->ja", rest[:, :3, :3], model.skeleton.axes)
-    step = np.arange(NUM_JOINTS) % _JOINTS_PER_DIGIT
-    numbers = np.arange(NUM_JOINTS)
-    next_digit = numbers + _JOINTS_PER_DIGIT
-    surface = model.surface
+    numbers, surface = np.arange(NUM_JOINTS), model.surface
+    step, next_digit = numbers % _JOINTS_PER_DIGIT, numbers + _JOINTS_PER_DIGIT
     weights = np.zeros((len(surface.vertices), _ROOT_FRAMES + NUM_BONES))
-    np.add.at(
-        weights, (np.arange(len(weights))[:, None], surface.bone_indices + _ROOT_FRAMES), surface.bone_weights
-    )
+    rows = np.arange(len(weights))[:, None]
+    np.add.at(weights, (rows, surface.bone_indices + _ROOT_FRAMES), surface.bone_weights)
     landmarks = to_order(hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0], "umetrack")
     return {
         "joint_rotation_axes": rounded(axes @ _UMETRACK_FROM_OURS.T, 8),
@@ -193,7 +185,7 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
         "joint_next_sibling": np.where((step == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
         "landmark_rest_positions": rounded(1e3 * landmarks @ _UMETRACK_FROM_OURS.T, 5),
         "landmark_rest_bone_weights": [[1.0]] * len(landmarks),
-        "landmark_rest_bone_indices": [[_ROOT_FRAMES + _bone(joint)] for joint in joint_order("umetrack")],
+        "landmark_rest_bone_indices": [[_ROOT_FRAMES + _bone(joint)] for joint in JOINT_ORDERS["umetrack"]],
         "mesh_vertices": rounded(1e3 * surface.vertices @ _UMETRACK_FROM_OURS.T, 4),
         "mesh_triangles": surface.faces.tolist(),
         "dense_bone_weights": rounded(weights, 6),
@@ -202,17 +194,17 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
 
 
 def _bone(keypoint: int) -> int:
-    """The bone that a keypoint is fixed to: the one that begins there, for a tip the last."""
+    """The bone that begins at a keypoint, or ends at it, for a tip."""
     digit = KEYPOINT_DIGITS[keypoint]
     return 0 if digit < 0 else 1 + 3 * digit + min((keypoint - 1) % 4, 2)
 
 
 _STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
 TAR: Final = ".tar"
-_FILLED: Final = 0.8  # of the crop's half width, by the keypoint that is farthest from its middle
-_WIDEST: Final = np.deg2rad(120.0)  # a flat picture of more is mostly stretching
-_ROUNDS: Final = 5  # towards the middle, which moves a little when the camera turns
-_NEAREST: Final = 1e-3  # [m]
+_FILLED: Final = 0.8  # distance of the outermost keypoint from a crop's middle over half the crop's width
+_WIDEST: Final = np.deg2rad(120.0)  # largest angle of view of a crop
+_ROUNDS: Final = 5  # times that a crop's camera is turned to the keypoints' middle, which then moves a little
+_NEAREST: Final = 1e-3  # least depth of a keypoint in a crop [m]
 
 
 class WebdatasetWriter:
@@ -227,8 +219,7 @@ class WebdatasetWriter:
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew; frames of one number follow one another."""
-        persons: dict[str, HandShape] = {}
-        numbers = set()
+        persons, numbers = dict[str, HandShape](), set[int]()
         path = self.folder / f"{shard_name(shard)}{TAR}"
         with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as add:
             for number, group in itertools.groupby(frames, key=lambda frame: frame.number):
@@ -240,16 +231,16 @@ class WebdatasetWriter:
                     add(f"{number:06d}.{name}", content)
                 for hand in views[0].hands:
                     persons.setdefault(to_json({**shape_record(hand.shape), "side": None}), hand.shape)
-            if len(persons) == 1:  # a clip has room for one
-                record = hand_shapes_record(*persons.values())
+            if len(persons) == 1:  # a clip has room for one person
+                record = {"mano": [], "umetrack": umetrack_hand(*persons.values())}
                 add(HAND_SHAPES, to_json(record).encode())
 
     def finish(self) -> None:
-        """Tars stand alone."""
+        """Do nothing, because tars are complete in themselves."""
 
 
 def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
-    """Files of one time: their names after the key, and their bytes."""
+    """Files of one time: the ends of their names, and their bytes."""
     names = [view.camera.name for view in views]
     for name in names:
         if not _STREAM.fullmatch(name):
@@ -276,10 +267,7 @@ def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
 
 
 def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
-    """`hand_crops.json` of one time: for each side the crop's camera in each stream that sees the hand.
-
-    By stream: `T_world_from_crop_camera`, and `crop_camera_fov`, the full angle of view [rad].
-    """
+    """`hand_crops.json` of one time: by side and stream the pose and angle of view of the crop's camera."""
     record: dict[str, Any] = {"left": {}, "right": {}}
     for frame in frames:
         for side, hand in by_side(frame).items():
@@ -293,29 +281,23 @@ def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     return record
 
 
-def crop_camera(
-    camera: Camera, keypoints: Float[np.ndarray, "21 3"]
-) -> tuple[Float[np.ndarray, "4 4"], float] | None:
-    """The pose of a camera for one hand alone, from its keypoints [m], and its full angle of view [rad].
+def crop_camera(camera: Camera, keypoints: Doubles) -> tuple[Doubles, float] | None:
+    """The pose of a camera for one hand's keypoints (21, 3) [m], and its full angle of view [rad].
 
-    None for a hand beside or behind the camera, or one that no flat picture of 120 degrees holds.
+    It is None for a hand beside or behind the camera, and for one that no flat picture of 120 degrees holds.
     """
     local = camera.local(keypoints)
-    if local[:, 2].mean() < _NEAREST:
+    target = local.mean(axis=0)
+    if target[2] < _NEAREST:
         return None
-    rotation = _looking_along(local.mean(axis=0))
-    for _ in range(_ROUNDS):
-        turned = local @ rotation
-        if turned[:, 2].min() < _NEAREST:
+    for _ in range(_ROUNDS + 1):
+        rotation = _looking_along(target)
+        rotated = local @ rotation
+        if rotated[:, 2].min() < _NEAREST:
             return None
-        flat = turned[:, :2] / turned[:, 2:]
-        middle = (flat.min(axis=0) + flat.max(axis=0)) / 2.0
-        rotation = _looking_along(rotation @ np.append(middle, 1.0))
-    turned = local @ rotation
-    if turned[:, 2].min() < _NEAREST:
-        return None
-    reach = float(np.abs(turned[:, :2] / turned[:, 2:]).max()) / _FILLED
-    angle = 2.0 * float(np.arctan(reach))
+        flat = rotated[:, :2] / rotated[:, 2:]
+        target = rotation @ np.append((flat.min(axis=0) + flat.max(axis=0)) / 2.0, 1.0)
+    angle = 2.0 * float(np.arctan(float(np.abs(flat).max()) / _FILLED))
     if angle > _WIDEST:
         return None
     T_world_crop: Doubles = camera.T_world_camera.copy()

@@ -80,8 +80,8 @@ class Format(NamedTuple):
 
     open: Callable[[Path], FrameWriter]
     needs_colors: bool = False
-    any_lens: bool = True  # or pinhole cameras alone
-    merges: bool = True  # whether several renderings have a place in one folder
+    any_lens: bool = True  # False: pinhole cameras alone
+    merges: bool = True  # whether renderings can be merged
 
 
 WRITERS: Final = {
@@ -97,19 +97,19 @@ FORMATS: Final = tuple(WRITERS)
 
 
 def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
-    """Where one of a rendering's formats is: in a folder of its own if there are several."""
+    """The folder of one of a rendering's formats; each of several has its own."""
     return folder if len(formats) == 1 else folder / name
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
-    """The writer of one of `FORMATS`, into a folder that is made when it is not there."""
+    """The writer of one of `FORMATS` into a folder."""
     check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name].open(Path(folder))
 
 
 CONFIG: Final = "render.json"
 """Settings of a rendering, in its folder."""
-_LARGEST: Final = 1 << 30  # bytes of a picture's file
+_LARGEST: Final = 1 << 30  # largest file of a picture [bytes]
 _SAMPLE: Final = re.compile(r"(\d+)(\..+)")
 
 
@@ -184,10 +184,8 @@ def _merge_format(
                 if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
                     _copy_folder(source, shard, target, number, offset)
                 else:
-                    start, end = (
-                        format_folder(one, formats, name) / f"{shard_name(which)}{TAR}"
-                        for one, which in ((folder, shard), (out, number))
-                    )
+                    start = format_folder(folder, formats, name) / f"{shard_name(shard)}{TAR}"
+                    end = format_folder(out, formats, name) / f"{shard_name(number)}{TAR}"
                     _copy_tar(start, end, offset)
             number += 1
         offset += count
@@ -209,8 +207,9 @@ def _copy_tar(start: Path, end: Path, offset: int) -> None:
 
 
 def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
+    """A file of a tar with its frame's number plus an offset."""
     sample = _SAMPLE.fullmatch(name)
-    if sample is None:  # the hand shapes of the shard
+    if sample is None:  # it is the file of hand shapes
         return name, content
     if sample[2] == ".info.json":
         info = json.loads(content)
@@ -219,12 +218,12 @@ def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
 
 
 def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number: int, offset: int) -> None:
-    """A shard of a format with folders: files that are named after keys, and an index of records."""
+    """Copy a shard of a format with folders; its frames' numbers grow by an offset."""
     start, places = source.pictures / shard_name(shard), source.beside(shard)
     records = []
     with target.new_shard(number) as temporary:
         for record, files in _keyed(start, places):
-            image = record.get("image", record)  # the formats with an image's record number frames in it
+            image = record.get("image", record)  # some formats have the frame's number in a record `image`
             field = "frame" if "image" in record else "number"
             frame = int(image[field]) + offset
             key = f"{image['camera']}_{frame:06d}"
@@ -252,7 +251,7 @@ def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number:
 def _keyed(
     start: Path, places: Mapping[str, Path]
 ) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], Path]]]:
-    """Records of a shard, and the files of each by the folder that they are in and their endings."""
+    """Records of a shard, and the files of each by folder and ending."""
     files: dict[str, dict[tuple[str, str], Path]] = {}
     for kind, place in {"": start, **places}.items():
         for path in sorted(place.iterdir()) if place.is_dir() else ():

@@ -33,25 +33,23 @@ from render.frames import Bytes, Doubles, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-_TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
-_MOST_PIXELS: Final = 100_000_000  # of a photograph
+_TRIES: Final = 50  # unreadable files in turn after which a folder counts as one without photographs
+_MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 
 
 @functools.lru_cache(maxsize=2)
 def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Photographs in a folder and its subfolders: those with the first bytes of a picture, and the others."""
+    """Files of photographs in a folder and its subfolders: those that begin like pictures, and the others."""
     if not folder.is_dir():
         raise HandSimError(f"{folder}: no such folder of photographs")
     files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
-    good = tuple(filter(_begins_as_picture, files))
+    good, broken = list[Path](), list[Path]()
+    for file in files:
+        with plain_path(file) as plain:
+            (good if cv2.haveImageReader(str(plain)) else broken).append(file)
     if not good:
         raise _no_photo(folder)
-    return good, tuple(file for file in files if file not in set(good))
-
-
-def _begins_as_picture(file: Path) -> bool:
-    with plain_path(file) as plain:
-        return bool(cv2.haveImageReader(str(plain)))
+    return tuple(good), tuple(broken)
 
 
 def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
@@ -59,13 +57,12 @@ def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     files, _ = photo_files(folder)
     for index in rng.permutation(len(files))[:_TRIES]:
         if _read(files[index]) is not None:
-            readable: Path = files[index]
-            return readable
+            return Path(files[index])
     raise _no_photo(folder)
 
 
 def photos_beside(file: Path, count: int) -> list[Path]:
-    """A photograph and others of its folder, so many together; they come again where there are fewer."""
+    """A photograph and others of its folder, `count` in all; they are repeated if there are too few."""
     files, _ = photo_files(file.parent)
     start = files.index(file) + 1 if file in files else 0
     others = (one for one in (*files[start:], *files[:start]) if one != file and _read(one) is not None)
@@ -91,13 +88,10 @@ def _read(file: Path) -> Bytes | None:
 
 
 def _num_pixels(file: Path) -> int:
-    """Pixels that a file states; OpenCV would allocate them all before it finds that they are not there.
-
-    The same holds for the parts of a PNG, which are checked.
-    """
+    """Number of pixels in a file's header, checked because OpenCV allocates them before it reads any."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of decompression bombs
+            warnings.simplefilter("ignore")  # warnings of decompression bombs
             with Image.open(file) as picture:
                 pixels = int(picture.width * picture.height)
                 picture.verify()
@@ -107,7 +101,7 @@ def _num_pixels(file: Path) -> int:
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """A random part of a photograph in the picture's proportions, which fills it: half of it or more."""
+    """A random part of a photograph, scaled to a picture's size: at least half of what fits, each way."""
     photo = _read(file)
     if photo is None:
         raise HandSimError(f"{file}: not a readable photograph")
@@ -116,36 +110,33 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     part = np.maximum(np.array(size) * scale, 1.0).astype(int)
     left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
     cut = photo[top : top + part[1], left : left + part[0], ::-1]
-    shrinks = part[0] > size[0]
-    scaled = cv2.resize(
-        np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
+    method = cv2.INTER_AREA if part[0] > size[0] else cv2.INTER_LINEAR
+    scaled = cv2.resize(np.ascontiguousarray(cut), size, interpolation=method)
     return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
 
 
 SHARE: Final = 0.6
-"""Of backgrounds that could have a backdrop, those that do; the others are too far away for a shadow."""
-_GAPS: Final = (0.02, 0.35)  # [m]
-_STEEPEST: Final = 0.35  # slope of a backdrop against the picture's plane
-_SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
+"""Share of the plain backgrounds that catch shadows; the others are too far away."""
+_GAPS: Final = (0.02, 0.35)  # range of a backdrop's distance from the hands [m]
+_STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's plane
+_SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _USUAL_SHARES: Final = {"plain": 0.1, "gradient": 0.1, "noise": 0.15, "clutter": 0.15, "room": 0.5}
-_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
-_OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # drawn at half of the picture's resolution
+_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # kinds that may be a wall or a table
+_OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # kinds drawn at half the resolution
 _GAMMA: Final = 2.2
-_GRAINS: Final = (6.0, 60.0)  # of stone, cloth or wood along the height of a picture
-_GRAIN_CONTRAST: Final = (0.1, 0.5)  # share of the difference of any two colors
-_SIDE: Final = np.float32(0.6)  # light on an object's side, where its top has 1
+_GRAINS: Final = (6.0, 60.0)  # range of the number of grains along the height of a picture
+_GRAIN_CONTRAST: Final = (0.1, 0.5)  # contrast of grain over that of any two colors
+_SIDE: Final = np.float32(0.6)  # light on an object's side over that on its top
 
 
 @dataclass(frozen=True, slots=True)
 class Backdrop:
-    """A plane behind all of the hands that is in the picture; it catches their shadows."""
+    """A plane behind the hands that catches their shadows."""
 
-    gap: float  # its distance from the nearest point of them [m]
-    recedes: tuple[float, float] = (0.0, 0.0)
-    """By how much it recedes to the right and downwards, a length for a length."""
+    gap: float  # distance from the nearest point of the hands [m]
+    recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
     softness: float = 0.1  # tangent of half the angle under which it sees the lamp
 
 
@@ -206,8 +197,7 @@ class Background:
     seed: int
     blur: float = 0.0  # standard deviation of its blur, in picture heights
     photo: str | None = None  # the photograph's file
-    backdrop: Backdrop | None = None
-    """What the hands' shadows fall on; None where the background is far away."""
+    backdrop: Backdrop | None = None  # plane that catches shadows; None for a far background
 
 
 def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:
@@ -227,23 +217,23 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
 
 
 def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
-    """A picture of `kept_background`, or values that grow with it from 0 on, at its whole size."""
+    """A picture of `kept_background`, or of its display values, at the whole size."""
     if picture.shape[1::-1] == size:
         return picture
     whole: Floats = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     return np.clip(whole, 0.0, picture.max(), out=whole)
 
 
-@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
+@functools.lru_cache(maxsize=2)  # each is drawn for its light, then behind the hands
 def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """The picture of `draw_background` before it is `enlarged`, which cannot be written."""
+    """The picture of `draw_background` before it is `enlarged`, read-only."""
     picture = _coarse(background, size)
     picture.setflags(write=False)
     return picture
 
 
 def _coarse(background: Background, size: tuple[int, int]) -> Floats:
-    """The picture of `draw_background`, at half of its size where that shows as well."""
+    """The picture of `draw_background`, at half its size if that is as good."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
     halved = (max(2, size[0] // 2), max(2, size[1] // 2))
@@ -269,7 +259,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Linear light of a wall or a cloth: grays more often than strong colors."""
+    """Linear color of a wall or a cloth: more often gray than strong."""
     gray = rng.uniform(0.12, 0.95) ** _GAMMA
     red, green, blue = np.clip(gray * np.exp(paint_tints(rng, 1)[0]), 0.003, 0.95)
     return float(red), float(green), float(blue)
@@ -287,9 +277,9 @@ def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.rand
 def _octaves(
     size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator, cells: int = 3
 ) -> Floats:
-    """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1.
+    """Noise of all scales with standard deviation 1: each has twice the cells and `fall` times the strength.
 
-    The largest is the picture's height over `cells`.
+    The coarsest scale has this number of `cells` along the picture's height.
     """
     width, height = size
     cells, strength, squares = min(cells, height - 1), 1.0, 0.0
@@ -306,7 +296,7 @@ def _octaves(
 
 
 def _noise(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """Stone, carpet, cloth or wood: grain of one scale and finer, often longer one way than the other."""
+    """Stone, carpet, cloth or wood: grain of one scale and finer, often longer in one direction."""
     cells = int(np.exp(rng.uniform(*np.log(_GRAINS))))
     longer = float(rng.choice([1.0, rng.uniform(2.0, 8.0)]))
     width, height = size
@@ -324,7 +314,7 @@ def _clutter(first: Floats, second: Floats, size: tuple[int, int], rng: np.rando
     picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
     height = size[1]
     turn = rng.uniform(0.0, 2.0 * np.pi)
-    up = np.array([np.cos(turn), np.sin(turn)])  # of what is seen of their height, aslant
+    up = np.array([np.cos(turn), np.sin(turn)])  # direction of heights in the picture
     for _ in range(int(rng.integers(8, 30))):
         color = np.array(_color(rng), dtype=np.float32)
         center = rng.uniform(0.0, 1.0, 2) * size
@@ -376,10 +366,10 @@ def _lay_over(part: Floats, covered: Bytes, shadow: Bytes, color: Floats) -> Non
 
 
 Corner = tuple[float, float, float]
-_MARGIN: Final = (0.8, 2.2)  # [m] between the outermost camera or hand and a wall
-_FREE: Final = 0.5  # [m] around hands and cameras without furniture
-_TEXTURE: Final = 512  # [px] of a wall each way
-_SHORTEST: Final = 1e-6  # component of a ray, so that it meets each pair of walls
+_MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camera or hand and a wall [m]
+_FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
+_TEXTURE: Final = 512  # width and height of a wall's picture [px]
+_SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,7 +383,7 @@ class Enclosure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What one camera sees behind hands and objects."""
+    """The picture, depth and normals that one camera has behind hands and objects."""
 
     rgb: UInt8[np.ndarray, "H W 3"]  # sRGB; 0 where the lens sees nothing
     depth: Float32[np.ndarray, "H W"]  # along the camera's axis [m]; 0 for what is not ahead
@@ -401,7 +391,7 @@ class Surroundings:
     signs: Int8[np.ndarray, "H W"]  # whether it points along that axis (1) or against it (-1)
 
     def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
-        """Pictures of hands and objects with depth and normals behind them, too."""
+        """Pictures of hands and objects with depth and normals added behind them."""
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
@@ -414,9 +404,8 @@ def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
     """A random box around cameras and hands."""
     below, above = np.random.default_rng([seed, 0]).uniform(*_MARGIN, (2, 3))
     low, high = positions.min(axis=0), positions.max(axis=0)
-    return Enclosure(
-        _corner(low - below), _corner(high + above), (_corner(low - _FREE), _corner(high + _FREE))
-    )
+    free = _corner(low - _FREE), _corner(high + _FREE)
+    return Enclosure(_corner(low - below), _corner(high + above), free)
 
 
 def _corner(point: Doubles) -> Corner:
@@ -425,10 +414,9 @@ def _corner(point: Doubles) -> Corner:
 
 
 def draw_surroundings(background: Background, enclosure: Enclosure, camera: Camera) -> Surroundings:
-    """What a camera inside the box, with any lens, sees of it; what stands still is drawn once."""
-    focal = tuple(camera.K.ravel().tolist())
-    lens = camera.lens
-    return _drawn(background, enclosure, camera.size, focal, lens, camera.T_world_camera.tobytes())
+    """The box as a camera in it sees it, through any lens; cached for cameras that stand still."""
+    focal, pose = tuple(camera.K.ravel().tolist()), camera.T_world_camera.tobytes()
+    return _drawn(background, enclosure, camera.size, focal, camera.lens, pose)
 
 
 @functools.lru_cache(maxsize=16)
@@ -465,7 +453,7 @@ def _drawn(
 
 @functools.lru_cache(maxsize=2)
 def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.ndarray, "R S 3"]:
-    """Linear pictures of the six walls, one below the other; a photograph of its own fills each."""
+    """Linear pictures of the six walls, one below the other; photographs are of one folder."""
     walls = [
         dataclasses.replace(background, seed=(background.seed + wall) % 2**31, blur=0.0) for wall in range(6)
     ]
@@ -474,7 +462,7 @@ def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.n
     room = np.array(enclosure.high) - np.array(enclosure.low)
     pictures = []
     for number, (wall, photo) in enumerate(zip(walls, photos_beside(Path(background.photo), 6), strict=True)):
-        sides = np.delete(room, number // 2)  # across and up
+        sides = np.delete(room, number // 2)  # the wall's width and height
         width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
         picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
         pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))

@@ -19,13 +19,13 @@ from render.frames import Doubles, Integers
 from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
 from render.skin.look import SkinLook
 
-_SIZE: Final = (64, 48)  # of the picture that gives light
-_DIRECTIONS: Final = 1024
-_MIDDLE_SKIN: Final = 0.3  # reflectance
-_METERED: Final = 0.5
-_SHARE: Final = (0.1, 0.5)  # of the light from everywhere that has the picture's colors, after white balance
+_SIZE: Final = (64, 48)  # size of the picture that gives light [px]
+_DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
+_MIDDLE_SKIN: Final = 0.3  # reflectance of the skin that needs no compensation
+_METERED: Final = 0.5  # share of the difference between skins that exposure compensates
+_SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
-# What a matt surface makes of each order, and the integrals of the squared functions over the sphere.
+# Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
 _SQUARES: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
 
@@ -66,9 +66,9 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its color."""
     exposure = float(np.exp(np.clip(rng.normal(0.06, 0.18), -0.35, 0.4)))
     warmth = rng.normal(0.06, 0.06)  # lamps are warm, and white balances keep some of it
-    # The lightness of an open palm has a deviation of 3.6 in photographs, and of 1.5 in light twice as even.
+    # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
     key_share, ambient_share = rng.uniform(0.52, 0.86), rng.uniform(0.09, 0.19)
-    # From above more than from below, and seldom from behind the hand.
+    # The key light comes from above more often than from below, and seldom from behind the hand.
     key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])
     fill = np.array([-np.sign(key[0]) * rng.uniform(0.4, 1.2), rng.normal(-0.2, 0.4), rng.uniform(-1.1, 0.1)])
     directions = (
@@ -97,9 +97,8 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
 
 
 def _tint(warmth: float, rng: np.random.Generator) -> tuple[float, float, float]:
-    """A lamp's color between candle and sky, as a white balance leaves it, a little green or magenta."""
-    green = rng.normal(0.0, 0.015)
-    return _triple(np.exp([warmth, green, -1.2 * warmth]))
+    """A lamp's color after white balance: warm or cool, and a little green or magenta."""
+    return _triple(np.exp([warmth, rng.normal(0.0, 0.015), -1.2 * warmth]))
 
 
 def _triple(values: Doubles) -> tuple[float, float, float]:
@@ -110,9 +109,9 @@ def _triple(values: Doubles) -> tuple[float, float, float]:
 def sample_surroundings(
     config: Backgrounds, skin: SkinLook | None, size: tuple[int, int] = _SIZE, *, rng: np.random.Generator
 ) -> tuple[Background, Lighting]:
-    """A random background, and random lamps in the light that it gives.
+    """A random background and random light, exposed for this skin; None stands for gloves.
 
-    The picture is exposed for this skin, or for gloves; of a known size [px] the background is painted once.
+    The background is painted once if `size` is that of the picture [px].
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
     picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
@@ -121,11 +120,7 @@ def sample_surroundings(
 
 
 def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
-    """The lighting after automatic exposure for a hand: stronger for dark skin, weaker for light skin.
-
-    Cameras meter the middle of the picture and its surroundings, so half of the difference between skins is
-    compensated.
-    """
+    """The lighting after automatic exposure, which makes half up for the difference between skins."""
     reflectance = ((skin.lightness + 16.0) / 116.0) ** 3  # CIELAB's definition
     gain = float((_MIDDLE_SKIN / reflectance) ** _METERED)
     lamps = tuple(dataclasses.replace(lamp, strength=gain * lamp.strength) for lamp in lighting.lamps)
@@ -135,7 +130,7 @@ def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
 
 
 def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: float) -> Lighting:
-    """Give light from everywhere the colors of a picture; how much there is of it stays."""
+    """Give a share of the ambient light the colors of a picture; its luminance stays."""
     ambient = np.array(lighting.ambient)
     rows = irradiance(picture)
     rows *= share * (ambient @ _LUMINANCE) / max(float(rows[0] @ _LUMINANCE), 1e-4)
@@ -145,9 +140,9 @@ def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: flo
 
 
 def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
-    """What a white matt surface sends back in a picture's light, by its normal in the camera's axes.
+    """Light of a white matt surface in a picture's light, by its normal (x, y, z) in the camera's axes.
 
-    Rows are the factors of 1, x, y, z, xy, yz, xz, x^2 - y^2 and 3 z^2 - 1.
+    Rows are factors of 1, x, y, z, xy, yz, xz, x^2 - y^2 and 3 z^2 - 1.
     """
     height, width = picture.shape[:2]
     pixels, functions = _looked_up(width, height)
@@ -158,7 +153,7 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
 
 @functools.lru_cache(maxsize=4)
 def _looked_up(width: int, height: int) -> tuple[Integers, Doubles]:
-    """Pixel of a picture in each direction (D,), and the nine functions there (D, 9)."""
+    """Pixel of a picture for each direction (D,), and the nine functions of the direction (D, 9)."""
     directions, functions = _sphere()
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
     aside = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1, keepdims=True), 1e-9)
@@ -169,7 +164,7 @@ def _looked_up(width: int, height: int) -> tuple[Integers, Doubles]:
 
 @functools.cache
 def _sphere() -> tuple[Doubles, Doubles]:
-    """Directions (D, 3) all around, evenly, and the nine functions there (D, 9)."""
+    """Even directions (D, 3) on the sphere, and their nine functions (D, 9)."""
     number = np.arange(_DIRECTIONS)
     z = 1.0 - (2.0 * number + 1.0) / _DIRECTIONS
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * number
