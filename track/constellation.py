@@ -46,17 +46,6 @@ def fit_inliers(
 
     Several wrong points together can bias a fit until the right ones look like outliers. Therefore the point
     without which the others fit best is removed, one at a time, until all agree.
-
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        points: Points in the world (N, 3) [m].
-        assignment: Points that are not kept are overwritten by -1.
-        pose: Overwritten; left as it is when fewer than three points agree.
-        tight: Largest residual of the points that determine the pose [m].
-        gate: Largest residual of a point that is kept [m].
-
-    Returns:
-        How many points are kept, and their RMS distance from their markers [m].
     """
     core, fitted = assignment.copy(), np.empty(7)
     count, _, worst = _fit_pose(positions, points, core, fitted)
@@ -202,21 +191,7 @@ def search_constellation(
     assignment: Ints,
     pose: Floats,
 ) -> tuple[int, float, int]:
-    """The largest set of points in the markers' constellation, from every triangle that fits.
-
-    Args:
-        positions: Markers in the body's frame (Q, 3) [m].
-        distances: Distances between markers (Q, Q) [m].
-        points: Points in the world (N, 3) [m].
-        expected: Expected positions of the markers in the world (Q, 3) [m].
-        radius: Largest distance from there [m]; infinite when nothing is known.
-        gate: Largest residual of a point after the fit [m].
-        assignment: Overwritten by the best assignment, as `pose` by its pose.
-
-    Returns:
-        Number of markers in the best assignment, its RMS distance [m], and number of markers in the best
-        other assignment.
-    """
+    """The largest set of points in the markers' constellation, from every triangle that fits."""
     apart = np.empty((len(points), len(points)))
     for i in range(len(points)):
         for j in range(len(points)):

@@ -40,13 +40,6 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
 
     A corrected label has a confidence of 1. Where a hand has at least four labeled markers its pose is fitted
     again; with fewer, and where the hand is lost, its pose stays. Poses of rigid bodies stay.
-
-    Args:
-        corrections: In the order in which they were made.
-
-    Raises:
-        CaptureError: A span is not within the frames, a label is unknown, or two points of a frame have one
-            label.
     """
     before = take.point_list
     pins = find_pins(corrections, before, take.label_names)

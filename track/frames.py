@@ -59,11 +59,7 @@ class StreamedFrame:
 
 
 def capture_of(capture: AnyCapture) -> Capture:
-    """The points of a capture or a take, without labels.
-
-    Raises:
-        CaptureError: The file is missing, damaged or of another kind.
-    """
+    """The points of a capture or a take, without labels."""
     if isinstance(capture, str | Path):
         capture = read_points(capture)
     if not isinstance(capture, Capture | Take):
@@ -76,11 +72,7 @@ def capture_of(capture: AnyCapture) -> Capture:
 
 
 def read_points(path: str | Path) -> Capture | Take:
-    """The capture or take of a file.
-
-    Raises:
-        CaptureError: The file is missing, damaged or of another kind.
-    """
+    """The capture or take of a file."""
     if str(path).lower().endswith((".npz", ".npz.part")):
         return load_take(path)
     return read_capture(path)
@@ -100,15 +92,7 @@ def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
 
 
 def checked_frames(capture: Capture) -> list[StreamedFrame]:
-    """The frames of a capture, if their points can be hands' markers.
-
-    Args:
-        capture: Positions (T, N, 3) [m].
-
-    Raises:
-        ArgumentError: The capture is not in meters.
-        CaptureError: Most of its points are far from any room.
-    """
+    """The frames of a capture, if their points can be hands' markers."""
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     check_place(capture, FARTHEST)

@@ -25,9 +25,9 @@ _PAIRS: Final = 5  # pairs of near markers that are listed
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
     """Write the page on a layout's score."""
-    layout = score.layout
+    layout, nothing = score.layout, "Nothing stands out: no marker is in anybody's way."
     sections = [
-        _advice_section(score),
+        Section("What to do", html_list(score.advice) if score.advice else nothing),
         *([_trials_section(score)] if score.trials else []),
         _labels_section(score),
         _markers_section(score),
@@ -43,11 +43,6 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
         f"frames of {score.seen_by}. Points were labeled by {network}."
     )
     write_sections(path, sections, title=f"Layout {layout.name}", lead=lead)
-
-
-def _advice_section(score: LayoutScore) -> Section:
-    nothing = "Nothing stands out: no marker is in anybody's way."
-    return Section("What to do", html_list(score.advice) if score.advice else nothing)
 
 
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:

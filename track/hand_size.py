@@ -42,7 +42,7 @@ from train.labelers.storage import labeler_at_once
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longest in ANSUR II
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
-_FAR: Final = 0.012  # [m] from the length that the labels were found with
+_FAR: Final = 0.012  # [m] change of length after which the hands are labeled again
 _PRECISION: Final = 0.001  # [m] of length
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
@@ -53,8 +53,8 @@ _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted t
 _MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
 _SOME_FRAMES: Final = 0.1  # the same of hands that fit well; hands that touch seldom begin a track
 _FITS_WELL: Final = 0.00175  # [m] median RMS distance; where points that are no hand's are found, it is more
-_FEWEST: Final = 3  # frames with which a size is trusted
-_MISSING: Final = 0.2  # share of the markers at most in such a frame
+_FEWEST: Final = 3  # fewest frames from which a size is trusted
+_MISSING: Final = 0.2  # largest share of missing markers in a frame that shows a hand
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
 _PATIENCE: Final = 20  # frames with enough points for a hand, but none, after which another size is tried
 _WINDOWS: Final = 8  # parts of a capture that are looked at
@@ -67,17 +67,17 @@ _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
 _SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size has 0.2 mm to spare
 _PART: Final = 30  # frames of each of two parts in which hands are compared
-_LEAST_FRAMES: Final = 10  # that tell anything
+_LEAST_FRAMES: Final = 10  # frames below which hands are not compared
 _NEAR: Final = 0.04  # [m] from a hand's points, where a point without a label counts against it
 _PENALTY: Final = 3.0  # log-odds of such a point, and of a marker that is not seen
 _FOUND: Final = 0.6  # share of the frames in which hands are found that fit
-_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # of such hands, for each of their markers
-_MOST_HIDDEN: Final = 0.35  # of hands all of whose markers are seen at times, as where they hide each other
-_FEW_NEAR: Final = 2.5  # points near hands that ghosts are
-_MOST_RMS: Final = 0.004  # [m] of such hands
-_LEAST_FOUND: Final = 0.5  # share of the frames in which what is named is found
-_BETTER: Final = 1.15  # as large must its log-odds be
-_MUCH_BETTER: Final = 2.0  # and where the scale is another
+_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # of the markers: missing ones, and points nearby, of hands that fit
+_MOST_HIDDEN: Final = 0.35  # the same for missing markers of a hand whose markers are all seen at times
+_FEW_NEAR: Final = 2.5  # points near a hand that may be ghosts
+_MOST_RMS: Final = 0.004  # [m] median RMS distance of hands that fit
+_LEAST_FOUND: Final = 0.5  # share of the frames in which suggested hands are found, at least
+_BETTER: Final = 1.15  # factor of our log-odds from which on another glove is suggested
+_MUCH_BETTER: Final = 2.0  # the same for another scale
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
 _WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
@@ -122,15 +122,7 @@ def fit_size(
     *,
     is_quick: bool = False,
 ) -> SizeFit | None:
-    """The size and proportions of the hands in some frames.
-
-    Args:
-        frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
-        is_quick: Whether hands are looked for as adults' and by the weaker evidence alone.
-
-    Returns:
-        The hands, both of one shape; None if no hand is found that shows most of its markers.
-    """
+    """The size and proportions of the hands in some frames."""
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
@@ -279,11 +271,7 @@ class _Search:
         return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
 
     def measures(self, length: float) -> tuple[float, float]:
-        """Length and breadth [m].
-
-        Args:
-            length: The likeliest of hands of the usual breadth [m].
-        """
+        """Length and breadth [m]."""
         usual = usual_breadth(length)
         low, high = (factor * usual for factor in _BREADTHS)
         breadth = _least(lambda tried: self._cost(length, tried), low, high)
@@ -337,22 +325,22 @@ class _Fit(NamedTuple):
     """How well hands fit some frames."""
 
     log_odds: float = 0.0
-    """Mean over the frames of that of hands, less what speaks against them."""
+    """Mean over the frames of the hands' log-odds, less penalties."""
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
     shown: int = 0
-    """Number of frames in which any is."""
+    """Number of frames in which any hand is found."""
     is_good: bool = False
-    """Whether nothing tells of a mistake."""
+    """Whether the hands fit well enough not to look for others."""
     is_whole: bool = False
-    """Whether each marker is seen at times: a glove fits the points of another one that has fewer markers."""
+    """Whether each marker is seen at times; otherwise the glove worn may have fewer markers."""
 
 
 class _Other(NamedTuple):
-    """What may fit better."""
+    """A glove or scale that may fit better."""
 
     name: str
-    """Of its glove, or the path of the glove's file."""
+    """Name of the glove, or path of its file."""
     layout: MarkerLayout
     scale: float
     """Factor that makes the points ones in meters."""
@@ -374,12 +362,6 @@ def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
     """Refuse points that fit hands at another scale, which distances between neighbors tell.
 
     `check_hands` finds that too, after all else that may be wrong.
-
-    Args:
-        frames: Frames of unlabeled points [m], as `sample_frames` gives.
-
-    Raises:
-        ArgumentError: The points fit hands at another scale alone.
     """
     some = _compared(frames)
     if not some:
@@ -406,16 +388,6 @@ def check_hands(
 
     That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
     the working folder.
-
-    Args:
-        frames: Frames of unlabeled points [m], as `sample_frames` gives.
-        options: Those by which the user can name what fits better.
-
-    Raises:
-        ArgumentError: The points fit hands at another scale alone.
-
-    Warns:
-        HandSimWarning: They fit another hand or glove clearly better.
     """
     some = _compared(frames)
     if not some:

@@ -27,7 +27,7 @@ LABELED: Final = (
     "biases of the hand",
     "improbable digit",
 )
-"""What is told of a point with a label."""
+"""Names of the evidence on a point with a label."""
 UNLABELED: Final = (
     "labels in its life",
     "a free marker within 10 mm",
@@ -38,34 +38,34 @@ UNLABELED: Final = (
     "markers not seen",
     "biases of the hand",
 )
-"""What is told of a point without a label."""
-_LEAST_RESIDUAL: Final = 0.0003  # [m] that a marker is usually off, at least: the noise of optical systems
-_FEWEST: Final = 10  # frames that tell how far a marker is usually off
-_LINK: Final = 0.015  # [m] that a point moves in its hand from frame to frame at most, where IDs do not last
-_EXCHANGE: Final = 0.005  # [m] that points jump at least whose IDs were exchanged
-_BESIDE: Final = 0.1  # [m] within which points are those of one hand
-_SHORT: Final = 20.0  # frames of a life that tells nothing by being short
-_FAR: Final = 1.0  # [m] in the place of what is not there
-_MOST_OFF: Final = 100.0  # usual residuals; more tells no more
+"""Names of the evidence on a point without a label."""
+_LEAST_RESIDUAL: Final = 0.0003  # [m] least usual residual of a marker: the noise of optical systems
+_FEWEST: Final = 10  # frames from which the usual residual of a marker is estimated, at least
+_LINK: Final = 0.015  # [m] largest motion of a point within its hand between frames, where IDs do not last
+_EXCHANGE: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
+_BESIDE: Final = 0.1  # [m] radius within which points belong to one hand
+_SHORT: Final = 20.0  # frames from which on the length of a life is no evidence
+_FAR: Final = 1.0  # [m] distance of a neighbor that does not exist
+_MOST_OFF: Final = 100.0  # usual residuals, at which the evidence of a residual is cut off
 
 
 class Evidence(NamedTuple):
-    """What is told of P points of a take, in the order of its frames."""
+    """Evidence on P points of a take, in the order of its frames."""
 
     points: Int[np.ndarray, "P"]
-    """Which points of the take's list these are."""
+    """Indices of the points in the take's list."""
     labels: Int[np.ndarray, "P"]
-    """Its label, -1 for none."""
+    """Label of each point, -1 for none."""
     markers: Int[np.ndarray, "P"]
-    """Its label, or that of the nearest marker without a point."""
+    """Label of each point, or of the nearest marker without a point."""
     labeled: Float[np.ndarray, "L 7"]
-    """What is told of the points with a label, see `LABELED`."""
+    """Evidence on the points with a label, see `LABELED`."""
     unlabeled: Float[np.ndarray, "U 8"]
-    """What is told of those without one, see `UNLABELED`."""
+    """Evidence on the points without a label, see `UNLABELED`."""
 
 
 def evidence_of(take: Take) -> Evidence:
-    """What a take with poses tells of the labels of its points; those of rigid bodies are left out."""
+    """Evidence on the labels of a take with poses, without those of rigid bodies."""
     count = take.hand_labels[-1].stop
     listed = take.point_list
     chosen = np.flatnonzero(listed.labels < count)
@@ -111,7 +111,7 @@ def evidence_of(take: Take) -> Evidence:
 
 
 def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
-    """How far each marker is usually off its pose [m]."""
+    """Usual distance of each marker from its pose [m]."""
     known = np.isfinite(residuals).sum(axis=0) >= _FEWEST
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
@@ -134,7 +134,7 @@ def _lives(
 def _of_hands(
     take: Take, seen: Bool[np.ndarray, "T K"], owners: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "T H 2"]:
-    """What is told of a hand: its markers that are not seen, and how far off the glove its markers are."""
+    """Evidence on each hand: its share of hidden markers, and the size of its marker biases."""
     values = np.zeros((*take.status.shape, 2))
     for hand, side in enumerate(take.sides):
         values[:, hand, 0] = np.log1p(20.0 * (1.0 - seen[:, owners == hand].mean(axis=1)))
@@ -168,19 +168,10 @@ def _surroundings(
     beside: float,
     far: float,
 ) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "3 U"]]:
-    """What is around the points without a label.
+    """Surroundings of the points without a label.
 
-    Args:
-        points: Points of all frames [m].
-        labels: Their labels, -1 for none.
-        starts: First point of each frame, and the number of points.
-        expected: Markers of the poses [m], NaN where a hand has none.
-        beside: Distance [m] within which points are counted.
-        far: Distance [m] in the place of one from what is not there.
-
-    Returns:
-        The nearest marker without a point; its distance and that of the nearest other point [m], and the
-        number of points without a label beside it.
+    These are the nearest marker without a point, its distance and that of the nearest other point [m], and
+    the number of points without a label nearby.
     """
     count = (labels < 0).sum()
     marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), far)
@@ -217,16 +208,7 @@ def _follow(
     link: float,
     exchange: float,
 ) -> Int[np.ndarray, "P"]:
-    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged.
-
-    Args:
-        points: Points of all frames [m].
-        ids: The system's IDs, -1 for none.
-        starts: First point of each frame, and the number of points.
-        centers: Middle of each hand's markers [m]; the points around it move with it.
-        link: Step [m] to a point of the next frame at most, where IDs do not last.
-        exchange: Step [m] at least of points whose IDs were exchanged.
-    """
+    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged."""
     lives, number = np.full(len(points), -1), 0
     for frame in range(len(starts) - 1):
         first, last = starts[frame], starts[frame + 1]
@@ -269,14 +251,7 @@ def _undo_exchanges(
     source: Int[np.ndarray, "N"],
     exchange: float,
 ) -> None:
-    """Exchange the sources of two points that both jump, if each is where the other one was predicted.
-
-    Args:
-        predicted: The points of the frame before where they are predicted [m].
-        points: Points of the frame [m].
-        source: Which of `predicted` each is, -1 for none; overwritten.
-        exchange: Least jump [m].
-    """
+    """Exchange the sources of two points that both jump, if each is where the other one was predicted."""
     for j in range(len(source)):
         for m in range(j):
             one, other = source[j], source[m]
@@ -312,10 +287,6 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
     """Probability that each point's label is right; of a point without one, that it is no marker.
 
     Confidences of rigid bodies' points stay, and all those of a take without poses.
-
-    Args:
-        take: A take of hands.
-        evidence: What `evidence_of` makes of it, where that is known already.
     """
     confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():

@@ -8,7 +8,6 @@ enough.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,12 +39,10 @@ from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m], the same for points that determine the pose, and in a search
-_TIGHTEST: Final = 0.0005  # [m], the same in a search that finds three points, which may fit by chance
+_TIGHT: Final = 0.001  # [m] largest residual of points that determine the pose, and in a search
+_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that finds three points, which may fit by chance
 _LEAST_WIDTH: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
-_LEAST_MARKER_DISTANCE: Final = (
-    2.0 * GATE
-)  # [m]: markers nearer to each other than this could exchange labels
+_LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m]; markers nearer to each other could exchange labels
 _LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
 _VELOCITY_FITS: Final = 5  # consecutive fits from which the velocity is known
 _VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
@@ -55,7 +52,6 @@ _RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with on
 _CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers are accepted at once
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
 _MOST_SEARCHED_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
-_FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
 SUFFIX: Final = ".toml"
 _EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
 _BODY_KEYS: Final = ("name", "description", "marker")
@@ -63,9 +59,9 @@ _MARKER_KEYS: Final = ("name", "place_mm")
 _MOST_LEARNED_MARKERS: Final = 20
 _COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
 _TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
-_AVERAGING_ROUNDS: Final = 3  # of averaging the markers over all frames
-_LEAST_SEEN_SHARE: Final = 0.5  # of the body's frames that a marker must be in
-_LEAST_LABELED_SHARE: Final = 0.8  # of all points that must be the body's
+_AVERAGING_ROUNDS: Final = 3  # rounds of averaging the markers over all frames
+_LEAST_SEEN_SHARE: Final = 0.5  # least share of the body's frames in which a marker is seen
+_LEAST_LABELED_SHARE: Final = 0.8  # least share of all points that are the body's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,8 +98,8 @@ def template_fault(
     name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
 ) -> str | None:
     """Why these markers [m] are not a body that can be tracked, as a sentence; None if they are."""
-    if positions.ndim != 2 or len(positions) < FEWEST:
-        return f"{name}: {positions.shape[-2]} markers, expected at least {FEWEST}, which determine a pose"
+    if len(positions) < FEWEST:
+        return f"{name}: {len(positions)} markers, expected at least {FEWEST}, which determine a pose"
     if len(set(marker_names)) < len(marker_names):
         return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
     distances = _distances_between(positions)
@@ -187,32 +183,9 @@ class BodyTracker:
         self._reset()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
-        """Track the body in the next frame; any content of a stream ends in a status.
-
-        Args:
-            points: All points of the frame [m], in any order, with those of hands and ghosts. Points with
-                coordinates that are not finite are ignored.
-            ids: The system's ID of each point, negative where it gives none.
-
-        Raises:
-            ArgumentError: `points` and `ids` do not fit together.
-        """
+        """Track the body among the finite points of the next frame."""
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
-        if points.shape != (len(ids), 3):
-            raise ArgumentError(
-                f"points have shape {points.shape}, expected ({len(ids)}, 3) for {len(ids)} IDs"
-            )
-        with np.errstate(invalid="ignore"):
-            usable = np.abs(points).max(axis=1, initial=0.0) < _FARTHEST  # which NaN is not
-        if usable.all():
-            return self._step(points, ids, time)
-        frame = self._step(points[usable], ids[usable], time)
-        labels = np.full(len(points), -1)
-        labels[usable] = frame.labels
-        return dataclasses.replace(frame, labels=labels)
-
-    def _step(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> BodyFrame:
         elapsed = time - self._time
         if self._status != Status.LOST:
             frame = self._track(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
@@ -278,10 +251,7 @@ class BodyTracker:
         """The body near its predicted pose, or anywhere."""
         pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
-            radius, predicted = (
-                self._search_radius(elapsed),
-                self._predict(elapsed),
-            )
+            radius, predicted = self._search_radius(elapsed), self._predict(elapsed)
             count, rms = self._match(points, predicted, radius, assignment, pose)
             if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
                 return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
@@ -411,12 +381,7 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
 
 
 def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
-    """Bodies that are tracked together, or one.
-
-    Raises:
-        ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
-        BodyError: A file cannot be loaded.
-    """
+    """Bodies that are tracked together, or one."""
     if isinstance(names_or_paths, AnyBody):
         names_or_paths = (names_or_paths,)
     check_type("bodies", names_or_paths, Iterable, _EXPECTED)
@@ -477,14 +442,6 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
 
     A first template is taken from one frame and tracked through all frames. Then each marker moves to its
     median over the frames.
-
-    Args:
-        capture: A capture of the body in motion; gaps and a few false points are allowed. Marker names are
-            not used.
-
-    Raises:
-        ArgumentError: The capture is not in meters.
-        CalibrationError: Most of the points are not of one rigid body, or the body cannot be tracked.
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
@@ -498,9 +455,6 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
         )
     for _ in range(_AVERAGING_ROUNDS):
         positions = _median_positions(body, frames, tracked)
-        fault = _fault(name, positions)
-        if fault is not None:
-            raise CalibrationError(fault)
         body = _template(name, positions)
         tracked = _track(body, frames)
     return body
@@ -518,29 +472,26 @@ def _best_template(
         )
     chosen = np.flatnonzero(counts == count)
     chosen = chosen[np.linspace(0, len(chosen) - 1, _TEMPLATE_CANDIDATES).round().astype(int)]
-    candidates = []
-    faults = {number: _fault(name, frames[number].points) for number in np.unique(chosen)}
-    for number, fault in faults.items():
-        if fault is None:
+    candidates, faults = [], []
+    for number in np.unique(chosen):
+        try:
             body = _template(name, frames[number].points)
+        except CalibrationError as error:
+            faults.append(error)
+        else:
             candidates.append((body, _track(body, frames)))
     if not candidates:
-        raise CalibrationError(f"{list(faults.values())[-1]}")
+        raise faults[-1]
     return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
 
 
-def _marker_names(positions: NDArray[np.float64]) -> tuple[str, ...]:
-    return tuple(f"Marker{number + 1}" for number in range(len(positions)))
-
-
-def _fault(name: str, positions: NDArray[np.float64]) -> str | None:
-    """What is wrong with a body of markers at these positions (Q, 3), if anything."""
-    return template_fault(name, _marker_names(positions), positions - positions.mean(axis=0))
-
-
 def _template(name: str, positions: NDArray[np.float64]) -> RigidTemplate:
-    """A body of markers at these positions (Q, 3), moved to its own frame."""
-    return RigidTemplate(name, _marker_names(positions), positions - positions.mean(axis=0))
+    """A body of markers at these positions (Q, 3) [m], moved to its own frame."""
+    names = tuple(f"Marker{number + 1}" for number in range(len(positions)))
+    try:
+        return RigidTemplate(name, names, positions - positions.mean(axis=0))
+    except ArgumentError as error:
+        raise CalibrationError(str(error)) from error
 
 
 def _track(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:

@@ -99,15 +99,7 @@ class TrackerSetup:
 
     @classmethod
     def of(cls, settings: LabelSettings) -> Self:
-        """The setup that settings name.
-
-        Raises:
-            ArgumentError: Hands and size do not go together, a hand wears another glove, a body is unknown,
-                or a name is given twice.
-            UserError: A user's file cannot be read.
-            LayoutError: The glove is unknown, or does not fit a hand.
-            WeightsError: The labeler is unknown, or knows other markers.
-        """
+        """The setup that settings name."""
         user, is_auto = _chosen_user(settings)
         tracking = settings if isinstance(settings, TrackSettings) else TrackSettings()
         bodies, config = load_bodies(tracking.bodies), tracking.tracker
@@ -128,11 +120,7 @@ class TrackerSetup:
         )
 
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
-        """The setup with the hands as measured in some frames, if they are to be measured.
-
-        Raises:
-            ArgumentError: See `check_hands`, which warns of hands that do not fit.
-        """
+        """The setup with the hands as measured in some frames, if they are to be measured."""
         check_scale(frames, self.user, self.labeler)
         user, is_named = self.user, self.user.notes in get_args(Size)
         if self.is_auto:

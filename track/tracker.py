@@ -250,26 +250,18 @@ class Tracker:
         if not lost:
             return frame, outcomes
         free = frame.free_for(lost)
-        if not self._is_attempt_due(frame.time, len(free)):
+        # Lost hands are looked for less and less often among the same number of points.
+        is_due = frame.time >= self._last_attempt + self._attempt_wait
+        if not is_due and len(free) < self._attempt_points + _MORE_POINTS:
             return frame, outcomes
         initialized = self._initializer.initialize(frame.points[free], lost)
         for found in initialized:
             frame, outcomes = self._start(frame, outcomes, found, free)
         goes_on = bool(initialized) or self._initializer.is_searching(lost)
-        self._attempt_wait = 0.0 if goes_on else self._longer_wait()
+        longer = min(_WAIT_FACTOR * max(self._attempt_wait, _FIRST_WAIT), _LONGEST_WAIT)
+        self._attempt_wait = 0.0 if goes_on else longer
         self._last_attempt, self._attempt_points = frame.time, len(free)
         return frame, outcomes
-
-    def _is_attempt_due(self, time: float, num_points: int) -> bool:
-        """Whether lost hands are looked for: less and less often among the same number of points."""
-        return (
-            time >= self._last_attempt + self._attempt_wait
-            or num_points >= self._attempt_points + _MORE_POINTS
-        )
-
-    def _longer_wait(self) -> float:
-        """Time until the next attempt after one in vain [s]."""
-        return min(_WAIT_FACTOR * max(self._attempt_wait, _FIRST_WAIT), _LONGEST_WAIT)
 
     def _replace_doubted(
         self, frame: FrameState, outcomes: tuple[_Outcome, ...]

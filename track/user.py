@@ -193,12 +193,7 @@ def _left_as_measured(notes: str) -> list[str]:
 
 
 def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) -> User:
-    """Hands of one of the five sizes in gloves as designed, of one side or both.
-
-    Raises:
-        ArgumentError: There is no such size, a side is named twice, or none is.
-        LayoutError: The glove is for the other hand.
-    """
+    """Hands of one of the five sizes in gloves as designed, of one side or both."""
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
@@ -206,12 +201,7 @@ def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) ->
 
 
 def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
-    """The user of hands, of a user's file, or one that is given.
-
-    Raises:
-        ArgumentError: It is of another type, or the hands are no user's.
-        UserError: The file cannot be read.
-    """
+    """The user of hands, of a user's file, or one that is given."""
     if isinstance(hands, str | Path):
         user = load_user(hands)
         return dataclasses.replace(user, notes="; ".join([Path(hands).name, *_left_as_measured(user.notes)]))

@@ -132,12 +132,7 @@ def evaluate_digit(
 ) -> None:
     """Evaluate all assignments of candidate points to the markers of one digit.
 
-    Args:
-        hand: The hand, its markers shifted by their biases.
-        points: Points in the world [m].
-        candidates: Which of them are tried.
-        log_odds: Log-odds of each label beside the fit, from IDs, presence and queries.
-        found: The digit's hypotheses, filled.
+    `log_odds` are those of each label beside the fit, from IDs, presence and queries.
     """
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
@@ -278,18 +273,10 @@ def fit_hypothesis(
     angles: Float[np.ndarray, "4"],
     work: Workspace,
 ) -> tuple[float, float]:
-    """Fit the four hinges of a digit to a hypothesis by Levenberg-Marquardt.
+    """Fit the four hinges of a digit [rad] to a hypothesis; return the cost and the complexity term.
 
-    Args:
-        hypothesis: Candidate of each of the digit's markers, -1 for none.
-        cutoff: Cost beyond which the fit stops early if it would end there.
-        angles: Hinges to start from [rad], overwritten.
-        work: The bones of the hand must be computed.
-
-    Returns:
-        The cost of markers and prior (half squared standard deviations), and the complexity term: half the
-        log ratio of the hinges' precision after and before (Laplace's approximation), because a hypothesis
-        that any pose would fit is little evidence.
+    The complexity is half the log ratio of the hinges' precision after and before (Laplace's approximation),
+    because a hypothesis that any pose would fit is little evidence. Costs beyond `cutoff` end the fit early.
     """
     trial, factor, step = angles.copy(), np.empty((4, 4)), np.empty(4)
     normal, gradient = np.empty((4, 4)), np.empty(4)

@@ -168,12 +168,7 @@ class PointHistory:
         time: float,
         expected: Float[np.ndarray, "K 3"],
     ) -> FrameState:
-        """The next frame with the labels and the evidence that its points carry over.
-
-        Args:
-            ids: The stream's IDs, -1 for none.
-            expected: Predicted position of the marker of each label [m]; NaN where there is none.
-        """
+        """The next frame with the labels and the evidence that its points carry over."""
         if time - self._last_time > self._silence:
             self._labels = {}
         self._last_time = time

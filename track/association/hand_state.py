@@ -165,10 +165,7 @@ class HandState:
     ) -> HandEstimate:
         """Fit the pose to labeled markers; what they leave open follows the prediction.
 
-        Args:
-            targets: Labeled markers [m]; NaN where missing. With fewer than four of them the pose is the
-                predicted one and has no RMS.
-            start: A pose near the solution.
+        With fewer than four markers the pose is the predicted one and has no RMS.
         """
         qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
@@ -224,11 +221,7 @@ class HandState:
         return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
 
     def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log-odds of a marker coming back when a point appeared, against a stray as old as the point.
-
-        Args:
-            first_seen: Time at which each point appeared [s].
-        """
+        """Log-odds of a marker coming back when a point appeared, against a stray as old as the point."""
         gap = first_seen[:, None] - self._last_seen
         log_odds: NDArray[np.float64] = np.log(
             np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
@@ -240,12 +233,7 @@ class HandState:
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
     ) -> HandEstimate:
-        """Start from a pose without history; the biases are kept if they still fit.
-
-        Args:
-            qpos: A pose near the solution.
-            targets: Labeled markers [m]; NaN where missing.
-        """
+        """Start from a pose without history; the biases are kept if they still fit."""
         self._velocity[:] = 0.0
         self._last_seen[:] = time
         self._last_label[:] = -np.inf
@@ -289,11 +277,7 @@ class HandState:
         return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
 
     def update(self, estimate: HandEstimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
-        """Take over the pose of the next frame, and learn the biases of markers with settled labels.
-
-        Args:
-            settled: Which markers have a settled label.
-        """
+        """Take over the pose of the next frame, and learn the biases of markers with settled labels."""
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
@@ -386,15 +370,7 @@ def _shift_markers(
     variance: Float[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 4 3"],
 ) -> float:
-    """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m].
-
-    Args:
-        bias_frames: Frames that each bias was averaged over; zero where it is unknown.
-        bias: Bias of each marker in the frame of its bone [m].
-        designed: Position of each marker in that frame as the glove has it [m].
-        variance: Variance of each marker [m^2], overwritten where it is below the least.
-        positions: `HandArrays.positions`; the first of each marker is overwritten.
-    """
+    """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m]."""
     square, count = 0.0, 0
     for marker in range(len(bias_frames)):
         for i in range(3):

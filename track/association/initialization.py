@@ -124,17 +124,15 @@ class HandInitializer:
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
     def initialize(self, points: Float[np.ndarray, "N 3"], hands: Sequence[int]) -> list[InitializedHand]:
-        """Look for some of the hands.
-
-        Args:
-            points: Points without a label [m].
-            hands: Indices of the hands that are looked for.
-        """
+        """Look for some of the hands."""
         search = self._searches.pop(tuple(hands), _Search())
         self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
         cut = False
-        for group in self._groups(points, hands):
+        least = min((self._least(index) for index in hands), default=0)
+        for group in linked_groups(np.ascontiguousarray(points), self._link_distance):
+            if not least <= len(group) <= MOST_POINTS:
+                continue
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
             here: list[InitializedHand] = []
@@ -193,12 +191,6 @@ class HandInitializer:
         variance = variance if spread is None else spread**2
         peak = peak_log_odds(np.array([variance]), self._config.stray_density)
         return float(count * peak[0] - 0.5 * (square / variance + taken))
-
-    def _groups(self, points: NDArray[np.float64], hands: Sequence[int]) -> list[NDArray[np.int64]]:
-        """Points that are linked and enough for a hand, the largest group first."""
-        least = min((self._least(index) for index in hands), default=0)
-        groups = linked_groups(np.ascontiguousarray(points), self._link_distance)
-        return [group for group in groups if least <= len(group) <= MOST_POINTS]
 
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
@@ -490,11 +482,7 @@ def _clouds(
 
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
-    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first.
-
-    Args:
-        distance: Longest step [m].
-    """
+    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
     number = _single_linkage(points, distance)
     groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
     return sorted(groups, key=len, reverse=True)

@@ -187,12 +187,7 @@ def _worst_label(
 
 
 def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
-    """Fit the pose of a hand again if its labels have changed.
-
-    Args:
-        before: The frame with the labels that `track` was fitted to.
-        frame: The frame now.
-    """
+    """Fit the pose of a hand again if its labels have changed."""
     if (before.markers(track.hand) == frame.markers(track.hand)).all():
         return frame, track
     frame, estimate = fit_labels(frame, track.hand, track.state, track.prediction)

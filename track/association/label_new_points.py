@@ -240,12 +240,7 @@ def assign_jointly(
 ) -> None:
     """Assign points to digits: the best combination of hypotheses of all digits that share points.
 
-    Args:
-        hypotheses: The best assignment of every set of them, digit by digit.
-        markers: Markers of each digit, counted through the hands; -1 where there are fewer.
-        assigned: Marker of each point, -1 for none; overwritten.
-        margins: Log-odds by which the next best combination is worse in which a point has another label;
-            written for candidate points.
+    A point's margin is the log-odds by which the next best combination with another label for it is worse.
     """
     pending = candidates.counts > 0
     group = np.empty(len(pending), dtype=np.int64)
@@ -346,15 +341,7 @@ def best_combination(
 ) -> float:
     """The best choice of one row per digit such that no point is used twice, by branch and bound.
 
-    Args:
-        scores: Scores of each digit's rows (log-odds), the best first.
-        sets: Points that each row uses, one bit per point.
-        counts: Rows of each digit; the last must use no point.
-        banned: A row of each digit that must not be chosen; -1 for none.
-        best: The chosen rows, overwritten.
-
-    Returns:
-        The sum of their scores; `-IMPOSSIBLE` if there is no choice.
+    Returns the sum of the scores; `-IMPOSSIBLE` if there is no choice. `sets` has one bit per point.
     """
     digits = len(scores)
     bound = np.zeros(digits + 1)

@@ -30,7 +30,6 @@ from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     Corners,
-    Skin,
     SkinCoordinates,
     SkinPatch,
     attachment_at,
@@ -78,11 +77,8 @@ _MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their 
 Progress = Callable[[int, float, float], None]
 """Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
-_DAMPING_RAISE, _DAMPING_CUT, _LEAST_RAISED_DAMPING = (
-    10.0,
-    0.2,
-    1e-6,
-)  # factors of the damping after a failed step and a good one
+_DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors of the damping after a failed step and a good one
+_LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
 SMALL_GAIN: Final = 1e-4
 """Share of the energy; a step that gains less is the last one."""
@@ -176,7 +172,7 @@ class Problem:
         _, by_bone = skinning_terms(model, bones, estimate.points, weights)
         predicted = np.einsum("ml,tmli->tmi", weights, by_bone, optimize=True)
         residuals = np.where(self.present[..., None], predicted - self.targets, 0.0)
-        faces, count = self._faces(estimate), len(estimate.points)
+        faces, count = self._all_coordinates(estimate).faces, len(estimate.points)
         corners = SkinPatch(faces).corners(model.surface.vertices)
         _, normals = skin_points(estimate.coordinates, _part(corners, 0, count))
         design, _ = skin_points(self.design, _part(corners, count, 2 * count))
@@ -186,13 +182,6 @@ class Problem:
             geometry = contact_geometry(estimate.contacts, pads, model, bones[estimate.contacts.frames])
         fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
         return fit._replace(cost=self._cost(estimate, fit))
-
-    def _faces(self, estimate: Estimate) -> NDArray[np.int64]:
-        """Triangles of the markers, of their design, and of the contacts on thumb and fingers."""
-        faces = [estimate.coordinates.faces, self.design.faces]
-        if estimate.contacts is not None:
-            faces += [estimate.contacts.thumb_coordinates.faces, estimate.contacts.finger_coordinates.faces]
-        return np.concatenate(faces)
 
     def _cost(self, estimate: Estimate, fit: Fit) -> float:
         squares = (fit.residuals**2).sum(axis=2)
@@ -225,7 +214,7 @@ class Problem:
         """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
-        patch = SkinPatch(self._faces(estimate))
+        patch = SkinPatch(self._all_coordinates(estimate).faces)
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
         bone_weights = skin_weights(estimate.coordinates)
         by_pose, by_shape, by_point, by_bone = self._point_jacobians(
@@ -277,7 +266,7 @@ class Problem:
         return np.stack(columns, axis=-1)
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
-        """Of the markers, of their design, and of compressed pads at the contacts, as in `_faces`."""
+        """Skin coordinates of the markers, of their design, and of compressed pads at the contacts."""
         parts = [estimate.coordinates, self.design]
         if estimate.contacts is not None:
             parts += [
@@ -363,13 +352,7 @@ class Problem:
     def apply_step(
         self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
     ) -> Estimate:
-        """The estimate after a step, with new coordinates of its markers on the new hand's skin.
-
-        Args:
-            estimate: The estimate before the step.
-            pose_step: Change of each pose [m, rad], in tangent coordinates of qpos; clipped at 0.5.
-            shared_step: Change of the parameters, then of each marker's rest position [m].
-        """
+        """The estimate after a step, with new coordinates of its markers on the new hand's skin."""
         parameters = estimate.parameters + shared_step[:NUM_PARAMETERS]
         shape = shape_at(self.shape, parameters)
         skin = build_skin(shape)
@@ -412,12 +395,7 @@ def find_touches(
     complete: Bool[np.ndarray, "T 5"],
     rate: float,
 ) -> list[tuple[int, str]]:
-    """Frames and fingers of possible touches.
-
-    Args:
-        model: A right hand.
-        complete: Whether all markers of a digit were seen.
-    """
+    """Frames and fingers of possible touches."""
     by_finger = [thumb_contact(model, angles, finger) for finger in FINGERS]
     gaps = np.stack([-contact.overlap for contact in by_finger], axis=1)
     window = max(1, round(_SPEED_WINDOW * rate))
@@ -461,12 +439,7 @@ def _speed(
 def initialize_contacts(
     model: HandModel, touches: list[tuple[int, str]], T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Contacts of touches, their points first where the two last bones come nearest.
-
-    Args:
-        model: A right hand.
-        touches: Frame and finger of each.
-    """
+    """Contacts of touches, their points first where the two last bones come nearest."""
     points = np.empty((2, len(touches), 3))
     for number, (_, finger) in enumerate(touches):
         ends = _nearest_skin_points(model, T_world_bone[number], finger)
@@ -504,17 +477,15 @@ def slide_contacts(
 
     Each point moves to the point of its skin nearest to a target inside the other pad. A target on the other
     skin would fail where the skins overlap.
-
-    Args:
-        model: A right hand.
-        T_world_bone: Its bones in the frame of each contact.
     """
     skin = build_skin(model.shape)
     sides = [contacts.thumb_coordinates, contacts.finger_coordinates]
     for _ in range(_SLIDE_ROUNDS):
         for own, other in ((0, 1), (1, 0)):
             inner = sides[other]._replace(heights=np.full(len(contacts.frames), -_PAD_DEPTH))
-            target = _posed_points(inner, skin, model, T_world_bone)
+            points, _ = skin_points(inner, skin.corners(inner.faces))
+            blend = _blend_transforms(inner, model, T_world_bone)
+            target = np.einsum("kij,kj->ki", blend[:, :, :3], points) + blend[:, :, 3]
             blend = _blend_transforms(sides[own], model, T_world_bone)
             rest = np.linalg.solve(blend[:, :, :3], (target - blend[:, :, 3])[..., None])[..., 0]
             slid = project_onto_skin(sides[own], rest, skin)
@@ -525,13 +496,7 @@ def slide_contacts(
 def contact_geometry(
     contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> ContactGeometry:
-    """How the pads lie to each other.
-
-    Args:
-        corners: Triangles of the thumb's points, then of the fingers' (2 K).
-        model: A right hand.
-        T_world_bone: Its bones in the frame of each contact (K, L, 4, 4).
-    """
+    """How the pads lie to each other."""
     count = len(contacts.frames)
     points, normals = [], []
     for part, coordinates in enumerate((contacts.thumb_coordinates, contacts.finger_coordinates)):
@@ -576,16 +541,6 @@ def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) ->
         deviation = geometry.gaps[mine] - np.quantile(geometry.gaps[mine], _GAP_QUANTILE)
         weights[mine] = (1.0 + (deviation / _GAP_SCALE) ** 2) ** -2.0
     return weights
-
-
-def _posed_points(
-    coordinates: SkinCoordinates, skin: Skin, model: HandModel, T_world_bone: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Points in the world (K, 3) [m], each in its frame."""
-    rest, _ = skin_points(coordinates, skin.corners(coordinates.faces))
-    blend = _blend_transforms(coordinates, model, T_world_bone)
-    posed: NDArray[np.float64] = np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]
-    return posed
 
 
 def _blend_transforms(
@@ -636,12 +591,7 @@ def contact_gap(estimate: Estimate, fit: Fit) -> float:
 
 
 def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
-    """The right hand of an estimate in its glove.
-
-    Args:
-        right: A right hand in the same glove.
-        estimate: Shape and markers.
-    """
+    """The right hand of an estimate in its glove."""
     shape = shape_at(problem.shape, estimate.parameters)
     return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
@@ -651,9 +601,8 @@ def eliminate_poses(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Schur complement of the poses, with `damping` times the diagonal of their blocks added to it.
 
-    Returns:
-        The reduced system with its gradient as the last column (S, S + 1), and the poses' blocks solved for
-        the shared unknowns and the gradient (F, 26, S + 1).
+    Returns the reduced system with its gradient as last column (S, S + 1), and the poses' blocks solved for
+    the shared unknowns and the gradient (F, 26, S + 1).
     """
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])

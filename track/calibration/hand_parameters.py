@@ -76,14 +76,7 @@ def shape_jacobian(
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
     count: int = NUM_PARAMETERS,
 ) -> Float[np.ndarray, "*shape 53"]:
-    """Derivative of a function of the shape by the parameters, by finite differences.
-
-    Args:
-        start: Shape of zero parameters.
-        parameters: Where to differentiate.
-        function: Arrays that depend on shapes, one for each.
-        count: The first parameters, on which alone the function depends.
-    """
+    """Derivative of a function of the shape by the parameters, by finite differences."""
     nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # the first as it is
     values = function([shape_at(start, one) for one in nudged])
     jacobian = np.zeros((*values.shape[1:], NUM_PARAMETERS))
@@ -223,11 +216,7 @@ class SkinPatch:
         self._corners = np.searchsorted(vertices, mesh.faces[faces])
 
     def corners(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
-        """Corners of the triangles.
-
-        Args:
-            vertices: Vertices of a hand's `HandSurface` [m].
-        """
+        """Corners of the triangles."""
         points = self._rows @ vertices
         return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
 
@@ -270,13 +259,7 @@ def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: Han
 def displace_markers(
     worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
 ) -> Attachment:
-    """A glove on a right hand with every marker displaced along the skin, as on a real glove.
-
-    Args:
-        worn: The glove as designed.
-        distance: Length of each marker's displacement, in a random direction [m].
-        lift: Standard deviation of its height above the skin [m].
-    """
+    """A glove on a right hand with every marker displaced along the skin, as on a real glove."""
     steps = rng.normal(size=worn.points.shape)
     steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
     steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
-from handsim.errors import ArgumentError, CalibrationError
+from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
 from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape
 from handsim.hand.skin import rest_vertices
@@ -195,33 +195,25 @@ def calibrate_hand(
     *,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Fit a hand and its glove to one user's labeled markers.
-
-    Args:
-        markers: The markers of one hand in the glove's order [m]; NaN where missing. Of joints that do not
-            move and tips that do not touch, what is usual among people stays.
-        start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
-
-    Returns:
-        The calibrated hand in its glove, residuals [m] before and after, and standard errors [m].
-
-    Raises:
-        CalibrationError: Too few frames have enough markers.
-        ArgumentError: `markers` do not fit the glove, or `rate` is not positive.
-    """
+    """Fit a hand and its glove to one user's labeled markers."""
     mirror = MIRROR if start.side == "left" else np.eye(3)
-    markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
+    markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     complete = complete_digits(markers, right.attachment)
     # Poses of frames spread over the capture, on the hand that the calibration begins with.
     track = solve_frames(markers, right, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
     problem, estimate = _initial_problem(markers, right, track)
-    estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
+    # Distant markers lose their weight only when the hand nearly fits.
+    estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
+    problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
+    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
     rough = user_hand(right, problem, estimate)
     rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
-    estimate, fit = _solve_with_spreads(problem, estimate, steps, progress)
+    for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
+        learn_spreads(problem, estimate, problem.fit(estimate))
+        estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)
     before = np.empty(0)
     if touches:
@@ -260,25 +252,6 @@ def _initial_problem(
     return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, track.qpos[chosen])
 
 
-def _solve_without_touches(
-    problem: Problem, estimate: Estimate, progress: Progress | None
-) -> tuple[Estimate, Fit, int]:
-    """The first steps; distant markers lose their weight only when the hand nearly fits."""
-    estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
-    problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
-    return levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
-
-
-def _solve_with_spreads(
-    problem: Problem, estimate: Estimate, steps: int, progress: Progress | None
-) -> tuple[Estimate, Fit]:
-    """The last steps; how far the glove's markers are from their design is learned meanwhile."""
-    for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
-        learn_spreads(problem, estimate, problem.fit(estimate))
-        estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
-    return estimate, fit
-
-
 def _with_touches(
     problem: Problem,
     estimate: Estimate,
@@ -295,12 +268,14 @@ def _with_touches(
     chosen = informative_frames(track, markers)
     touching = np.array([frame for frame, _ in touches], dtype=np.int64)
     frames = np.concatenate([chosen, touching])
+    # Flesh moves alike in similar poses: many frames tell no more about it than a few.
+    flesh = repeated_share(track.qpos, track.residuals) * noise**2
     larger = Problem(
         problem.shape,
         problem.design,
         problem.heights,
         markers[track.frames[frames]],
-        noise=effective_noise(noise, repeated_share(track.qpos, track.residuals), len(frames)),
+        noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
     )
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
@@ -346,18 +321,6 @@ class PoseTrack(NamedTuple):
     residuals: Float[np.ndarray, "K M 3"]  # model minus marker [m], NaN where a marker is missing
 
 
-def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
-    """A copy of the markers [m] in which a marker has three finite coordinates or three NaN."""
-    values = np.array(markers, dtype=np.float64)
-    count = start.attachment.layout.num_markers
-    if values.ndim != 3 or values.shape[1:] != (count, 3):
-        raise ArgumentError(f"markers have shape {values.shape}, expected (T, {count}, 3) for this glove")
-    if not 0.0 < rate < np.inf:
-        raise ArgumentError(f"rate is {rate:g} Hz, expected a positive number")
-    values[~np.isfinite(values).all(axis=2)] = np.nan
-    return values
-
-
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
     """Numbers of the frames with enough markers for a pose."""
     count = markers.shape[1]
@@ -385,8 +348,7 @@ def solve_frames(
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
     """Whether all markers of a digit are seen."""
     present = np.isfinite(markers[..., 0])
-    bones = attachment.main_bones
-    digits = np.array([BONES[bone].digit for bone in bones])
+    digits = np.array([BONES[bone].digit for bone in attachment.main_bones])
     return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
@@ -433,16 +395,6 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
     products, squares = local * local[nearest], 0.5 * (local**2 + local[nearest] ** 2)
     both = np.isfinite(products)
     return float(np.clip(products[both].sum() / max(squares[both].sum(), 1e-18), 0.0, 1.0))
-
-
-def effective_noise(noise: float, repeated: float, num_frames: int) -> float:
-    """Noise [m] for the weights of the residuals, so that correlated frames do not count as independent ones.
-
-    What repeats (`repeated_share`) in every similar pose is flesh that moves with the pose: many frames carry
-    the information of a few about it.
-    """
-    flesh = repeated * noise**2
-    return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
 
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:

@@ -243,13 +243,7 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
 
 @kernel
 def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"], work: Workspace) -> None:
-    """Normal matrix and half gradient of the sum of the markers' weighted squared residuals.
-
-    Args:
-        weights: Weight of each marker [1/m^2]; zero for a missing one.
-        work: Its markers and residuals must be computed; `jacobian`, `normal` (upper triangle) and `gradient`
-            are filled.
-    """
+    """Normal matrix and half gradient of the sum of the markers' weighted squared residuals."""
     normal, gradient = work.normal, work.gradient
     normal[:] = 0.0
     gradient[:] = 0.0
@@ -300,15 +294,7 @@ def levenberg_marquardt(
     small_gain: float,
     work: Workspace,
 ) -> tuple[float, int]:
-    """Bring a pose to a minimum of its cost.
-
-    Args:
-        qpos: Pose to start from, overwritten.
-        small_gain: Expected decrease of the cost from which on a step is the last one.
-
-    Returns:
-        The cost (squared standard deviations), and how many steps were tried.
-    """
+    """Bring a pose to a minimum of its cost."""
     trial, weights = qpos.copy(), np.zeros(len(energy.target))
     cost = _cost(hand, energy, qpos, work)
     _linearize(hand, energy, qpos, weights, work)

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import check_array
@@ -108,30 +108,13 @@ class PoseFit:
     """Steps tried, over all starts of a frame."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AnglePrior:
+class AnglePrior(NamedTuple):
     """Independent normal priors of the hinges, for digits that lack a marker or have under three."""
 
-    angles: Float[np.ndarray, "*T 20"]
-    """Mean angles [rad], for each frame or for all."""
-    spread: ArrayLike
-    """Their standard deviation [rad]: one number, or an array that broadcasts with the angles."""
-
-    def _rows(self, frames: int) -> _PosePrior:
-        """Means and precisions, one row per frame."""
-        spread = np.asarray(self.spread, dtype=np.float64)
-        if not (spread > 0.0).all():
-            raise ArgumentError(f"prior.spread is {spread.min():g} rad, expected positive angles")
-        angles = check_array("prior.angles", self.angles, (NUM_JOINTS,))
-        shape = (frames, NUM_JOINTS)
-        try:
-            means, precision = np.broadcast_to(angles, shape), np.broadcast_to(spread**-2, shape)
-        except ValueError:
-            raise ArgumentError(
-                f"prior has angles of shape {angles.shape} and spread of shape {spread.shape}, "
-                f"expected shapes that broadcast to ({frames}, {NUM_JOINTS})"
-            ) from None
-        return _PosePrior(np.array(means, order="C"), np.array(precision, order="C"), _NO_WRIST)
+    angles: Float[np.ndarray, "T 20"]
+    """Mean angles [rad]."""
+    spread: float
+    """Their standard deviation [rad]."""
 
 
 class PoseSolver:
@@ -140,14 +123,9 @@ class PoseSolver:
     Args:
         outlier_distance: Scale [m] of a robust loss (Geman and McClure 1987), so that a wrong label does not
             bend the hand; it needs a good start. Plain least squares when not given.
-
-    Raises:
-        ArgumentError: `outlier_distance` is not positive.
     """
 
     def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
-        if outlier_distance is not None and not outlier_distance > 0.0:
-            raise ArgumentError(f"outlier_distance is {outlier_distance:g} m, expected a positive distance")
         self.hand: HandArrays = hand_arrays(fit)
         """The hand and its glove; a change of its marker positions takes effect in the next solution."""
         angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
@@ -166,44 +144,17 @@ class PoseSolver:
         initial: Float[np.ndarray, "T 27"] | None = None,
         *,
         prior: AnglePrior | None = None,
-        iterations: int | None = None,
+        iterations: int = _MOST_STEPS,
     ) -> PoseFit:
-        """Poses whose markers are nearest to labeled ones, each frame by itself.
-
-        Args:
-            targets: Labeled markers in the glove's order [m]; NaN where missing.
-            initial: Poses to start from; a hand put together from a few shapes when not given, and where that
-                does not end within 0.5 mm RMS, each of those shapes, of which the best is kept.
-            prior: Distribution of the hinges.
-            iterations: Steps at most from each start; 30 when not given.
-
-        Raises:
-            ArgumentError: `targets`, `initial` or `prior` do not fit the glove or each other, or a frame has
-                fewer than 4 markers.
-        """
+        """Solve the poses of frames with four markers or more, each by itself; see `solve_pose`."""
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
-        frames, markers = len(targets), len(self.hand.digits)
-        if targets.ndim != 3 or targets.shape[1:] != (markers, 3):
-            raise ArgumentError(f"targets have shape {targets.shape}, expected (T, {markers}, 3)")
-        starts = np.empty((0, NUM_QPOS))
-        if initial is not None:
-            starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
-            if starts.shape != (frames, NUM_QPOS):
-                raise ArgumentError(f"initial has shape {starts.shape}, expected ({frames}, {NUM_QPOS})")
-        known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST) if prior is None else prior._rows(frames)
-        steps = _MOST_STEPS if iterations is None else iterations
-        wrong, fit = self._run(targets, starts, known, steps, _CONVERGED)
-        if wrong >= 0:
-            present = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
-            if present < FEWEST_MARKERS:
-                raise ArgumentError(
-                    f"frame {wrong} has {present} markers, expected at least {FEWEST_MARKERS}"
-                )
-            raise ArgumentError(
-                f"initial has a quaternion of length zero in frame {wrong}, expected an orientation"
-            )
-        return fit
+        starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
+        known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST)
+        if prior is not None:
+            precision = np.full(prior.angles.shape, np.asarray(prior.spread) ** -2)
+            known = _PosePrior(np.array(prior.angles, order="C"), precision, _NO_WRIST)
+        return self._run(targets, starts, known, iterations, _CONVERGED)
 
     def solve_frame(
         self,
@@ -214,20 +165,10 @@ class PoseSolver:
         wrist: Float[np.ndarray, "7"],
         wrist_spread: tuple[float, float],
     ) -> PoseFit:
-        """`solve` for one frame from a near start, without checks of the arguments: for loops in real time.
-
-        Args:
-            target: Labeled markers [m], at least four; NaN where missing.
-            start: A pose near the solution.
-            angles: Mean of the hinges [rad], see `AnglePrior`.
-            spread: Standard deviation of the hinges [rad].
-            wrist: Predicted position [m] and orientation (wxyz) of the wrist: a prior where the palm lacks a
-                marker or has under three.
-            wrist_spread: Standard deviations of that position [m] and orientation [rad].
-        """
+        """`solve` for one frame from a near start in real time; [m] and [rad]."""
         wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
         prior = _PosePrior(angles[None], spread[None] ** -2.0, wrist_prior)
-        return self._run(target[None], start[None], prior, _MOST_STEPS, _ACCURATE)[1]
+        return self._run(target[None], start[None], prior, _MOST_STEPS, _ACCURATE)
 
     def _run(
         self,
@@ -236,13 +177,12 @@ class PoseSolver:
         prior: _PosePrior,
         iterations: int,
         small_gain: float,
-    ) -> tuple[int, PoseFit]:
-        """Index of the first frame that cannot be solved (or -1), and the fits."""
+    ) -> PoseFit:
+        """Solve with the arrays of the kernel."""
         scale, frames = self._robust_scale, (targets, starts, prior)
-        wrong, *arrays = _fit_frames(
-            self.hand, self._shapes, self.on_part, *frames, scale, iterations, small_gain
+        return PoseFit(
+            *_fit_frames(self.hand, self._shapes, self.on_part, *frames, scale, iterations, small_gain)
         )
-        return wrong, PoseFit(*arrays)
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
@@ -272,7 +212,25 @@ def solve_pose(
     Raises:
         ArgumentError: The arrays do not fit the glove or each other, or a frame has fewer than 4 markers.
     """
-    return PoseSolver(fit).solve(targets, initial, iterations=iterations)
+    count = fit.layout.num_markers
+    targets = np.asarray(targets, dtype=np.float64)
+    if targets.ndim != 3 or targets.shape[1:] != (count, 3):
+        raise ArgumentError(f"targets have shape {targets.shape}, expected (T, {count}, 3)")
+    present = np.isfinite(targets).all(axis=-1).sum(axis=1)
+    if (present < FEWEST_MARKERS).any():
+        wrong = int((present < FEWEST_MARKERS).argmax())
+        raise ArgumentError(f"frame {wrong} has {present[wrong]} markers, expected at least {FEWEST_MARKERS}")
+    if initial is not None:
+        initial = check_array("initial", initial, (None, NUM_QPOS))
+        if initial.shape != (len(targets), NUM_QPOS):
+            raise ArgumentError(f"initial has shape {initial.shape}, expected ({len(targets)}, {NUM_QPOS})")
+        without = np.flatnonzero(~initial[:, 3:7].any(axis=1))
+        if len(without):
+            raise ArgumentError(
+                f"initial has a quaternion of length zero in frame {without[0]}, expected an orientation"
+            )
+    steps = _MOST_STEPS if iterations is None else iterations
+    return PoseSolver(fit).solve(targets, initial, iterations=steps)
 
 
 @kernel
@@ -287,26 +245,12 @@ def _fit_frames(
     iterations: int,
     small_gain: float,
 ) -> tuple[
-    int,
     Float[np.ndarray, "T 27"],
     Float[np.ndarray, "T"],
     Float[np.ndarray, "T M 3"],
     Int[np.ndarray, "T"],
 ]:
-    """Solve frames one by one.
-
-    Args:
-        shapes: Shapes to start from where there are no initial poses.
-        on_part: Markers on each digit, and on the palm (last).
-        targets: Labeled markers [m]; NaN where missing.
-        initial: Poses to start from, one row per frame or none.
-        robust_scale: See `PoseEnergy`.
-        iterations: Steps at most from each start.
-        small_gain: See `levenberg_marquardt`.
-
-    Returns:
-        Index of the first frame that cannot be solved (or -1), and the arrays of a `PoseFit`.
-    """
+    """Solve frames one by one; the result has the fields of a `PoseFit`."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
@@ -314,15 +258,10 @@ def _fit_frames(
     work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
     for frame in range(frames):
         present = _read_markers(hand.digits, targets[frame], target, seen)
-        if present < FEWEST_MARKERS:
-            return frame, qpos, rms, residuals, steps
         _set_prior(seen, on_part, prior, frame, mean, precision)
         if len(initial) > 0:
             starts = initial[frame : frame + 1].copy()
-            length = np.sqrt((starts[0, 3:7] ** 2).sum())
-            if not length > 0.0:
-                return frame, qpos, rms, residuals, steps
-            starts[0, 3:7] /= length
+            starts[0, 3:7] /= np.sqrt((starts[0, 3:7] ** 2).sum())
         else:
             starts = _initial_poses(shapes, hand.digits, target)
         least = np.inf
@@ -343,7 +282,7 @@ def _fit_frames(
             if least < present * (_RMS_OF_LAST_START / MARKER_NOISE) ** 2:
                 break
         rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
-    return -1, qpos, rms, residuals, steps
+    return qpos, rms, residuals, steps
 
 
 @kernel

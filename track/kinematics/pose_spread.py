@@ -221,16 +221,7 @@ def predict_markers(
     variance: Float[np.ndarray, "M"],
     noise: float,
 ) -> MarkerPrediction:
-    """Positions and covariances of a fitted pose's markers.
-
-    Args:
-        on_part: Markers on each digit, and on the palm (last).
-        target: The markers it was fitted to [m]; NaN where missing.
-        joint_prior: Distribution of the hinges before the fit.
-        wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before the fit.
-        variance: Variance of each marker around its position on the hand [m^2].
-        noise: Standard deviation of the markers around the pose's [m].
-    """
+    """Positions and covariances of a fitted pose's markers."""
     count = len(target)
     work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
     out = MarkerPrediction(
@@ -369,9 +360,6 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
 
     People and gloves differ as simulated ones do. A calibrated hand is as near to its user's as the noise of
     its markers [m] lets it be; a digit with a single marker remains half as doubtful as on a measured hand.
-
-    Args:
-        digits: Digit of each marker, -1 for the palm.
     """
     known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
     turns = np.full((count, 3), np.deg2rad(known.turn))
@@ -415,18 +403,16 @@ class SpreadModel:
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
     ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]:
-        """Those of one pose; see `spreads`."""
+        """Standard deviations of one pose; see `spreads`."""
         angles, keypoints = self.spreads(qpos[None], unseen[None], rms)
         return angles[0], keypoints[0]
 
     def spreads(
         self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-        """Of each joint angle [rad], and of each keypoint in each direction [m].
+        """Standard deviations of joint angles [rad] and of keypoints in each direction [m].
 
-        Args:
-            unseen: Time since each marker was last seen [s]; infinite if it never was.
-            rms: Usual RMS distance of markers from the pose's [m]; NaN if it is not known.
+        Times since markers were seen are in [s], infinite where never; the RMS distance [m] may be NaN.
         """
         digits = self._hand.digits
         freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
@@ -466,13 +452,7 @@ def pose_spreads(
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
 ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-    """Standard deviations of each joint angle [rad] and of each keypoint in each direction [m].
-
-    Args:
-        tips: Lengths of the last bones [m].
-        prior: Precision of the hinges before any marker is seen [1/rad^2].
-        unseen: Time since each marker was last seen [s]; infinite if it never was.
-    """
+    """Standard deviations of each joint angle [rad] and of each keypoint in each direction [m]."""
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
     count = unseen.shape[1]
     work, weights, square = workspace(count), np.empty(count), (NUM_UNKNOWNS, NUM_UNKNOWNS)
