@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from track.sinks import SinkGroup as SinkGroup
     from track.sinks import open_sinks as open_sinks
     from track.streams import ReplaySettings as ReplaySettings
+    from track.streams.frame_source import FrameSource as FrameSource
     from track.streams.live_stream import LiveStream as LiveStream
     from track.streams.live_stream import StreamSettings as StreamSettings
     from track.streams.live_stream import open_source as open_source

@@ -128,24 +128,25 @@ def _warn(what: str, error: Exception) -> None:
     warnings.warn(f"{what} ({type(error).__name__}: {error})", HandSimWarning, stacklevel=4)
 
 
-def open_sinks(addresses: str | Sequence[str]) -> SinkGroup:
+def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGroup:
     """Open a sink for each address, which gets positions in [m] and angles in [rad].
 
     Args:
         addresses: One, or several, each as in `VALID`; `udp://` and `ws://` take `?format=json`,
-            `?format=msgpack` and `?points=yes`.
+            `?format=msgpack` and `?points=yes`. A sink of your own may be given as an object.
 
     Raises:
         ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
     """
-    addresses = (addresses,) if isinstance(addresses, str) else addresses
-    check_type("addresses", addresses, Sequence, f"a list of {', '.join(VALID)}")
+    chosen = [addresses] if isinstance(addresses, str) or hasattr(addresses, "send") else addresses
+    check_type("addresses", chosen, Sequence, f"a list of {', '.join(VALID)}, or of sinks")
     sinks: dict[str, LiveSink] = {}
     with ExitStack() as stack:
-        for address in addresses:
+        for given in chosen:
+            address = given if isinstance(given, str) else type(given).__name__
             if address in sinks:
                 raise ArgumentError(f"--send {address} is given twice, expected once")
-            sinks[address] = open_sink(address)
+            sinks[address] = open_sink(given) if isinstance(given, str) else _checked_sink(given, address)
             stack.callback(sinks[address].close)
         stack.pop_all()
     return SinkGroup(sinks)
@@ -166,11 +167,15 @@ def open_sink(address: str) -> LiveSink:
     name = address.partition("?")[0]
     if not (is_plugin(name) or name in list_plugins(GROUP)):
         raise ArgumentError(f"'{address}' is not an address to send to, expected {', '.join(VALID)}")
-    sink: Any = make_plugin(address, group=GROUP, noun="sink")
+    return _checked_sink(make_plugin(address, group=GROUP, noun="sink"), address)
+
+
+def _checked_sink(sink: Any, name: str) -> LiveSink:
+    """A sink of the user's own, if it has the methods of one."""
     for method in ("send", "close"):
         if not callable(getattr(sink, method, None)):
             raise ArgumentError(
-                f"{address} has no method {method}, expected the methods send and close of a sink"
+                f"{name} has no method {method}, expected the methods send and close of a sink"
             )
     made: LiveSink = sink
     return made

@@ -35,7 +35,7 @@ from track.association.label_consistency import (
 from track.association.label_new_points import SETTLED_EVIDENCE, digit_table, label_new_points
 from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
-from track.rigid_body import BodyTracker, RigidTemplate
+from track.rigid_body import AnyBody, BodyTracker, load_bodies
 from track.user import AnyLabeler, User, as_user, labeler_of
 from train.labelers.protocol import Labeler
 
@@ -69,7 +69,7 @@ class Tracker:
             others that is assumed), or the path of a user's file.
         labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
             the glove when not given.
-        bodies: Rigid bodies beside the hands.
+        bodies: Rigid bodies beside the hands, or names of handsim's objects, or paths of their files.
         config: Settings.
 
     Raises:
@@ -82,14 +82,14 @@ class Tracker:
         self,
         hands: User | Sequence[GloveFit] | str | Path,
         labeler: AnyLabeler = None,
-        bodies: Sequence[RigidTemplate] = (),
+        bodies: Sequence[AnyBody] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
         if not isinstance(config, TrackerConfig):
             raise ArgumentError(f"config is {shown_value(config)}, expected a TrackerConfig")
         self.user = as_user(hands)
         self.hands = self.user.hands
-        self.bodies = tuple(bodies)
+        self.bodies = load_bodies(bodies)
         self.config = config
         asked = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)

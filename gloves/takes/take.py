@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -424,6 +424,11 @@ class Take:
         """Names of the twenty joint angles of a hand, in their order in `qpos`."""
         return JOINT_NAMES
 
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """Names of the 21 keypoints of a hand, in the order of `keypoints()`."""
+        return KEYPOINT_NAMES
+
     def angles(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
         """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose."""
         return dict(zip(JOINT_NAMES, self.qpos[:, self.hand_index(side), 7:].T, strict=True))
@@ -654,14 +659,15 @@ class Take:
             up: The axis of the take's world that points up.
 
         Raises:
-            ArgumentError: The ending is unknown, no hand has a pose, or the rate is out of range.
+            ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
             HandSimError: A package that the format needs is not installed.
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a file")
+        check_choice(up, get_args(UpAxis), noun="axis that points up")
         path = Path(path)
         form = motion_format(path)
-        motion = self.poses_alone(rate)
+        motion = self.poses_alone(None if rate is None else float(rate))
         if form.steady and not is_steady(motion.times, motion.rate):
             motion = motion.poses_alone(motion.rate)
         form.write(path, posed_motion(motion), up)

@@ -56,7 +56,7 @@ class Options(Settings):
         ({"num_frames": True}, ("num_frames", "True", "whole number")),
         ({"kind": "tow"}, ("kind", "tow", "two", "one")),
         ({"kind": "two"}, ("two frames",)),
-        ({"hands": ("up",)}, ("hands", "up", "right, left")),
+        ({"hands": ("up",)}, ("hands", "up", "right", "left")),
         ({"hands": 5}, ("hands", "5", "tuple")),
         ({"chances": (0.5, 0.25)}, ("chances", "0.5", "smaller")),
         ({"chances": (0.5,)}, ("chances", "2 values")),

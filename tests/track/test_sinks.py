@@ -123,6 +123,19 @@ def test_what_is_no_sink_is_told(own):
         open_sink("no_such_module:Sink")
 
 
+def test_sinks_may_be_objects():
+    own = {}
+    exec(SOURCE, own)
+    one = own["Counter"]()
+    with open_sinks([one, "udp://127.0.0.1:9"]) as group:
+        assert list(group.counts) == ["Counter", "udp://127.0.0.1:9"]
+    assert open_sinks(one)
+    with error_names(ArgumentError, "NoSink | send | close"):
+        open_sinks([own["NoSink"]()])
+    with error_names(ArgumentError, "addresses | 5"):
+        open_sinks(5)
+
+
 def test_an_address_twice_and_a_bad_one_leave_nothing_open():
     with pytest.raises(ArgumentError, match="osc://:9000 is given twice"):
         open_sinks(["osc://:9000", "osc://:9000"])

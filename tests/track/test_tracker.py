@@ -156,3 +156,8 @@ def test_hands_labelers_and_settings_of_another_type_are_refused(take, labeler):
     ):
         with error_names(HandSimError, sentence):
             Tracker(*given)
+
+
+def test_bodies_are_given_by_name_too():
+    tracker = Tracker([nominal_fit(load_layout("dense19"), "M", "right")], bodies=["mug"])
+    assert [body.name for body in tracker.bodies] == ["mug"]

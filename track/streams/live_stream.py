@@ -20,7 +20,7 @@ import dataclasses
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Final
@@ -35,7 +35,7 @@ from handsim.errors import ArgumentError
 from handsim.settings import Limits, Settings
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame
 from track.streams import split_address
-from track.streams.frame_source import LEAVE, ArrivingFrames, SourceStream
+from track.streams.frame_source import LEAVE, ArrivingFrames, FrameSource, SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
 """What an address may be."""
@@ -89,7 +89,7 @@ def check_address(address: str) -> None:
 
 
 def open_source(
-    address: str,
+    address: str | FrameSource,
     settings: StreamSettings | None = None,
     *,
     ended: Callable[[], bool] = lambda: False,
@@ -101,7 +101,8 @@ def open_source(
     them. Frames that are not kept up with are dropped, oldest first, see `LiveStream`.
 
     Args:
-        address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own.
+        address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own, which
+            may also be given as an object.
         settings: How to read it; as `StreamSettings()` when not given.
         ended: The stream ends when this is true; it is asked before each frame, and several times a second
             while none comes.
@@ -112,8 +113,14 @@ def open_source(
         CaptureError: No server answers.
     """
     settings = StreamSettings.of(settings, options)
-    check_address(address)
-    return LiveStream(_open_frames(address), silence=settings.silence, ended=ended)
+    frames: ArrivingFrames
+    if isinstance(address, str):
+        check_address(address)
+        frames = _open_frames(address)
+    else:
+        check_type("address", address, Iterable, f"one of {', '.join(VALID)}, or a frame source")
+        frames = SourceStream(address, type(address).__name__)
+    return LiveStream(frames, silence=settings.silence, ended=ended)
 
 
 def _open_frames(address: str) -> ArrivingFrames:

@@ -25,7 +25,7 @@ from gloves.optics.visibility import (
     visible_cameras,
 )
 from handsim import CameraRig, HandModel, join_qpos, sample_shape
-from handsim.errors import ArgumentError, RigError
+from handsim.errors import RigError
 from handsim.space.rig import load_rig
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
@@ -106,7 +106,7 @@ def test_packing_round_trip(rng):
 def test_bad_rigs_are_told():
     with pytest.raises(RigError, match="rig 'lonely' has 1 cameras, expected 2 to 32"):
         CameraRig("lonely", load_rig("six").cameras[:1])
-    with pytest.raises(ArgumentError, match="unknown camera rig 'figure6'"):
+    with pytest.raises(RigError, match="unknown camera rig 'figure6'"):
         load_rig("figure6")
 
 

@@ -528,6 +528,14 @@ def test_what_has_no_pose_is_left_out(moving):
         nobody.export("hands.bvh")
 
 
+def test_a_rate_may_be_a_whole_number_and_an_axis_is_y_or_z(moving, tmp_path):
+    moving.export(tmp_path / "hands.bvh", rate=30)
+    with pytest.raises(ArgumentError, match="'Y-axis'; valid names: y, z"):
+        moving.export(tmp_path / "other.bvh", up="Y-axis")
+    assert [path.name for path in tmp_path.iterdir()] == ["hands.bvh"]
+    assert len(moving.keypoint_names) == moving.keypoints().shape[2]
+
+
 def test_other_endings_are_refused_with_the_valid_ones(moving, tmp_path):
     with pytest.raises(ArgumentError) as caught:
         moving.export(tmp_path / "hands.fbx")

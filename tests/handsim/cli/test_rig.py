@@ -95,7 +95,7 @@ def test_hands_of_a_take_are_scored_where_they_are(tmp_path, capsys):
 def test_a_planned_rig_is_written_and_told(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(rig_plan, "_PEOPLE", 1)
     monkeypatch.setattr(rig_plan, "_FRAMES", 120)
-    monkeypatch.setattr(rig_plan, "_JUDGED", 120)
+    monkeypatch.setattr(rig_plan, "_TEST_FRAMES", 120)
     out = tmp_path / "mine.toml"
     options = ["--cameras", "2", "--room", "2.4", "1.8", "2.2", "--mounts", "truss", "--glove", "tips8"]
     assert main(["rig", "plan", *options, "--out", str(out)]) == 0

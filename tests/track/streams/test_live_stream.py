@@ -62,6 +62,15 @@ def test_a_class_of_the_user_s_own(own, address):
     assert [frame.number for frame in open_source(address)] == list(range(count))
 
 
+def test_a_source_may_be_an_object():
+    own = {}
+    exec(SOURCE, own)
+    assert [frame.number for frame in open_source(own["Counting"](3))] == [0, 1, 2]
+    for wrong, words in ((own["NoSource"](), "address"), (5, "address | 5"), (iter([]), "close")):
+        with error_names(HandSimError, words):
+            open_source(wrong)
+
+
 @pytest.mark.parametrize(
     ("address", "words"),
     [
@@ -243,7 +252,8 @@ def test_whatever_happens_to_some_packets_the_others_go_on(fates, random):
         swapped = fate == "swap" and not swapped and fates[number - 1] == "good" and number > 3
         packets.insert(len(packets) - swapped, packet)
         packets += [packet] * (fate == "double")
-    timed = [(number, time, at * INTERVAL) for at, (number, time, _) in enumerate(packets)]
+    arrivals = np.maximum.accumulate([number for number, _, _ in packets])  # a dropped packet takes its time
+    timed = [(number, time, at * INTERVAL) for (number, time, _), at in zip(packets, arrivals, strict=True)]
     gone = [number for number, _ in passed(order, timed)]
     assert gone == expected
 
