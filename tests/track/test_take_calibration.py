@@ -49,7 +49,7 @@ def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
     assert one.is_better and one.held_out.num_frames > 200
     assert 0.8 * one.held_out.before < before < 1.25 * one.held_out.before
     assert 0.8 * one.held_out.after < after < 1.25 * one.held_out.after
-    assert user.notes == f"from a test; right hand: {one}"
+    assert user.notes == f"calibrated from a test, M to begin with; right hand: {one}"
 
 
 @pytest.mark.slow
