@@ -44,6 +44,13 @@ def check_callable(name: str, value: object, expected: str) -> None:
         raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
 
 
+def check_methods(name: str, value: object, methods: Iterable[str], expected: str) -> None:
+    """Refuse an object of the user's own that lacks one of the methods of its kind."""
+    for method in methods:
+        if not callable(getattr(value, method, None)):
+            raise ArgumentError(f"{name} has no method {method}, expected {expected}")
+
+
 def shown_value(value: Any) -> str:
     """A value for a sentence: short ones as Python writes them, arrays and objects by their type."""
     if isinstance(value, np.ndarray):

@@ -83,10 +83,8 @@ class Settings:
         """
         if settings is not None:
             check_type("settings", settings, cls, f"a {cls.__name__}; its fields can be given by name")
-        known = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
-        for name in options:
-            check_choice(name, known, noun=cls.noun)
-        return cls(**options) if settings is None else dataclasses.replace(settings, **options)  # type: ignore[type-var]
+        changed: Self = _changed(cls, settings, options, cls.noun)
+        return changed
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Self:
@@ -254,15 +252,20 @@ def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) ->
 
 def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
     """A group of settings from the fields that differ from its default; a mixture from all its shares."""
-    known = [one.name for one in dataclasses.fields(kind) if one.init]
-    for change in changes:
-        check_choice(change, known, noun=f"setting of {name}")
-    if issubclass(kind, Mixture):
-        return kind(**(dict.fromkeys(known, 0.0) | dict(changes)))
     usual = None
-    if field is not None and field.default_factory is not dataclasses.MISSING:
+    if issubclass(kind, Mixture):
+        changes = dict.fromkeys((one.name for one in dataclasses.fields(kind)), 0.0) | dict(changes)
+    elif field is not None and field.default_factory is not dataclasses.MISSING:
         usual = field.default_factory()
-    return dataclasses.replace(usual, **changes) if isinstance(usual, kind) else kind(**changes)
+    return _changed(kind, usual if isinstance(usual, kind) else None, changes, f"setting of {name}")
+
+
+def _changed(kind: Any, usual: Any, changes: Mapping[str, Any], noun: str) -> Any:
+    """An object of settings, or the usual one of its class, with some fields given by name."""
+    known = [field.name for field in dataclasses.fields(kind) if field.init]
+    for name in changes:
+        check_choice(name, known, noun=noun)
+    return kind(**changes) if usual is None else dataclasses.replace(usual, **changes)
 
 
 def _words(kind: Any, expected: Expected | None) -> str:

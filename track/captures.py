@@ -294,7 +294,7 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
 
 
 def _calibrated(take: Take, setup: TrackerSetup) -> TrackerSetup:
-    """The setup with its hands calibrated on a take of it, as far as they fit held-out frames better."""
+    """Replace the hands of a setup by hands calibrated on a take, where these fit held-out frames better."""
     try:
         done = calibrate_take(take, setup.start, setup.user)
     except CalibrationError as error:

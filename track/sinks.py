@@ -24,7 +24,7 @@ import numpy as np
 
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
-from handsim._checks import check_type
+from handsim._checks import check_methods, check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
@@ -172,11 +172,7 @@ def open_sink(address: str) -> LiveSink:
 
 def _checked_sink(sink: Any, name: str) -> LiveSink:
     """A sink of the user's own, if it has the methods of one."""
-    for method in ("send", "close"):
-        if not callable(getattr(sink, method, None)):
-            raise ArgumentError(
-                f"{name} has no method {method}, expected the methods send and close of a sink"
-            )
+    check_methods(name, sink, ("send", "close"), "the methods send and close of a sink")
     made: LiveSink = sink
     return made
 

@@ -68,7 +68,7 @@ _CURVE_POINTS: Final = 200  # entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
 _COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
 _REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # costs of a ghost that are tried [m]
-_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # spreads of the confidence that are tried [m]
+_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # confidence scales tried after training [m]
 
 
 class TrainingError(HandSimError):

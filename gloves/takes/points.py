@@ -61,7 +61,7 @@ class Column(NamedTuple):
 
     @property
     def missing(self) -> float:
-        """The value of a missing entry: NaN for numbers, -1 for IDs and labels."""
+        """The value that stands for a missing entry: NaN in numbers, -1 in IDs and labels."""
         return np.nan if np.dtype(self.dtype).kind == "f" else -1
 
     @property

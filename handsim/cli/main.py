@@ -23,20 +23,68 @@ from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
-# "module:function", or "module:TABLE" for a dict of sub-commands, and a line of help. Modules are imported
-# when their command runs.
-COMMANDS: Final[dict[str, tuple[str, str]]] = {
+Table = Mapping[str, tuple[Any, str]]
+"""For each command "module:function", or a table of its sub-commands, and a line of help."""
+_GLOVE: Final[Table] = {
+    "list": (
+        "handsim.cli.glove:list_gloves",
+        "List the marker layouts that come with handsim: markers, labeler and source of each.",
+    ),
+    "show": ("handsim.cli.glove:show_glove", "Show a layout's markers."),
+    "new": (
+        "handsim.cli.glove:new_glove",
+        "Write a commented layout file as a start for a glove of your own.",
+    ),
+    "check": (
+        "handsim.cli.glove:check_glove",
+        "Check a layout on hands of all five sizes, and draw it from the back, the palm and the thumb's "
+        "side.",
+    ),
+    "score": (
+        "handsim.cli.glove_advice:score_glove",
+        "Say how well a layout can be labeled and what it tells of each joint; nothing is trained.",
+    ),
+    "improve": (
+        "handsim.cli.glove_advice:improve_glove",
+        "Look for a better layout near a given one: move, add or drop markers.",
+    ),
+}
+_RIG: Final[Table] = {
+    "list": (
+        "handsim.cli.rig:list_shipped",
+        "List the camera rigs that come with handsim: how many cameras, their pictures, and what they are.",
+    ),
+    "new": ("handsim.cli.rig:new_rig", "Write a commented rig file as a start for a rig of your own."),
+    "check": (
+        "handsim.cli.rig:check_rig",
+        "Check a rig's file: where its cameras stand and look, and what is suspicious.",
+    ),
+    "import": (
+        "handsim.cli.rig:import_rig",
+        "Write a rig's file of the calibration of a camera system: all its cameras, pictures and lenses.",
+    ),
+    "score": (
+        "handsim.cli.rig:score_rig",
+        "Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is recorded.",
+    ),
+    "plan": (
+        "handsim.cli.rig:plan_rig",
+        "Look for the best places of a number of cameras, for hands at work in a volume.",
+    ),
+}
+# Modules are imported when their command runs, and not for the help of a table.
+COMMANDS: Final[Table] = {
     "demo": (
         "handsim.cli.demo:demo",
         "Run the whole chain on a built-in example; ends with a page of pictures.",
     ),
     "hand": ("handsim.cli.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
     "glove": (
-        "handsim.cli.glove:GLOVE",
+        _GLOVE,
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
-        "handsim.cli.rig:RIG",
+        _RIG,
         "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
     ),
     "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
@@ -83,7 +131,7 @@ def main(args: Sequence[str] | None = None) -> int:
     return run(COMMANDS, sys.argv[1:] if args is None else args)
 
 
-def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
+def run(commands: Table, args: Sequence[str]) -> int:
     """Run a command of a table and return its exit code."""
     program = f"handsim {args[0]}" if args and args[0] in commands else "handsim"
     _prepare_streams()
@@ -110,8 +158,10 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
         return 1
 
 
-def load(target: str) -> Any:
-    """Import the object that "module:name" stands for."""
+def load(target: str | Table) -> Any:
+    """Import the object that "module:name" stands for, or those of a table as a dict."""
+    if not isinstance(target, str):
+        return {name: load(inner) for name, (inner, _) in target.items()}
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -189,7 +239,7 @@ def _abandon_stdout() -> None:
         return
 
 
-def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
+def _dispatch(commands: Table, args: Sequence[str]) -> int:
     """Print the overview or the version, or call the command that the first argument names."""
     name = args[0] if args else "--help"
     if name in ("-h", "--help"):
@@ -205,10 +255,13 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> i
             return 2
         print(completion_script({name: load(target) for name, (target, _) in commands.items()}, args[1]))
     elif name in commands:
-        from handsim.cli.parsing import run_command
+        from handsim.cli.parsing import outline, run_command
 
-        target, help_line = commands[name]
-        result = run_command(load(target), prog=f"handsim {name}", help_line=help_line, args=args[1:])
+        (target, help_line), prog, args = commands[name], f"handsim {name}", args[1:]
+        if isinstance(target, Mapping) and args and args[0] in target:
+            (target, help_line), prog, args = target[args[0]], f"{prog} {args[0]}", args[1:]
+        command = load(target) if isinstance(target, str) else outline(target)
+        result = run_command(command, prog=prog, help_line=help_line, args=args)
         return result if isinstance(result, int) else 0
     else:
         noun = "option" if name.startswith("-") else "command"
@@ -218,7 +271,7 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> i
     return 0
 
 
-def _print_overview(commands: Mapping[str, tuple[str, str]]) -> None:
+def _print_overview(commands: Table) -> None:
     from rich.console import Console
     from rich.table import Table
 

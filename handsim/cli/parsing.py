@@ -73,6 +73,19 @@ def run_command(
     )
 
 
+def outline(table: Mapping[str, tuple[Any, str]]) -> dict[str, Command]:
+    """Functions that stand for the sub-commands of a table in its help, so that none is loaded for it."""
+
+    def named(help_line: str) -> Command:
+        def stand_in() -> None:
+            pass
+
+        stand_in.__doc__ = help_line
+        return stand_in
+
+    return {name: named(help_line) for name, (_, help_line) in table.items()}
+
+
 def completion_script(
     commands: Mapping[str, Command | PresetCommand | dict[str, Command]], shell: str
 ) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
 import tyro
@@ -220,13 +219,3 @@ def _forecast_line(one: Forecast) -> str:
         f"{100 * one.seen_by_three:.1f} %; {100 * one.missing:.1f} % missing, error "
         f"{1e3 * one.error.mean:.3f} mm"
     )
-
-
-RIG: Final[dict[str, Callable[..., Any]]] = {
-    "list": list_shipped,
-    "new": new_rig,
-    "check": check_rig,
-    "import": import_rig,
-    "score": score_rig,
-    "plan": plan_rig,
-}

@@ -58,7 +58,7 @@ def sides_there(take):
 
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_two_hands_are_labeled_better_than_frame_by_frame_and_as_by_the_tracker(kind):
-    """In the mean over two people, whom the labeler alone or the tracker takes for others in some frames."""
+    """Means over two people; the labeler alone and the tracker mislabel some of their frames."""
     slots = []
     for seed in (0, 4):
         take = simulate_take(kind=kind, num_frames=FRAMES, seed=seed)

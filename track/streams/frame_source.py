@@ -14,6 +14,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from handsim._checks import check_methods
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.frames import LATEST_TIME, StreamedFrame
 
@@ -101,11 +102,7 @@ class SourceStream(ArrivingFrames):
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
         super().__init__()
-        for method in ("__iter__", "close"):
-            if not callable(getattr(source, method, None)):
-                raise ArgumentError(
-                    f"{name} has no method {method}, expected __iter__ and close of a frame source"
-                )
+        check_methods(name, source, ("__iter__", "close"), "__iter__ and close of a frame source")
         self._source, self._name, self._waits = source, name, waits
         self._changed = threading.Condition()
         self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)

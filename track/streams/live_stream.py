@@ -460,7 +460,7 @@ class FrameOrder:
         self._leave_out_jumping(sum(self.passed - passed > _WINDOW for passed in self._jumping.values()))
 
     def _leave_out_jumping(self, count: int) -> None:
-        """Count the oldest `count` jumping frames as wild."""
+        """Drop the `count` oldest frames whose time or number jumped, and count them in `wild`."""
         self.wild += count
         for one in list(self._jumping)[:count]:
             del self._jumping[one]

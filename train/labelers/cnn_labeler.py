@@ -244,7 +244,7 @@ def depth_images(
 def _view_frames(
     points: NDArray[np.float64], present: NDArray[np.bool_], rotations: NDArray[np.float64]
 ) -> ViewFrames:
-    """Cameras (B) that see every present point."""
+    """Pick a camera for each of B clouds that has all points of the cloud in its image."""
     offsets, centers = centered(points, present)
     rotated = offsets @ rotations.swapaxes(1, 2)
     extent = np.abs(rotated[..., :2]).max(axis=(1, 2), initial=SMALLEST_EXTENT)

@@ -268,8 +268,8 @@ def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
 
 
 LIGHT = (
-    "body", "calibrate", "demo", "doctor", "evaluate", "export", "hand", "label", "replay", "report",
-    "track", "view",
+    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "report",
+    "rig", "track", "view",
 )  # fmt: skip
 
 

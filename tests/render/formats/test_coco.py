@@ -22,13 +22,17 @@ def frames(make_frame) -> list[RenderedFrame]:
     return [make_frame(0, ("right", "left")), make_frame(1, ("left",), away=True), make_frame(2, noisy=True)]
 
 
-@pytest.fixture
-def folder(frames: list[RenderedFrame], tmp_path: Path) -> Path:
-    writer = open_writer("coco", tmp_path)
+def written(format: str, frames: list[RenderedFrame], folder: Path) -> Path:
+    writer = open_writer(format, folder)
     writer.write(0, frames[:2])
     writer.write(1, frames[2:])
     writer.finish()
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def folder(frames: list[RenderedFrame], tmp_path: Path) -> Path:
+    return written("coco", frames, tmp_path)
 
 
 def test_the_file_holds_what_was_in_the_pictures(folder: Path, frames: list[RenderedFrame]) -> None:
@@ -126,17 +130,8 @@ def test_pycocotools_scores_it(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def yolo_frames(make_frame) -> list[RenderedFrame]:
-    return [make_frame(0, ("right", "left")), make_frame(1, ("left",), away=True), make_frame(2, noisy=True)]
-
-
-@pytest.fixture
-def yolo_folder(yolo_frames: list[RenderedFrame], tmp_path: Path) -> Path:
-    writer = open_writer("yolo", tmp_path)
-    writer.write(0, yolo_frames[:2])
-    writer.write(1, yolo_frames[2:])
-    writer.finish()
-    return tmp_path
+def yolo_folder(frames: list[RenderedFrame], tmp_path: Path) -> Path:
+    return written("yolo", frames, tmp_path)
 
 
 def settings(yolo_folder: Path) -> dict:
@@ -176,9 +171,9 @@ def test_lines_are_what_the_loader_accepts(yolo_folder: Path) -> None:
 
 
 def test_boxes_and_keypoints_are_where_the_truth_has_them(
-    yolo_folder: Path, yolo_frames: list[RenderedFrame]
+    yolo_folder: Path, frames: list[RenderedFrame]
 ) -> None:
-    for (picture, rows), frame in zip(pictures_and_labels(yolo_folder), yolo_frames, strict=True):
+    for (picture, rows), frame in zip(pictures_and_labels(yolo_folder), frames, strict=True):
         height, width, _ = cv2.imread(str(picture)).shape
         for row, hand in zip(rows, frame.hands, strict=False):
             center, extent = row[1:3] * (width, height), row[3:5] * (width, height)
