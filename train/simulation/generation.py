@@ -94,14 +94,8 @@ def make_dataset(
     if isinstance(place, Path):
         _check_space(source, place)
     with open_output(place) as output:
-        output.claim(
-            CONFIG,
-            _record(source),
-            noun="training set",
-            error=DatasetError,
-            grows="num_frames",
-            result=MANIFEST,
-        )
+        record, noun = _record(source), "training set"
+        output.claim(CONFIG, record, noun=noun, error=DatasetError, grows="num_frames", result=MANIFEST)
         _make_shards(source, output, workers, progress)
         return _complete(source, output)
 
@@ -115,9 +109,8 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     attach_markers(layout, HandModel.named("M"))
-    return FrameSource(
-        settings, layout, rig, None if settings.sampler is None else load_sampler(settings.sampler)
-    )
+    sampler = None if settings.sampler is None else load_sampler(settings.sampler)
+    return FrameSource(settings, layout, rig, sampler)
 
 
 def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str | None) -> int | Executor:
@@ -155,7 +148,12 @@ def _record(source: FrameSource) -> dict[str, Any]:
 def _make_shards(source: FrameSource, output: Output, workers: int | Executor, progress: Progress) -> None:
     """Make the missing shards."""
     there, total = output.sizes(), source.settings.num_frames
-    todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
+
+    def is_finished(shard: int) -> bool:  # the last shard of a set that grows is not
+        expected = array_bytes(row_dtype(source.layout.num_markers), _shard_size(total, shard))
+        return hands_name(shard) in there and there.get(rows_name(shard)) == expected
+
+    todo = [shard for shard in _shards(total) if not is_finished(shard)]
     done = total - sum(_shard_size(total, shard) for shard in todo)
     try:
         job = output.job(functools.partial(make_shard, source), last=["rows-*"])
@@ -204,13 +202,6 @@ def _shards(num_frames: int) -> range:
 def _shard_size(num_frames: int, shard: int) -> int:
     """Rows of a shard."""
     return min(ROWS_PER_SHARD, num_frames - shard * ROWS_PER_SHARD)
-
-
-def _is_finished(source: FrameSource, there: dict[str, int], shard: int) -> bool:
-    """Whether a shard has all its rows; the last shard of a set that grows does not."""
-    size = _shard_size(source.settings.num_frames, shard)
-    expected = array_bytes(row_dtype(source.layout.num_markers), size)
-    return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
 
 def make_shard(source: FrameSource, out: Path, shard: int) -> int:
