@@ -35,6 +35,7 @@ from train.data.shards import (
     Manifest,
     array_bytes,
     hands_name,
+    load_manifest,
     load_redrawn,
     redrawn_name,
     row_dtype,
@@ -94,9 +95,16 @@ def make_dataset(
     if isinstance(place, Path):
         _check_space(source, place)
     with open_output(place) as output:
-        record, noun = _record(source), "training set"
-        output.claim(CONFIG, record, noun=noun, error=DatasetError, grows="num_frames", result=MANIFEST)
-        _make_shards(source, output, workers, progress)
+        damaged = _damaged_files(output)
+        output.claim(
+            CONFIG,
+            _record(source),
+            noun="training set",
+            error=DatasetError,
+            grows="num_frames",
+            result=MANIFEST,
+        )
+        _make_shards(source, output, damaged, workers, progress)
         return _complete(source, output)
 
 
@@ -109,8 +117,9 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     attach_markers(layout, HandModel.named("M"))
-    sampler = None if settings.sampler is None else load_sampler(settings.sampler)
-    return FrameSource(settings, layout, rig, sampler)
+    return FrameSource(
+        settings, layout, rig, None if settings.sampler is None else load_sampler(settings.sampler)
+    )
 
 
 def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str | None) -> int | Executor:
@@ -145,15 +154,30 @@ def _record(source: FrameSource) -> dict[str, Any]:
     }
 
 
-def _make_shards(source: FrameSource, output: Output, workers: int | Executor, progress: Progress) -> None:
-    """Make the missing shards."""
-    there, total = output.sizes(), source.settings.num_frames
+def _damaged_files(output: Output) -> set[str]:
+    """Files of a finished set that are no longer what its manifest lists, which are told."""
+    if not output.is_here and MANIFEST in output.sizes():
+        (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
+    try:
+        listed = load_manifest(output.folder).files
+    except DatasetError:  # unfinished, or of another version
+        return set()
+    there = output.sizes()
+    damaged = {name for name, known in listed.items() if name in there and output.checksum(name) != known}
+    if damaged:
+        names = ", ".join(sorted(damaged))
+        told = f"{output}: {names} are not what {MANIFEST} lists (other checksums), and are made again"
+        warnings.warn(told, HandSimWarning, stacklevel=4)
+    return damaged
 
-    def is_finished(shard: int) -> bool:  # the last shard of a set that grows is not
-        expected = array_bytes(row_dtype(source.layout.num_markers), _shard_size(total, shard))
-        return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
-    todo = [shard for shard in _shards(total) if not is_finished(shard)]
+def _make_shards(
+    source: FrameSource, output: Output, damaged: set[str], workers: int | Executor, progress: Progress
+) -> None:
+    """Make the shards that are missing or damaged."""
+    total = source.settings.num_frames
+    there = {name: size for name, size in output.sizes().items() if name not in damaged}
+    todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
     done = total - sum(_shard_size(total, shard) for shard in todo)
     try:
         job = output.job(functools.partial(make_shard, source), last=["rows-*"])
@@ -202,6 +226,13 @@ def _shards(num_frames: int) -> range:
 def _shard_size(num_frames: int, shard: int) -> int:
     """Rows of a shard."""
     return min(ROWS_PER_SHARD, num_frames - shard * ROWS_PER_SHARD)
+
+
+def _is_finished(source: FrameSource, there: dict[str, int], shard: int) -> bool:
+    """Whether a shard has all its rows; the last shard of a set that grows does not."""
+    size = _shard_size(source.settings.num_frames, shard)
+    expected = array_bytes(row_dtype(source.layout.num_markers), size)
+    return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
 
 def make_shard(source: FrameSource, out: Path, shard: int) -> int:
