@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +25,7 @@ from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.color_sensor import linear_of
+from render.formats.png import encode_png
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
@@ -207,30 +206,23 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
 
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m]."""
-_KEYWORD: Final = b"metres_per_unit"
-_FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
+_KEYWORD: Final = "metres_per_unit"
 _LARGEST: Final = 65535  # largest depth in these units
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
 _JPEG_QUALITY: Final = 95
 
 
-def encode_png(picture: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """An sRGB picture as PNG."""
-    return _encode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-
-
 def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QUALITY) -> bytes:
     """An sRGB or gray picture as JPEG."""
     ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
-    return _encode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done, "JPEG holds any picture"
+    return data.tobytes()
 
 
 def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
     """Depth [m] as 16-bit gray PNG, whose text chunk `metres_per_unit` has the unit; 0 if it does not fit."""
-    data = _encode(".png", _depth_steps(np.ascontiguousarray(depth)))
-    text = _KEYWORD + b"\0" + repr(METERS_PER_UNIT).encode("ascii")
-    end = _FIRST_CHUNK.stop
-    return data[:end] + _chunk(b"tEXt", text) + data[end:]
+    return encode_png(_depth_steps(np.ascontiguousarray(depth)), text={_KEYWORD: repr(METERS_PER_UNIT)})
 
 
 @kernel
@@ -251,25 +243,25 @@ def encode_ids(pictures: Pictures) -> bytes | None:
     known = [layer for layer in layers if layer is not None]
     if not known:
         return None
-    return encode_png(np.stack([np.zeros_like(known[0]) if x is None else x for x in layers], axis=-1))
+    return encode_png(cv2.merge([np.zeros_like(known[0]) if layer is None else layer for layer in layers]))
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
     """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
-    return _encode(".png", _normal_levels(np.ascontiguousarray(normals)))
+    return encode_png(_normal_levels(np.ascontiguousarray(normals)))
 
 
 @kernel
 def _normal_levels(normals: Floats) -> Any:
-    """Normals (H, W, 3) as bytes, z first, because OpenCV has blue first."""
+    """Normals (H, W, 3) as bytes."""
     levels = np.zeros(normals.shape, np.uint8)
     for row in range(normals.shape[0]):
         for column in range(normals.shape[1]):
             x, y, z = normals[row, column]
             if x != 0.0 or y != 0.0 or z != 0.0:
-                levels[row, column, 2] = int(np.rint(x * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 0] = int(np.rint(x * _NORMAL_SCALE)) + _NORMAL_ZERO
                 levels[row, column, 1] = int(np.rint(y * _NORMAL_SCALE)) + _NORMAL_ZERO
-                levels[row, column, 0] = int(np.rint(z * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 2] = int(np.rint(z * _NORMAL_SCALE)) + _NORMAL_ZERO
     return levels
 
 
@@ -288,17 +280,6 @@ def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]
     if ids is not None:
         files[".ids.png"] = ids
     return files
-
-
-def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None) -> bytes:
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(picture), options or [])
-    assert done, "PNG and JPEG hold any picture"
-    return data.tobytes()
-
-
-def _chunk(name: bytes, content: bytes) -> bytes:
-    checksum = zlib.crc32(name + content)
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
 
 
 _RGB: Final = ("R", "G", "B")
