@@ -90,7 +90,7 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
 
 def run_lengths(mask: Flags) -> list[int]:
     """COCO's uncompressed run lengths of a mask (H, W): zeros and ones in turn, column by column."""
-    flat = mask.ravel(order="F")
+    flat = cv2.transpose(mask.view(np.uint8)).ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     ends = np.concatenate([[0], changes, [flat.size]])
     counts: list[int] = np.diff(ends).tolist()
