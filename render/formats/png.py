@@ -203,14 +203,21 @@ def _write_block(
         held, count, place = _put(header[n, 0], header[n, 1], held, count, place, block)
     low = np.uint64(0xFFFFFFFF)
     for token in tokens:
-        held, count, place = _put(codes[token] & low, codes[token] >> np.uint64(32), held, count, place, block)
+        held, count, place = _put(
+            codes[token] & low, codes[token] >> np.uint64(32), held, count, place, block
+        )
     block[place] = np.uint32(held)
     return 4 * place + int(count + np.uint64(7)) // 8
 
 
 @kernel
 def _put(
-    value: np.uint64, bits: np.uint64, held: np.uint64, count: np.uint64, place: int, block: NDArray[np.uint32]
+    value: np.uint64,
+    bits: np.uint64,
+    held: np.uint64,
+    count: np.uint64,
+    place: int,
+    block: NDArray[np.uint32],
 ) -> Any:
     """Add some bits to those that are held; whole words are written, without a branch."""
     held |= value << count

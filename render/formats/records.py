@@ -158,50 +158,19 @@ def _plain(content: Any) -> Any:
     return content
 
 
-# Joint orders, in one table because a wrong permutation looks almost right:
-# - FreiHAND, MediaPipe and COCO-WholeBody: wrist, then thumb to little, base to tip. This is ours.
-# - MANO with its tips appended, as in HO-3D and H2O-3D: wrist, three joints each of index, middle, little,
-#   ring and thumb, then the tips from thumb to little.
-# - InterHand2.6M: thumb to little, tip to base, then the wrist; its files have a right hand and a left one.
-# - HANDS17 and BigHand2.2M: wrist, five first joints, then the other three per digit.
-# - OpenXR: palm, wrist, four of the thumb, five per finger from its metacarpal on; WebXR has no palm.
-# - UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger; with 21 landmarks
-#   the palm's center comes last.
-ABSENT: Final = -1
-"""Index of a joint that we lack."""
-_WRIST: Final = 0
-_OURS: Final = tuple(range(NUM_KEYPOINTS))
-_DIGITS: Final = tuple(_OURS[first : first + 4] for first in range(1, NUM_KEYPOINTS, 4))
-_TIPS: Final = _OURS[4::4]
-_MANO: Final = (_WRIST, *(joint for digit in (1, 2, 4, 3, 0) for joint in _DIGITS[digit][:3]), *_TIPS)
-_INTERHAND: Final = (*(joint for digit in _DIGITS for joint in digit[::-1]), _WRIST)
-_HANDS17: Final = (_WRIST, *_OURS[1::4], *(joint for digit in _DIGITS for joint in digit[1:]))
-_WEBXR: Final = (_WRIST, *_DIGITS[0], *(joint for digit in _DIGITS[1:] for joint in (ABSENT, *digit)))
-_UMETRACK: Final = (*_TIPS, _WRIST, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3]))
-
+_DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))
+# InterHand2.6M: thumb to little, tip to base, then the wrist; its files have a right hand and a left one.
+# UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger.
 JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
-    "handsim": _OURS,
-    "freihand": _OURS,
-    "mediapipe": _OURS,
-    "coco_wholebody_hand": _OURS,
-    "mano": _MANO,
-    "ho3d": _MANO,
-    "interhand": _INTERHAND,
-    "hands17": _HANDS17,
-    "bighand": _HANDS17,
-    "openxr": (ABSENT, *_WEBXR),
-    "webxr": _WEBXR,
-    "umetrack": _UMETRACK,
-    "hot3d": _UMETRACK,
-    "umetrack21": (*_UMETRACK, ABSENT),
+    "interhand": (*(joint for digit in _DIGITS for joint in digit[::-1]), 0),
+    "umetrack": (*(digit[3] for digit in _DIGITS), 0, 2, 3, *(j for digit in _DIGITS[1:] for j in digit[:3])),
 }
-"""Index in `KEYPOINT_NAMES` of every joint of an order."""
+"""Index in `KEYPOINT_NAMES` of every joint of another data set's order; ours is that of FreiHAND."""
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Rows of our keypoints in one of `JOINT_ORDERS`; NaN for joints that we lack."""
-    nowhere = np.full_like(points[..., :1, :], np.nan)
-    return np.concatenate([points, nowhere], axis=-2)[..., list(JOINT_ORDERS[name]), :]
+    """Rows of our keypoints in one of `JOINT_ORDERS`."""
+    return points[..., list(JOINT_ORDERS[name]), :]
 
 
 METERS_PER_UNIT: Final = 1e-4
