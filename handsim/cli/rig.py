@@ -26,39 +26,11 @@ from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 if TYPE_CHECKING:
     from train.forecast.rig_forecast import Forecast
 
-_STARTER: Final = """\
-# A camera rig (docs/rigs.md): lengths in meters, z up, the origin on the floor. Edit it, then run
-#   handsim rig check FILE
-#   handsim rig score FILE
-
-name = "my rig"
-description = "Four cameras at the corners of a table."
-size = [1280, 1024]  # width and height of the pictures [px]
-horizontal_field_of_view = 56.0  # [deg], as data sheets state it; or focal = 1204.0 [px] of a calibration
-
-# One table for each camera, two to thirty-two of them; what it says goes before what stands at the top. Hands
-# work around (0, 0, 1.1): place the origin so, or tell `handsim rig score` where they work with --center.
-
-[[camera]]
-position = [-1.2, -0.9, 2.2]  # of the lens
-target = [0.0, 0.0, 1.1]  # a point in the middle of its picture
-
-[[camera]]
-position = [-1.2, 0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-
-[[camera]]
-position = [1.2, -0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-
-[[camera]]
-position = [1.2, 0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-"""
+_STARTER: Final = Path(__file__).parents[1] / "data" / "starter_rig.toml"
 _Sides = tuple[float, float, float]
 
 
-def list_shipped() -> None:
+def list_rig() -> None:
     """List the camera rigs that come with handsim: how many cameras, their pictures, and what they are."""
     rigs = [(name, load_rig(name)) for name in list_rigs()]
     rows = [(name, str(len(rig.cameras)), rig.pictures(), rig_description(name)) for name, rig in rigs]
@@ -72,7 +44,7 @@ def new_rig(file: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         file: A new .toml file.
     """
-    write_starter(file, _STARTER, error=RigError)
+    write_starter(file, _STARTER.read_text("utf-8"), error=RigError)
     print_line(f"{file}: edit it, then run `handsim rig check {file}`")
 
 
@@ -100,17 +72,14 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
         f"The cameras look at ({coordinates(point, ', ')}) m; {covered:.0f} % of the cube of "
         f"{side:g} m around it is in view of two or more."
     )
-    if not _tell_faults(cameras):
-        print_line(f"Nothing is suspicious. What it sees of hands at work: handsim rig score {rig}")
+    fine = f"Nothing is suspicious. What it sees of hands at work: handsim rig score {rig}"
+    print_line(*(_suspicions(cameras) or [fine]))
 
 
-def _tell_faults(rig: CameraRig) -> list[str]:
+def _suspicions(rig: CameraRig) -> list[str]:
     from train.forecast.rig_score import faults
 
-    found = faults(rig)
-    for sentence in found:
-        print_line(f"Suspicious: {sentence}.")
-    return found
+    return [f"Suspicious: {sentence}." for sentence in faults(rig)]
 
 
 def import_rig(
@@ -125,8 +94,7 @@ def import_rig(
         up: The axis that points up in the calibration; y for Motive and z for the others when not given.
             The rig's is z.
     """
-    check_ending(out, ".toml")
-    check_outputs([file], [out])
+    check_outputs([file], [out], ".toml")
     try:
         rig = CameraRig(as_text(file.stem), import_cameras(file, up))
     except RigError as error:
@@ -171,8 +139,7 @@ def score_rig(
     print_line(rig_score.COLUMNS_TOLD)
     axes = " x ".join(f"{1e3 * axis:.3f}" for axis in score.whole.error.axes)
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
-    for number, sentence in enumerate(score.advice, 1):
-        print_line(f"{number}. {sentence}")
+    print_line(*(f"{number}. {sentence}" for number, sentence in enumerate(score.advice, 1)))
     with written_together():
         if json is not None:
             save_json(json, score.record())
@@ -195,8 +162,7 @@ def plan_rig(
             middle below that of the volume.
         settings: Where hands work, and what cameras can hang on.
     """
-    check_ending(out, ".toml")
-    check_outputs([settings.keep, settings.glove], [out])
+    check_outputs([settings.keep, settings.glove], [out], ".toml")
     from train.forecast import rig_plan
 
     with named_steps("getting ready") as step:
@@ -208,7 +174,7 @@ def plan_rig(
     if planned.before is not None:
         print_line(f"before: {_forecast_line(planned.before)}")
     print_line(f"after:  {_forecast_line(planned.after)}")
-    _tell_faults(planned.rig)
+    print_line(*_suspicions(planned.rig))
     planned.rig.save(out)
     print_line(f"{out}: run `handsim rig score {out}`")
 
