@@ -326,7 +326,7 @@ def put_before(
 
 def whole_levels(background: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """A background as bytes."""
-    return np.minimum(background, _WHITE).astype(np.uint8)
+    return np.asarray(np.minimum(background, _WHITE).astype(np.uint8))
 
 
 @kernel
