@@ -14,12 +14,11 @@ import mujoco
 import numpy as np
 
 from benchmarks.record import add_save, describe, save_figures
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos, load_rig
 from handsim.hand.shape import EVERYBODY
-from handsim.space.rig import load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import HIGH, LOW, sample_valid_angles
 from train.simulation.training_frames import sample_hands

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.record import describe
+from gloves import MarkerLayout, load_layout
 from gloves.captures.formats import read_markers
-from gloves.layout import MarkerLayout, list_layouts, load_layout
-from train.data.batches import Corruption, paper_corruption
-from train.evaluation import evaluate_labeler
+from gloves.layout import list_layouts
+from train import Corruption, Labeler, evaluate_labeler, load_labeler
+from train.data.batches import paper_corruption
 from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler, sample_worn_markers
 from train.labelers.layout_training import sample_places
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.labelers.storage import shipped_labelers
 
 CAPTURE_FRAMES = 3000
 

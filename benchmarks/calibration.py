@@ -33,11 +33,10 @@ from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import right_hands
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit, attach_markers, nominal_fit
-from gloves.layout import MarkerLayout, load_layout
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import BONES, SIDES, SIZES, HandShape, sample_shape, shape_from_measures
+from gloves import GloveFit, MarkerLayout, Take, load_layout
+from gloves.fit import attach_markers, nominal_fit
+from handsim import HandModel, HandShape, join_qpos, sample_shape
+from handsim.hand.shape import BONES, SIDES, SIZES, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.energy import contact_geometry, initialize_contacts

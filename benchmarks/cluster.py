@@ -30,11 +30,9 @@ import numpy as np
 
 from benchmarks.record import describe
 from handsim.app.workers import chosen_workers, run_jobs
-from render.config import RenderConfig
-from render.session import render_take
+from render import RenderConfig, render_take
+from train import GenerateSettings, simulate_take
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 

@@ -20,16 +20,17 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import measured_users, nearest_size, nominal_users, seen_frame
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit, nominal_fit
-from gloves.takes.take import Take, keypoints_of
+from gloves import GloveFit, Take
+from gloves.fit import nominal_fit
+from gloves.takes.take import keypoints_of
 from handsim.hand.shape import JOINT_NAMES
+from track import Tracker, User
 from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
-from track.tracker import Tracker
-from track.user import MEASURED, User
-from train.labelers.storage import load_labeler
+from track.user import MEASURED
+from train import load_labeler, simulate_take
 from train.simulation.scenes import KINDS, CalibrationTakeConfig
-from train.simulation.takes import simulate_calibration, simulate_take
+from train.simulation.takes import simulate_calibration
 
 EVERY = 4  # frames
 

@@ -24,11 +24,11 @@ from scipy.ndimage import binary_closing
 
 from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves import Take
 from gloves.captures.capture import runs_of
-from gloves.takes.take import Take
-from track.captures import label_capture, track_capture
+from track import find_suspect_spans, label_capture, track_capture
 from track.label_confidence import evidence_of
-from track.take_summary import find_suspect_spans, frame_confidence
+from track.take_summary import frame_confidence
 from train.evaluation import expected_calibration_error
 
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")

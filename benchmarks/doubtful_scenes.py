@@ -10,11 +10,10 @@ import numpy as np
 
 from benchmarks.real_motion import tracker_of, true_labels
 from benchmarks.real_scenes import CONDITIONS, make_scene
-from gloves.takes.take import Take
+from gloves import Take
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
-from train.simulation.room import OpticsOptions
-from train.simulation.takes import simulate_take
+from train import OpticsOptions, simulate_take
 
 KINDS = ("single-hand", "hand-hand", "hand-pen", "hand-controller")
 POOR = OpticsOptions(blob_loss=0.08, dropout=0.004, noise=0.25)  # the usual: 0.002, 0.0002, 0.12

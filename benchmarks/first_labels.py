@@ -19,15 +19,14 @@ from benchmarks.held_out import held_out_markers
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from benchmarks.record import add_save, describe, save_figures
+from gloves import load_layout
 from gloves.captures.formats import find_captures, read_markers
-from gloves.layout import load_layout
+from train import Dataset, GenerateSettings, TrainSettings
 from train.data.batches import draw_batch
-from train.data.shards import Dataset
 from train.labelers.networks import labeler_of
 from train.loop import TrainingState, start_fabric
-from train.settings import KINDS, TrainSettings, batch_recipe, usual_settings
+from train.settings import KINDS, batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings
 
 GLOVE = "dense19"
 EVERY = {"set": 40_000, "cnn": 20_000}  # samples between two looks

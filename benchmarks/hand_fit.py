@@ -19,12 +19,13 @@ import numpy as np
 
 from benchmarks.people import right_hands
 from benchmarks.record import add_save, describe, save_figures
-from gloves.fit import Attachment, attach_markers
-from gloves.layout import MarkerLayout, load_layout
-from handsim.hand.model import HandModel, skinned_jacobian
-from handsim.hand.shape import JOINTS, HandShape, shape_from_measures
+from gloves import Attachment, MarkerLayout, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, HandShape
+from handsim.hand.model import skinned_jacobian
+from handsim.hand.shape import JOINTS, shape_from_measures
 from handsim.kernels import move
-from track.kinematics.pose_solver import PoseFit, solve_pose
+from track import PoseFit, solve_pose
 
 ROUNDS = 12
 STEP = 1e-5

@@ -22,16 +22,13 @@ import numpy as np
 
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.record import describe
-from gloves.captures.capture import Capture
+from gloves import Capture, GloveFit, Take, load_layout
 from gloves.captures.formats import read_markers
-from gloves.fit import GloveFit
-from gloves.layout import load_layout
-from gloves.takes.take import Take
-from handsim.errors import HandSimWarning
+from handsim import HandSimWarning
 from handsim.hand.shape import Side
-from track.captures import calibrate, measure_hands, track_capture
+from track import calibrate, measure_hands, track_capture
 from track.kinematics.pose_solver import PoseSolver
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 FRESH, RATE = 20.0, 120.0  # [s], [Hz]
 NAMES = (

@@ -16,12 +16,13 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from gloves.fit import Attachment, GloveFit, attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
+from gloves import Attachment, GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos
+from handsim.hand.model import build_spec, skinned_jacobian
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
-from poses.motion import sample_motion
+from poses import sample_motion
 from poses.shapes import sample_valid_angles
 from track.kinematics.pose_solver import PoseSolver
 

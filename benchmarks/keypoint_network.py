@@ -42,13 +42,11 @@ import trimesh
 
 from benchmarks import keypoint_training as training
 from benchmarks.record import Figures, add_save, describe, save_figures
+from handsim import HandModel
 from handsim.files.outputs import atomic_write
-from handsim.hand.model import HandModel
-from render.config import RenderConfig
-from render.frames import RenderedFrame
+from render import Backgrounds, RenderConfig, RenderedFrame
 from render.painting.figures import Appearance, sample_people
 from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
-from render.scenery.backgrounds import Backgrounds
 
 FEW_BACKGROUNDS: Final = Backgrounds({"plain": 1, "gradient": 1})
 LEARNED, HELD_OUT = 1, 2  # seeds of the pictures

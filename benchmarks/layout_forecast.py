@@ -22,26 +22,16 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, load_layout
+from handsim import load_rig
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
-from handsim.space.rig import load_rig
-from track.glove_score import (
-    CAPTURES,
-    FRAMES,
-    METHODS,
-    NOISE,
-    WORK,
-    LayoutScore,
-    mean_trial,
-    score_layout,
-    try_layout,
-)
+from track import LayoutScore
+from track.glove_score import CAPTURES, FRAMES, METHODS, NOISE, WORK, mean_trial, score_layout, try_layout
 from track.kinematics.pose_solver import PoseSolver
+from train import Labeler, load_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_poses
 from train.labelers.layout_labeler import fine_tuned_labeler, learned_labeler
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.layout_forecast import chosen_layouts, stored, trial_figures
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from track.glove_score import METHODS

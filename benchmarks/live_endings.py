@@ -33,11 +33,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gloves.captures.formats import write_capture
+from gloves import load_take, write_capture
 from gloves.takes.archives import CutOffWarning, GrownArchive
-from gloves.takes.take import load_take
 from handsim.cli.main import main as handsim
-from train.simulation.takes import simulate_take
+from train import simulate_take
 
 MOST = 2.0  # seconds from the last signal to the end
 HANGS = 30.0  # seconds after which a recording is killed

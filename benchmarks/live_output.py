@@ -24,14 +24,12 @@ from websockets.sync.client import connect
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
-from gloves.takes.take import Take
-from track.sinks import open_sinks
+from gloves import Take
+from track import ReplayServer, Tracker, open_sinks, open_source
 from track.streams import LOOPBACK, natnet
-from track.streams.live_stream import open_source
-from track.streams.natnet import ReplayServer, ServerInfo
-from track.tracker import Tracker, warm_up
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track.streams.natnet import ServerInfo
+from track.tracker import warm_up
+from train import load_labeler, simulate_take
 
 RATE = 120.0
 SPAWN = multiprocessing.get_context("spawn")

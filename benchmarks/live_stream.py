@@ -31,16 +31,13 @@ import numpy as np
 
 from benchmarks.paper.take_evaluation import true_users
 from benchmarks.record import describe
+from gloves import Take, load_take
 from gloves.takes.archives import GrownArchive
-from gloves.takes.take import Take, load_take
-from track.frames import StreamedFrame
-from track.recorder import Recorder
+from track import LiveStream, Recorder, ReplayServer, StreamedFrame, Tracker
 from track.streams import LOOPBACK, natnet
-from track.streams.live_stream import MOST_LAG, LiveStream
-from track.streams.natnet import Kind, ReplayServer, ServerInfo, open_stream
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track.streams.live_stream import MOST_LAG
+from track.streams.natnet import Kind, ServerInfo, open_stream
+from train import load_labeler, simulate_take
 
 RATE = 120.0
 SHARE = 0.05  # of the packets, for each kind of damage

@@ -27,19 +27,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import Take, load_take
+from gloves import Take, attach, load_layout, load_take
+from handsim import Camera, HandModel, join_qpos, sample_shape
 from handsim.errors import PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIDES, Side, sample_shape
-from handsim.space.camera import Camera, preset
+from handsim.hand.shape import SIDES, Side
+from handsim.space.camera import preset
 from poses.shapes import gesture, make_valid
-from render.color_sensor import ExposureConfig, sample_exposure
+from render import Backgrounds, ExposureConfig, RenderedFrame
+from render.color_sensor import sample_exposure
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import Background, Backgrounds
+from render.scenery.backgrounds import Background
 from render.scenery.lights import Lighting, expose_for, sample_surroundings
 from render.skin.look import TONES
 from render.studio import FrameChoices, Moment, Studio

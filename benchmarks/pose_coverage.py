@@ -18,9 +18,9 @@ import torch
 
 from benchmarks.people import right_hands
 from benchmarks.record import add_save, describe, save_figures
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from handsim.space.transforms import rigid_fit
 from poses.shapes import sample_valid_angles
 

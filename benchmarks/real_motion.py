@@ -30,12 +30,10 @@ import torch
 
 from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.layout import load_layout
-from track.captures import label_capture
-from track.frames import StreamedFrame
+from gloves import load_layout
+from track import StreamedFrame, Tracker, label_capture
 from track.hand_size import fit_size, sample_frames
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from train import load_labeler
 
 SIDES = ("right", "left")
 

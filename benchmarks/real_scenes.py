@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from gloves.captures.capture import Capture
-from gloves.layout import load_layout
+from gloves import Capture, load_layout
 from gloves.optics.reconstruction import number_runs
 
 CONDITIONS = ("clean", "gaps", "close", "new-ids", "exchanged-ids")

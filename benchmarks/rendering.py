@@ -29,21 +29,19 @@ import trimesh
 from torch.utils.data import DataLoader
 
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.takes.take import Take
+from gloves import Take
 from handsim.app.workers import run_jobs
-from render.config import RenderConfig
+from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
 from render.painting.rasterizer import join, rasterize
 from render.session import Drawing
 from render.skin.look import ALL_TONES
-from render.stream import PictureStream
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
-from render.viewpoints import ViewConfig, Viewpoints
-from train.simulation.takes import simulate_take
+from render.viewpoints import Viewpoints
+from train import simulate_take
 
 SECTIONS: Final = ("accuracy", "memory", "stream")
 CROP, BATCH = 256, 16  # of the stream's pictures [px], and in a batch

@@ -20,14 +20,13 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.record import describe
+from gloves import load_layout
 from gloves.captures.capture import run_lengths
-from gloves.layout import load_layout
-from handsim.space.camera import look_at
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, load_rig
-from train.forecast.rig_forecast import Forecast, forecast, light_work, sample_work
-from train.forecast.rig_plan import plan_rig
+from handsim import CameraRig, load_rig, look_at
+from handsim.space.rig import ROOM_CENTER, list_rigs
+from train import Forecast, plan_rig, simulate_take
+from train.forecast.rig_forecast import forecast, light_work, sample_work
 from train.simulation.scenes import SimulatedKind
-from train.simulation.takes import simulate_take
 
 GLOVE = "dense19"
 CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (

@@ -21,14 +21,14 @@ import numba
 import numpy as np
 
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves import OpticsConfig, load_layout
 from gloves.fit import wear
-from gloves.layout import load_layout
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import reconstruct
 from gloves.optics.visibility import clear_of_mesh, facing_cameras, hand_tree, visible_cameras
-from handsim.hand.model import join_qpos
-from handsim.space.rig import load_rig
+from handsim import join_qpos, load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
+from train import GenerateSettings, simulate_take
 from train.simulation.room import (
     SKIN_CHUNK,
     TWINS,
@@ -39,8 +39,8 @@ from train.simulation.room import (
     sample_light_sources,
     stray_reflections,
 )
-from train.simulation.takes import sample_scene, simulate_take
-from train.simulation.training_frames import GenerateSettings, sample_hands
+from train.simulation.takes import sample_scene
+from train.simulation.training_frames import sample_hands
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"

@@ -23,13 +23,9 @@ import numpy as np
 from benchmarks.held_out import held_out_markers
 from benchmarks.record import describe
 from handsim.app.workers import chosen_workers, run_jobs
-from render.config import RenderConfig
-from render.session import render_take
-from train.data.batches import Corruption, corrupt
-from train.labelers.storage import load_labeler
+from render import RenderConfig, render_take
+from train import Corruption, GenerateSettings, corrupt, load_labeler, simulate_take
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings
 
 SHARD = 1.0  # [s] that a shard sleeps
 EACH = 8  # shards of each worker

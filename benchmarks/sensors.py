@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from benchmarks.record import describe
-from handsim.space.camera import Camera, Lens, pinhole
+from handsim import Camera, Lens
+from handsim.space.camera import pinhole
 from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DEPTH_NOISES, SENSORS, apply_depth_noise, reflectance_of
 from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals

@@ -18,8 +18,8 @@ import numpy as np
 import trimesh
 
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
 from gloves.optics.visibility import (
     MAX_FACING,
     clear_of_body,
@@ -28,9 +28,9 @@ from gloves.optics.visibility import (
     hand_tree,
     visible_cameras,
 )
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Side, sample_shape
-from handsim.space.rig import CameraRig, list_rigs, load_rig
+from handsim import CameraRig, HandModel, join_qpos, load_rig, sample_shape
+from handsim.hand.shape import Side
+from handsim.space.rig import list_rigs
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 

@@ -20,12 +20,10 @@ import torch
 
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.captures.capture import Capture
+from gloves import Capture
 from gloves.captures.formats import find_captures, read_markers
-from track.captures import label_capture
-from train.evaluation import LabelingReport
-from train.labelers.protocol import Labeler, Labeling
-from train.labelers.storage import load_labeler
+from track import label_capture
+from train import Labeler, Labeling, LabelingReport, load_labeler
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "

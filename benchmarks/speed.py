@@ -51,27 +51,33 @@ from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_use
 from benchmarks.paper.trials import hide_points
 from benchmarks.record import Figures, add_save, describe, save_figures
 from benchmarks.tracking import calibrated_users, labeler, twin
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
+from gloves import GloveFit, Take, load_layout, write_capture
+from gloves.fit import attach_markers
 from gloves.optics.visibility import free_rays
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel, join_qpos
-from handsim.space.rig import load_rig
+from handsim import HandModel, join_qpos, load_rig
 from poses.shapes import sample_valid_angles
-from track.tracker import Tracker, warm_up
-from train.data.batches import Corruption, corrupt, draw_batch
-from train.data.shards import Dataset
+from track import Tracker
+from track.tracker import warm_up
+from train import (
+    CNNConfig,
+    Corruption,
+    Dataset,
+    GenerateSettings,
+    Labeler,
+    SceneMix,
+    corrupt,
+    load_labeler,
+    simulate_take,
+)
+from train.data.batches import draw_batch
 from train.fabric import start_fabric
 from train.labelers.networks import labeler_of, new_network
-from train.labelers.protocol import Labeler, torch_threads
-from train.labelers.storage import OnnxLabeler, export_onnx, load_labeler, load_network
+from train.labelers.protocol import torch_threads
+from train.labelers.storage import OnnxLabeler, export_onnx, load_network
 from train.loop import TrainingState
-from train.settings import CNNConfig, batch_recipe, usual_settings
+from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count

@@ -40,14 +40,12 @@ from benchmarks.paper.take_evaluation import (
 )
 from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from track.captures import calibrate
-from track.tracker import Tracker, warm_up
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
+from gloves import GloveFit, Take
+from track import Tracker, calibrate
+from track.tracker import warm_up
+from train import Labeler, load_labeler, simulate_take
 from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
-from train.simulation.takes import simulate_calibration, simulate_take
+from train.simulation.takes import simulate_calibration
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""

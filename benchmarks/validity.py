@@ -15,18 +15,17 @@ import itertools
 import numpy as np
 
 from benchmarks.record import add_save, describe, save_figures
-from gloves.takes.take import Take
-from handsim.errors import HandSimError
-from handsim.hand.model import HandModel
-from handsim.hand.shape import EVERYBODY, sample_shape
+from gloves import Take
+from handsim import HandModel, HandSimError, sample_shape
+from handsim.hand.shape import EVERYBODY
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.grasps import object_penetration
 from poses.motion import script_names, scripted_motion
 from poses.shapes import HIGH, LOW
 from poses.two_hands import two_hands_penetration
+from train import simulate_take
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
 
 SECONDS = 10.0
 WORST = (

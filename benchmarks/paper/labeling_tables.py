@@ -16,21 +16,26 @@ from rich.table import Table
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from benchmarks.record import Figures, save_figures
+from gloves import Take
 from gloves.captures.capture import count_gaps, run_lengths
 from gloves.captures.formats import find_captures, read_markers
-from gloves.takes.take import Take
+from handsim import HandSimError
 from handsim.app.messages import progress_bar
-from handsim.errors import HandSimError
-from train.data.batches import Corruption, paper_corruption
-from train.data.shards import Dataset
-from train.evaluation import LabelingReport, evaluate_labeler
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
-from train.loop import train_labeler
+from train import (
+    Corruption,
+    Dataset,
+    Labeler,
+    LabelingReport,
+    evaluate_labeler,
+    load_labeler,
+    simulate_take,
+    train_labeler,
+)
+from train.data.batches import paper_corruption
+from train.labelers.storage import shipped_labelers
 from train.settings import Kind, usual_settings
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
 
 # Median and p90 of real finger markers' gaps [frames]; docs/room.md.
 PUBLISHED_GAPS: Final = "3-4", "24-43"
