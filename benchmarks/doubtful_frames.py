@@ -13,7 +13,6 @@ those in use are of seeds 101 to 114, which test nothing.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -23,7 +22,7 @@ import torch
 from scipy.ndimage import binary_closing
 
 from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
-from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.record import Figures, describe, run, save_figures
 from gloves import Take
 from gloves.captures.capture import runs_of
 from track import find_suspect_spans, label_capture, track_capture
@@ -38,11 +37,13 @@ WHAT = (
 )
 
 
-def simulated_takes(options: argparse.Namespace) -> Iterator[tuple[str, Take, np.ndarray]]:
+def simulated_takes(
+    gloves: tuple[str, ...], seeds: tuple[int, ...], frames: int, label: bool
+) -> Iterator[tuple[str, Take, np.ndarray]]:
     """What each take is, the take and the true labels."""
-    make = label_capture if options.label else track_capture
-    for glove, seed, kind in product(options.gloves, options.seeds, KINDS):
-        truth = simulate(glove, kind, seed, options.frames)
+    make = label_capture if label else track_capture
+    for glove, seed, kind in product(gloves, seeds, KINDS):
+        truth = simulate(glove, kind, seed, frames)
         yield f"{glove} {kind}", make(truth, glove=glove), truth.labels
 
 
@@ -87,7 +88,9 @@ def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
 
 
-def fit(told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: float = 10.0) -> np.ndarray:
+def fitted(
+    told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: float = 10.0
+) -> np.ndarray:
     """Coefficients of a logistic model, the constant first, by Newton's method.
 
     Args:
@@ -106,28 +109,25 @@ def fit(told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: 
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--gloves", nargs="+", default=GLOVES)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[300, 301, 302, 303])
-    parser.add_argument("--frames", type=int, default=600)
-    parser.add_argument("--label", action="store_true")
-    parser.add_argument("--real", type=Path)
-    parser.add_argument("--fit", action="store_true")
-    add_save(parser)
-    options = parser.parse_args()
+def main(
+    gloves: tuple[str, ...] = GLOVES,
+    seeds: tuple[int, ...] = (300, 301, 302, 303),
+    frames: int = 600,
+    label: bool = False,
+    real: Path | None = None,
+    fit: bool = False,
+    save: str | None = None,
+) -> None:
     torch.set_num_threads(1)
     print(describe("numba", "torch"), WHAT, sep="\n")
     table: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {}
     labeled: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[tuple[np.ndarray, np.ndarray]] = []
-    takes = real_takes(options.real, options.frames) if options.real else simulated_takes(options)
+    takes = real_takes(real, frames) if real else simulated_takes(gloves, seeds, frames, label)
     for name, take, truth in takes:
         for key in (*name.split(), "all"):
             table.setdefault(key, []).append(score(take, truth))
-        if options.fit:
+        if fit:
             evidence = evidence_of(take)
             points = take.point_list
             true = truth[points.frames[evidence.points], points.columns[evidence.points]]
@@ -142,10 +142,10 @@ def main() -> None:
         )
         print(f"{key:16s} | " + " | ".join(f"{value:6.1f}" for value in values), flush=True)
         figures[key] = f"{WHAT}; {key}", values
-    save_figures(options.save, figures)
-    if options.fit:
-        print("_LABELED", fit(labeled).round(2), "\n_UNLABELED", fit(others).round(2))
+    save_figures(save, figures)
+    if fit:
+        print("_LABELED", fitted(labeled).round(2), "\n_UNLABELED", fitted(others).round(2))
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -8,6 +8,7 @@ step brings the markers less than a micron nearer. mink is left out where it is 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,7 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
+from benchmarks.record import timed
 from gloves import Attachment, GloveFit, load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, join_qpos
@@ -188,12 +190,7 @@ def from_eight_starts(
 
 def _times(job: Callable[[int], object], count: int) -> list[float]:
     """Times of a job for each number below a count [s], the first left out."""
-    times = []
-    for number in range(count):
-        begun = time.perf_counter()
-        job(number)
-        times.append(time.perf_counter() - begun)
-    return times[1:]
+    return [timed(functools.partial(job, number)) for number in range(count)][1:]
 
 
 def times(seeds: Sequence[int], frames: int) -> Iterator[tuple[str, str, list[float]]]:

@@ -10,7 +10,6 @@ python -m benchmarks.layout_forecast FOLDER [--labelers] [--frames 60000] [--sam
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import time
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.record import describe
+from benchmarks.record import describe, run
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim import load_rig
 from handsim.cli.main import main as handsim
@@ -39,17 +38,11 @@ FEWEST_MARKERS = 4  # of a pose
 Figures = dict[str, Any]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="training sets, runs and results")
-    parser.add_argument("--labelers", action="store_true", help="train a labeler of each layout, too")
-    parser.add_argument("--frames", type=int, default=60_000, help="of each training set")
-    parser.add_argument("--samples", type=int, default=300_000, help="of each training: minutes on one core")
-    options = parser.parse_args()
+def main(folder: Path, labelers: bool = False, frames: int = 60_000, samples: int = 300_000) -> None:
     print(describe("torch", "numpy"))
-    compare_captures(options.folder)
-    if options.labelers:
-        compare_labelers(options.folder, options.frames, options.samples)
+    compare_captures(folder)
+    if labelers:
+        compare_labelers(folder, frames, samples)
 
 
 def compare_captures(folder: Path) -> None:
@@ -248,4 +241,4 @@ def print_layout(layout: MarkerLayout, told: Figures, measured: Figures) -> None
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -16,17 +16,17 @@ pose, tone, side and background; without, its command lines are.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from benchmarks.record import run
 from gloves import Take, attach, load_layout, load_take
 from handsim import Camera, HandModel, join_qpos, sample_shape
 from handsim.errors import PoseError
@@ -61,16 +61,8 @@ FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
 JUDGED: Final = "judged.json"
 GROUPS: Final = ("view", "pose", "tone", "side", "background")
-WRIST, INDEX, MIDDLE, LITTLE = 0, 5, 9, 17  # keypoints
-PARTS: Final = {
-    "wrist": [WRIST],
-    "knuckles": [5, 9, 13, 17],
-    "finger tips": [8, 12, 16, 20],
-    "thumb's last two": [3, 4],
-}
 Tracked = dict[Side, list[tuple[HandModel, np.ndarray]]]
 """Hands of tracked takes, and their poses (T, 27); empty where gestures are drawn."""
-FLAT: Final = 5.0  # width of a palm that is seen edge on [px]
 
 
 class Case(NamedTuple):
@@ -104,7 +96,7 @@ def make_case(number: int, background: str, tracked: Tracked, rng: np.random.Gen
     return Case(pose, view, tone, side, name, model, qpos, camera, background)
 
 
-def load_tracked(paths: list[Path]) -> Tracked:
+def load_tracked(paths: Sequence[Path]) -> Tracked:
     """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
     found: Tracked = {side: [] for side in SIDES} if paths else {}
     for path in paths:
@@ -204,7 +196,7 @@ def write_set(name: str, hands: int, empty: int, seed: int, tracked: Tracked, ou
     (out / JUDGED).write_text(json.dumps(coco), encoding="utf-8")
 
 
-def judge(program: Path | None, out: Path) -> None:
+def run_judge(program: Path | None, out: Path) -> None:
     """Run the judge on a set and print its figures, or print how to run it."""
     report = out / "report.json"
     line = ["--images", str(out), "--annotations", str(out / JUDGED), "--report", str(report)]
@@ -221,52 +213,26 @@ def judge(program: Path | None, out: Path) -> None:
         values = (row["found"], row["err"], row["pck_all"], row["side"])
         cells = "".join(f"{'-' if value is None else format(100 * value, '.1f'):>8s}" for value in values)
         print(f"{name:22s}{row['n']:6d}{cells}")
-    print_offsets(out / JUDGED, figures["hands"])
     empty = [found for _, found in figures["controls"]]
     if empty:
         print(f"pictures without a hand: one reported in {sum(empty)} of {len(empty)}")
 
 
-def print_offsets(annotations: Path, hands: list[dict[str, Any]]) -> None:
-    """How far the judge's keypoints lie from ours on the median hand, and its error without that.
-
-    Along the hand, from our wrist to the knuckle of the middle finger, in thousandths of the box's diagonal.
-    """
-    coco = json.loads(annotations.read_text(encoding="utf-8"))
-    known = {one["id"]: one for one in coco["annotations"]}
-    errors = []
-    for hand in hands:
-        truth = np.array(known[hand["ann"]]["keypoints"]).reshape(21, 3)[:, :2]
-        across = truth[INDEX] - truth[LITTLE]
-        ahead = (truth[MIDDLE] - truth[WRIST]) / np.linalg.norm(truth[MIDDLE] - truth[WRIST])
-        across -= ahead * (across @ ahead)
-        if hand["found"] and np.linalg.norm(across) > FLAT:
-            axes = np.stack([ahead, across / np.linalg.norm(across)], axis=1)
-            diagonal = np.linalg.norm(known[hand["ann"]]["bbox"][2:])
-            errors.append((np.array(hand["points"]) - truth) @ axes / diagonal)
-    if errors:
-        offsets = np.median(errors, axis=0)
-        rest = np.linalg.norm(errors - offsets, axis=-1).mean()
-        told = ", ".join(f"{name} {1e3 * offsets[rows, 0].mean():+.0f}" for name, rows in PARTS.items())
-        print(f"keypoints along the hand against ours: {told}; error without these offsets {100 * rest:.1f}")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--clean", type=int, default=300)
-    parser.add_argument("--mixed", type=int, default=300)
-    parser.add_argument("--empty", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--judge", type=Path, default=None)
-    parser.add_argument("--takes", type=Path, nargs="+", default=[])
-    options = parser.parse_args()
-    tracked = load_tracked(options.takes)
-    for name, hands, empty in (("clean", options.clean, 0), ("mixed", options.mixed, options.empty)):
-        if hands + empty:
-            write_set(name, hands, empty, options.seed, tracked, options.out / name)
-            judge(options.judge, options.out / name)
+def main(
+    out: Path,
+    clean: int = 300,
+    mixed: int = 300,
+    empty: int = 100,
+    seed: int = 0,
+    judge: Path | None = None,
+    takes: tuple[Path, ...] = (),
+) -> None:
+    tracked = load_tracked(takes)
+    for name, hands, bare in (("clean", clean, 0), ("mixed", mixed, empty)):
+        if hands + bare:
+            write_set(name, hands, bare, seed, tracked, out / name)
+            run_judge(judge, out / name)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -9,12 +9,11 @@ collides them; poses allow 1 mm, what skin gives way.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 
 import numpy as np
 
-from benchmarks.record import add_save, describe, save_figures
+from benchmarks.record import describe, run, save_figures
 from gloves import Take
 from handsim import HandModel, HandSimError, sample_shape
 from handsim.hand.shape import EVERYBODY
@@ -116,19 +115,13 @@ def scripts(people: int) -> None:
         print(f"  {name:20s} {deepest:.3f}, {outside}, {speed:.1f}{unable}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=None)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--people", type=int, default=5)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(frames: int | None = None, seeds: int = 3, people: int = 5, save: str | None = None) -> None:
     print(describe("mujoco", "numba", "scipy"))
-    worst = twins(arguments.frames, arguments.seeds)
+    worst = twins(frames, seeds)
     named = zip(WORST, worst, strict=True)
-    save_figures(arguments.save, {key: (f"twins, the worst: {what}", value) for (key, what), value in named})
-    scripts(arguments.people)
+    save_figures(save, {key: (f"twins, the worst: {what}", value) for (key, what), value in named})
+    scripts(people)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)
