@@ -23,8 +23,9 @@ from gloves import load_layout
 from gloves.captures.formats import find_captures, read_markers
 from train import Dataset, GenerateSettings, TrainSettings
 from train.data.batches import draw_batch
+from train.fabric import start_fabric
 from train.labelers.networks import labeler_of
-from train.loop import TrainingState, start_fabric
+from train.loop import TrainingState
 from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 

@@ -22,7 +22,7 @@ from gloves import GloveFit, MarkerLayout, load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, HandShape
 from handsim.hand.model import skinned_jacobian
-from handsim.hand.shape import JOINTS, shape_from_measures
+from handsim.hand.shape import shape_from_measures
 from handsim.kernels import move
 from track import PoseFit, solve_pose
 
@@ -103,25 +103,6 @@ def fit_person(markers: np.ndarray, layout: MarkerLayout) -> tuple[Person, np.nd
     return person, parameters
 
 
-def tell(name: str, person: Person, parameters: np.ndarray, fit: PoseFit) -> None:
-    """Print one person's residuals, worst markers, and joints out of range."""
-    rms = 1e3 * fit.rms
-    print(f"{name}: {len(rms)} held-out frames, 3D RMS median {np.median(rms):.2f} mm, "
-          f"p95 {np.percentile(rms, 95):.2f} mm, worst {rms.max():.2f} mm")  # fmt: skip
-    by_marker = 1e3 * np.sqrt((fit.residuals**2).sum(-1).mean(0))
-    order = by_marker.argsort()[::-1]
-    print(
-        "  markers: " + ", ".join(f"{person.layout.names[m]} {by_marker[m]:.1f}" for m in order[:6]) + " mm"
-    )
-    low, high = person.wear(parameters).model.skeleton.ranges.T
-    outside = ((fit.qpos[:, 7:] < low - 0.05) | (fit.qpos[:, 7:] > high + 0.05)).mean(axis=0)
-    worst = outside.argsort()[::-1][:3]
-    print("  out of range by 3 degrees: " + ", ".join(f"{JOINTS[j].name} {outside[j]:.1%}" for j in worst))
-    change = np.exp(parameters[:15]).reshape(5, 3)
-    print("  bone lengths against the mean hand of this size: " + " | ".join(
-        " ".join(f"{ratio:.2f}" for ratio in digit) for digit in change))  # fmt: skip
-
-
 def main(
     captures: Path, frames: int = 400, held_out: int = 400, seed: int = 0, save: str | None = None
 ) -> None:
@@ -131,8 +112,8 @@ def main(
         chosen = rng.choice(len(markers), frames + held_out, replace=False)
         person, parameters = fit_person(markers[chosen[:frames]], layout)
         fit = solve_pose(person.wear(parameters), markers[chosen[frames:]])
-        tell(name, person, parameters, fit)
         everyone.append(1e3 * fit.rms)
+        print(f"{name}: 3D RMS median {np.median(everyone[-1]):.2f} mm, worst {everyone[-1].max():.2f} mm")
     rms = np.concatenate(everyone)
     what = f"fit of the hand to {len(rms)} other frames, 3D RMS median and p95 [mm]"
     report(save, {"all": (what, np.percentile(rms, [50, 95]))})

@@ -1,12 +1,11 @@
 """Whether a hand tracker that was trained on photographs takes the renders for hands.
 
     python -m benchmarks.looks_like_a_hand OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
-        [--takes TRACKED.npz ...]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
 OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
 among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box
-takes 20 to 30 % of the frame. With --takes hands and poses are those of tracked takes instead.
+takes 20 to 30 % of the frame.
 OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
 
 The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
@@ -20,14 +19,14 @@ import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from benchmarks.record import run
-from gloves import Take, attach, load_layout, load_take
+from gloves import Take, attach, load_layout
 from handsim import Camera, HandModel, join_qpos, sample_shape
 from handsim.errors import PoseError
 from handsim.hand.shape import SIDES, Side
@@ -61,8 +60,6 @@ FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
 JUDGED: Final = "judged.json"
 GROUPS: Final = ("view", "pose", "tone", "side", "background")
-Tracked = dict[Side, list[tuple[HandModel, np.ndarray]]]
-"""Hands of tracked takes, and their poses (T, 27); empty where gestures are drawn."""
 
 
 class Case(NamedTuple):
@@ -79,35 +76,16 @@ class Case(NamedTuple):
     background: str
 
 
-def make_case(number: int, background: str, tracked: Tracked, rng: np.random.Generator) -> Case:
+def make_case(number: int, background: str, rng: np.random.Generator) -> Case:
     """Kinds go round by number; all else is drawn."""
-    pose = "tracked" if tracked else list(POSES)[number % 5]
+    pose = list(POSES)[number % 5]
     view = list(VIEWS)[number // 5 % 3]
     side = SIDES[number // 15 % 2]
     tone = list(TONES)[(number // 30 + number) % 6]
-    if tracked:
-        model, rows = tracked[side][int(rng.integers(len(tracked[side])))]
-        number = int(rng.integers(len(rows)))
-        name, qpos = f"pose {number}", rows[number]
-    else:
-        name = POSES[pose][int(rng.integers(len(POSES[pose])))]
-        model, qpos = sample_pose(name, side, rng)
+    name = POSES[pose][int(rng.integers(len(POSES[pose])))]
+    model, qpos = sample_pose(name, side, rng)
     camera = place_camera(model, qpos, view, rng)
     return Case(pose, view, tone, side, name, model, qpos, camera, background)
-
-
-def load_tracked(paths: Sequence[Path]) -> Tracked:
-    """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
-    found: Tracked = {side: [] for side in SIDES} if paths else {}
-    for path in paths:
-        take = load_take(path)
-        for number, hand in enumerate(take.hands):
-            rows = take.qpos[np.isfinite(take.qpos[:, number, 0]), number, 7:]
-            found[hand.model.shape.side].append((hand.model, join_qpos(rows)))
-    for side in found:
-        if not found[side]:
-            sys.exit(f"no {side} hand in {', '.join(map(str, paths))}, expected both sides")
-    return found
 
 
 def sample_pose(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
@@ -171,23 +149,21 @@ def photograph(
     return dataclasses.replace(studio.photograph(moment, case.camera, choices), number=number)
 
 
-def frames_of(
-    name: str, hands: int, empty: int, seed: int, tracked: Tracked, cases: list[Case]
-) -> Iterator[RenderedFrame]:
+def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -> Iterator[RenderedFrame]:
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
         background, lighting = sample_surroundings(SETS[name], None, rng=rng)
-        cases.append(make_case(number, background.kind, tracked, rng))
+        cases.append(make_case(number, background.kind, rng))
         yield photograph(number, cases[-1], background, lighting, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
 
 
-def write_set(name: str, hands: int, empty: int, seed: int, tracked: Tracked, out: Path) -> None:
+def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
     """Pictures and judged.json of one set."""
     writer, cases = open_writer("coco", out), []
-    writer.write(0, frames_of(name, hands, empty, seed, tracked, cases))
+    writer.write(0, frames_of(name, hands, empty, seed, cases))
     writer.finish()
     coco = json.loads((out / "annotations.json").read_text(encoding="utf-8"))
     for image, case in zip(coco["images"], cases, strict=True):
@@ -225,12 +201,10 @@ def main(
     empty: int = 100,
     seed: int = 0,
     judge: Path | None = None,
-    takes: tuple[Path, ...] = (),
 ) -> None:
-    tracked = load_tracked(takes)
     for name, hands, bare in (("clean", clean, 0), ("mixed", mixed, empty)):
         if hands + bare:
-            write_set(name, hands, bare, seed, tracked, out / name)
+            write_set(name, hands, bare, seed, out / name)
             run_judge(judge, out / name)
 
 

@@ -86,29 +86,20 @@ def agreement(poses: int, rng: np.random.Generator) -> Figures:
         asked.append(wanted)
         capsules.append(visible_cameras(scene.markers, scene.normals, rig, scene.segments, radii))
     oracle, ours, facing, flesh = (np.concatenate(each) for each in (embree, skin, asked, capsules))
-    both = (ours & facing).sum(-1) >= 2
-    print(f"\nskin against embree, {ours.size:,} lines (all cameras, facing or not), {both.size:,} markers")
-    print(f"  lines alike {(oracle == ours).mean():.4%}, of those in view and facing "
-          f"{(oracle == ours)[facing].mean():.4%}")  # fmt: skip
-    print(
-        f"  markers alike (seen by 2 cameras or not) {(both == ((oracle & facing).sum(-1) >= 2)).mean():.4%}"
-    )
-    seen, loose = ours & facing, flesh.sum(-1) >= 2
-    print("\ncapsules against skin, of the lines in view and facing")
-    print(f"  capsules see, skin hides {(flesh & ~seen)[facing].mean():.3%}; "
-          f"the reverse {(seen & ~flesh)[facing].mean():.3%}")  # fmt: skip
-    print(f"  markers only capsules see {(loose & ~both).mean():.3%}, skin {(both & ~loose).mean():.3%}")
-    names = load_layout("dense19").names
-    print(f"  markers missing, capsules -> skin: all {(~loose).mean():.2%} -> {(~both).mean():.2%}")
-    for number, name in enumerate(names):
-        print(f"    {name:10s} {(~loose[:, number]).mean():.2%} -> {(~both[:, number]).mean():.2%}")
-    hidden, clear = 100 * (flesh & ~seen)[facing].mean(), 100 * (seen & ~flesh)[facing].mean()
-    missing = [100 * (~loose).mean(), 100 * (~both).mean()]
+    both, loose = (ours & facing).sum(-1) >= 2, flesh.sum(-1) >= 2
+    seen, alike = ours & facing, oracle == ours
+    markers = both == ((oracle & facing).sum(-1) >= 2)
     return {
-        "lines": ("lines of sight that agree with embree", int((oracle == ours).sum())),
-        "false_clear": ("lines in view and facing that capsules see and the skin hides [%]", hidden),
-        "false_hidden": ("the reverse [%]", clear),
-        "missing": ("markers missing, capsules and skin [%]", missing),
+        "all": ("lines of sight past the skin, facing or not", ours.size),
+        "lines": ("lines of sight that agree with embree", int(alike.sum())),
+        "facing": ("of those in view and facing [%]", 100 * alike[facing].mean()),
+        "markers": ("markers that are seen by two cameras, or not, as embree says [%]", 100 * markers.mean()),
+        "false_clear": (
+            "lines in view and facing that capsules see and the skin hides [%]",
+            100 * (flesh & ~seen)[facing].mean(),
+        ),
+        "false_hidden": ("the reverse [%]", 100 * (seen & ~flesh)[facing].mean()),
+        "missing": ("markers missing, capsules and skin [%]", [100 * (~loose).mean(), 100 * (~both).mean()]),
     }
 
 

@@ -17,8 +17,8 @@ training: images that the paper's network learns from, alone and beside a busy p
 pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
     pictures; a plain pyrender loop and MuJoCo's renderer.
 generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy, SciPy and mink, from nothing,
-    and from eight starts.
+solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy and SciPy, from nothing, and
+    from eight starts.
 rays: lines of sight past a hand by our kernel and by `mj_multiRay`.
 
 Run it where nothing else runs. --quick tries every part with a few frames and one seed.
