@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import resource
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, op
 from render.skin.look import TONES
 from render.studio import Moment
 from render.subject import subject_of_take
-from render.viewpoints import PLACEMENTS, Viewpoints
+from render.viewpoints import Placement, Viewpoints
 from tests.programs import run_python
 from tests.render.formats.reading import depth_of
 from train import simulate_take
@@ -138,7 +139,7 @@ def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
     studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
     pictures = 0
-    for placement in PLACEMENTS:
+    for placement in get_args(Placement):
         viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))
         for frame in range(0, 120, 20):
             cameras = viewpoints.cameras(frame)
