@@ -118,8 +118,10 @@ def type_row(kind: Any, table: list[Any]) -> int:
         row = f"={json.dumps(kind.literal_value)}"
     elif isinstance(kind, types.Dispatcher):
         row = f"{kind.dispatcher.py_func.__module__}:{kind.dispatcher.py_func.__qualname__}"
-    elif not hasattr(types, kind.name):
-        raise ValueError(f"no words for the type {kind}")
+    elif getattr(types, kind.name, None) is not kind:
+        row = next((name for name, one in vars(types).items() if one is kind), "")
+        if not row:
+            raise ValueError(f"no words for the type {kind}")
     if row not in table:
         table.append(row)
     return table.index(row)
