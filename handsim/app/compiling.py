@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib
 import json
 import os
@@ -33,6 +34,8 @@ _FEW: Final = 4.0  # [s] of compiling that other processes are not worth
 _TOLD: Final = 2.0  # [s] between two lines
 _ENDING: Final = 5.0  # [s] that a process has to end
 _MOST: Final = 8  # processes; more would wait for one another
+_KNOWN: Final = 3.0  # factor of the rank of kernels in a package whose other kernels a process has compiled
+_GARBAGE: Final = 100_000  # new objects that Python's collector waits for: a twentieth of the time is its
 
 
 class ListedKernel(NamedTuple):
@@ -230,7 +233,8 @@ class _Compilers:
     def _feed(self, process: subprocess.Popen[str]) -> None:
         """Hand kernels to a process until none is left or it dies."""
         assert process.stdin is not None and process.stdout is not None
-        while (row := self._take()) is not None:
+        packages: set[str] = set()
+        while (row := self._take(packages)) is not None:
             alive = False
             with contextlib.suppress(OSError, ValueError):
                 process.stdin.write(f"{row}\n")
@@ -242,8 +246,16 @@ class _Compilers:
             if not alive:
                 return
 
-    def _take(self) -> int | None:
-        """The next kernel, when what it calls is there; None if no more are left."""
+    def _take(self, packages: set[str]) -> int | None:
+        """The next kernel, when what it calls is there; None if no more are left.
+
+        Each process compiles what kernels need of numba itself. So it keeps to few packages if it can.
+        """
+
+        def rank(row: int) -> float:
+            name = self._todo[row].name
+            return self._rank[name] * (_KNOWN if name.rpartition(".")[0] in packages else 1.0)
+
         with self._changed:
             while self._todo:
                 busy = {one.name for one in self._now.values()}
@@ -254,8 +266,9 @@ class _Compilers:
                     if one.name not in busy and not self._needs[one.name] & waited_for - {one.name}
                 ]
                 if ready:
-                    row = max(ready, key=lambda row: self._rank[self._todo[row].name])
+                    row = max(ready, key=rank)
                     self._now[row] = self._todo.pop(row)
+                    packages.add(self._now[row].name.rpartition(".")[0])
                     return row
                 if not self._now:  # kernels that call one another
                     break
@@ -287,6 +300,7 @@ def plain_shape_errors() -> None:
 
 def _work(rows: Iterable[str]) -> None:
     """Compile kernels by their rows in the list, and print each row when its kernel is in the cache."""
+    gc.set_threshold(_GARBAGE)
     plain_shape_errors()
     listed, known = read_list(), known_types()
     for row in rows:
