@@ -60,10 +60,7 @@ _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
 _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
-_CARD_FRAMES: Final[dict[Kind, int]] = {
-    "set": _MAX_HELD_OUT,
-    "cnn": 1024,
-}  # held-out frames of the model card
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # those of the model card
 _CURVE_POINTS: Final = 200  # entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
 _COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
@@ -186,9 +183,17 @@ class _Run:
         A signal ends the run between two steps; several processes all end after the same step.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
-        recipe = batch_recipe(settings, len(self.manifest.marker_names))
-        saved = time.monotonic()
-        while self._is_unfinished(on_step):
+        recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
+        shown, saved = _few(self.held_out, _CURVE_FRAMES[settings.labeler]), time.monotonic()
+        evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
+        while True:
+            if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):
+                evaluated = state.done
+                if state.fabric.is_global_zero:
+                    on_step("held-out frames")
+                    state.evaluate(shown, names)
+            if state.done >= settings.samples:
+                break
             with interrupt_flag(flag, again=alone):
                 # One generator per step, so that a resumed run makes the same draws; the same one on
                 # each device.
@@ -205,16 +210,6 @@ class _Run:
                 saved = time.monotonic()
         on_step("checkpoint")
         state.save(self.out / CHECKPOINT)
-
-    def _is_unfinished(self, on_step: OnStep) -> bool:
-        """Evaluate the network if that is due, and return whether steps remain."""
-        state, settings = self.state, self.state.settings
-        evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
-        due = state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS)
-        if due and state.fabric.is_global_zero:
-            on_step("held-out frames")
-            state.evaluate(_few(self.held_out, _CURVE_FRAMES[settings.labeler]), self.manifest.marker_names)
-        return state.done < settings.samples
 
     @contextmanager
     def kept(self) -> Iterator[None]:
@@ -255,21 +250,20 @@ class _Run:
 
     def _card(self, network: nn.Module, rows: NDArray[np.void]) -> tuple[dict[str, Any], LabelingReport]:
         """The model card, and the evaluation on held-out frames with the paper's corruption."""
-        labeler = labeler_of(network, self.manifest.marker_names)
+        settings, names = self.state.settings, self.manifest.marker_names
+        labeler, paper = labeler_of(network, names), paper_corruption(len(names))
         markers = rows["markers"].astype(np.float64)
         clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
-        paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
+        report = paper_report(labeler, rows)
+        recipe = f"occlude {paper.occlude}, ghosts {paper.ghosts}"
         card = {
-            "marker_names": list(self.manifest.marker_names),
+            "marker_names": list(names),
             "trained_on": "simulated frames only",
             "handsim": __version__,
             "license": UNKNOWN_LICENSE,
             "dataset": self.manifest.config,
-            "train": self.state.settings.record() | {"devices": self.state.fabric.world_size},
-            "held_out_simulated": {
-                "clean": clean.figures,
-                f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,
-            },
+            "train": settings.record() | {"devices": self.state.fabric.world_size},
+            "held_out_simulated": {"clean": clean.figures, recipe: report.figures},
             "curve": self.state.history.accuracies,
         }
         return card, report
@@ -289,7 +283,13 @@ class TrainingState:
         self.part = Part(fabric.global_rank, fabric.world_size)
         network = new_network(settings.chosen)
         prepare_network(network, rows)
-        self.network, self.optimizer = fabric.setup(network, _optimizer(settings, network))
+        optimizer: torch.optim.Optimizer
+        weights, rate, decay = network.parameters(), settings.learning_rate, settings.weight_decay
+        if settings.optimizer == "sgd":
+            optimizer = torch.optim.SGD(weights, lr=rate, weight_decay=decay)
+        else:
+            optimizer = torch.optim.AdamW(weights, lr=rate, weight_decay=decay, fused=True)
+        self.network, self.optimizer = fabric.setup(network, optimizer)
         self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
         self.done = 0
         self.history = History()
@@ -321,7 +321,11 @@ class TrainingState:
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
         if _passed(self.done, self.settings, _CURVE_POINTS) or self.done >= self.settings.samples:
-            self._log(rate)
+            (since, done), self.began = self.began, (time.monotonic(), self.done)
+            speed = (self.done - done) / (self.began[0] - since)
+            mean = self.history.close(self.done, rate)
+            figures = {"loss": mean, "learning_rate": rate, "samples_per_second": speed}
+            self.fabric.log_dict(figures, step=self.done)
         return value
 
     def _average(self) -> None:
@@ -336,17 +340,6 @@ class TrainingState:
                     self.mean[name].lerp_(tensor, 1.0 - decay)
                 else:
                     self.mean[name].copy_(tensor)
-
-    def _log(self, rate: float) -> None:
-        """Add the last steps to the curves."""
-        loss = self.history.close(self.done, rate)
-        since, done = self.began
-        now = time.monotonic()
-        speed = (self.done - done) / (now - since)
-        self.began = now, self.done
-        self.fabric.log_dict(
-            {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
-        )
 
     def evaluate(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
         """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
@@ -417,14 +410,6 @@ class TrainingState:
                     raise ValueError(f"{name} is not finite")
 
 
-def _optimizer(settings: TrainSettings, network: nn.Module) -> torch.optim.Optimizer:
-    """The optimizer of the settings."""
-    weights, rate, decay = network.parameters(), settings.learning_rate, settings.weight_decay
-    if settings.optimizer == "sgd":
-        return torch.optim.SGD(weights, lr=rate, weight_decay=decay)
-    return torch.optim.AdamW(weights, lr=rate, weight_decay=decay, fused=True)
-
-
 def _rate(settings: TrainSettings, progress: float) -> float:
     """Learning rate at a share of the run, as a share of the peak rate."""
     if settings.schedule == "steps":
@@ -463,10 +448,11 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
         labeler.reject, labeler.spread = reject, spread
         return paper_report(labeler, rows)
 
+    def accuracy(reject: float) -> float:
+        return report(reject, _SPREADS[0]).figures["slot_accuracy"]
+
     config = network.config
-    reject = config.reject or max(
-        _REJECTS, key=lambda tried: report(tried, _SPREADS[0]).figures["slot_accuracy"]
-    )
+    reject = config.reject or max(_REJECTS, key=accuracy)
     spread = config.spread or min(
         _SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
     )

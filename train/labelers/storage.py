@@ -107,7 +107,8 @@ def load_labeler(
 ) -> Labeler:
     """The labeler of a glove, or a labeler by its name, path or object.
 
-    A glove without a labeler of its own gets the one for any layout, which learns the layout within a minute.
+    A glove without a labeler of its own gets the one for any layout, which learns the layout in a minute,
+    and in two if it has more than 24 markers.
     Only shipped labelers, folders and the one for any layout need torch.
 
     Args:
@@ -201,7 +202,7 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
-    how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
+    how = "has learned it before" if is_learned(layout) else "learns it in one minute or two, once"
     warnings.warn(
         f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
         f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
