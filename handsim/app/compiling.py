@@ -187,8 +187,8 @@ class _Compilers:
     def __enter__(self) -> _Compilers:
         home = str(Path(__file__).parents[2])
         path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
-        command = [sys.executable, "-P", "-m", "handsim.app.compiling"]
-        with one_thread(), without_signals():
+        command = [sys.executable, "-P", "-m", __name__]
+        with one_thread(), without_signals(), contextlib.suppress(OSError):  # if it has no room for more
             for _ in range(min(usable_cores(), self._count, _MOST)):
                 self._processes.append(
                     subprocess.Popen(
@@ -217,16 +217,18 @@ class _Compilers:
         tell_state(f"compiling {self._count} kernels, once on this machine")
         for thread in threads:
             thread.start()
-        told = began
+        told, first = began, (began, 0.0)  # the first kernel waits until the process is there
         while any(thread.is_alive() for thread in threads):
             with self._changed:
                 self._changed.wait(_TOLD / 10.0)
                 done = self._count - len(self._todo) - len(self._now)
             now = time.monotonic()
+            if not first[1]:
+                first = now, self._done
             if now >= told + _TOLD:
                 told = now
-                left = (now - began) * (self._total - self._done) / self._done if self._done else 0.0
-                rest = f", about {left:.0f} s left" if left >= 1.0 else ""
+                speed = (self._done - first[1]) / (now - first[0]) if now > first[0] else 0.0
+                rest = f", about {(self._total - self._done) / speed:.0f} s left" if speed else ""
                 tell_state(f"compiling {self._count} kernels, once on this machine: {done} done{rest}")
         tell_state("")
 
