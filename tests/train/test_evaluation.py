@@ -17,7 +17,6 @@ from train.evaluation import (
     LabelCounts,
     error_without,
     expected_calibration_error,
-    macro_f1,
     percent,
     print_figures,
     reliability,
@@ -90,12 +89,6 @@ def test_confusion_agrees_with_the_counts(frames):
         assert confusion[-1].sum() == counts.ghosts and confusion[:, -1].sum() == counts.ghosts_given
     if counts.points:
         assert (figures["macro_f1"] == 1.0) == (figures["point_accuracy"] == 1.0)
-
-
-def test_macro_f1_of_nothing_and_of_chance():
-    assert np.isnan(macro_f1(np.zeros((4, 4), dtype=int)))
-    assert macro_f1(np.full((4, 4), 3)) == pytest.approx(0.25)
-    assert macro_f1(np.diag([5, 0, 1])) == 1.0
 
 
 def test_percent():
@@ -216,12 +209,6 @@ def test_leaving_the_least_sure_out():
     assert np.isnan(error_without(confidence, right, 1.0))
 
 
-def test_two_percent_of_fifty_is_one():
-    confidence, right = np.linspace(0.5, 1.0, 50), np.ones(50, dtype=bool)
-    right[[0, 7]] = False
-    assert error_without(confidence, right) == pytest.approx(1 / 49)
-
-
 @given(points, st.floats(0.0, 1.0, allow_subnormal=False), st.randoms(use_true_random=False))
 def test_the_order_of_points_has_no_say(drawn, share, random):
     confidence, right = np.round(drawn[0], 1), drawn[1]  # rounded, so that there are ties
@@ -236,12 +223,6 @@ def test_ties_count_by_the_mean_over_all_choices():
     right = np.array([True, False, True, True])
     # Of four alike two go; whichever they are, the one mistake stays half of the time.
     assert error_without(np.full(4, 0.7), right, 0.5) == pytest.approx(0.5 * 1 / 2)
-
-
-def test_nothing_to_measure():
-    none = np.zeros(0)
-    assert np.isnan(expected_calibration_error(none, none.astype(bool)))
-    assert np.isnan(error_without(none, none.astype(bool)))
 
 
 def test_an_entry_is_the_mean_since_the_one_before():

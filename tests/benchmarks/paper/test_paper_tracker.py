@@ -202,13 +202,6 @@ def test_points_without_ids_are_found_anew_in_every_frame(users, labeler, still)
     assert any(hand.status is Status.INITIALIZED for frame in frames for hand in frame.hands)
 
 
-def test_frames_without_points_are_frames(users, labeler):
-    tracker = PaperTracker(users, labeler, rng=np.random.default_rng(0))
-    frame = tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), 0.0)
-    assert len(frame.labels) == len(frame.confidence) == 0
-    assert [hand.status for hand in frame.hands] == [Status.LOST] * 2
-
-
 PLACES = arrays(np.float64, st.tuples(st.integers(0, 40), st.just(3)), elements=st.floats(-0.5, 0.5))
 
 
@@ -229,23 +222,6 @@ def test_centers_count_and_not_the_points_between():
     chain = np.zeros((6, 3))
     chain[:, 0] = np.arange(6) * 0.15
     assert [cluster.tolist() for cluster in cluster_points(chain, most=22)] == [[0, 1], [2, 3], [4, 5]]
-
-
-def test_two_hands_apart_are_two_clusters_whatever_the_order(rng):
-    hands = rng.uniform(-0.08, 0.08, size=(2, 19, 3))
-    hands[1, :, 0] += 0.4
-    points, order = hands.reshape(-1, 3), rng.permutation(38)
-    clusters = cluster_points(points[order], most=22)
-    assert sorted(sorted(order[cluster].tolist()) for cluster in clusters) == [
-        list(range(19)),
-        list(range(19, 38)),
-    ]
-
-
-def test_clusters_do_not_grow_beyond_the_most():
-    points = np.random.default_rng(5).uniform(-0.05, 0.05, size=(45, 3))
-    sizes = [len(cluster) for cluster in cluster_points(points, most=22)]
-    assert max(sizes) <= 22 and len(sizes) >= 3
 
 
 SOME = arrays(np.float64, st.tuples(st.integers(0, 9), st.just(3)), elements=st.floats(0.0, 0.03))

@@ -16,7 +16,6 @@ from benchmarks.paper.comparison import (
     USERS,
     compare_trackers,
     measure_with_body,
-    trackers,
 )
 from benchmarks.paper.printed import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from benchmarks.paper.tracking_tables import TRACKING_TABLES, print_errors, print_trials, table5_figures
@@ -159,10 +158,6 @@ def test_a_body_that_is_followed_must_have_its_labels():
     assert np.flatnonzero(~wrong).tolist() == [7]
     with pytest.raises(ArgumentError, match="controller: the take has no body"):
         measure_with_body("controller", take.without_body(), labeler)
-
-
-def test_every_tracker_has_a_maker():
-    assert tuple(trackers(load_labeler("dense19"), 0)) == METHODS
 
 
 @pytest.mark.parametrize(

@@ -34,16 +34,6 @@ class Late:
         return TrackedFrame(time, (hand, hand), labels, np.ones(len(points)))
 
 
-def test_a_cut_take_is_a_part_of_it(take):
-    part = take.cut(10, 40)
-    assert part.num_frames == 30
-    np.testing.assert_array_equal(part.points, take.points[10:40])
-    np.testing.assert_array_equal(part.qpos, take.qpos[10:40])
-    np.testing.assert_array_equal(part.body_poses, take.body_poses[10:40])
-    with pytest.raises(ArgumentError, match="frames 10 to 999, expected a part of 0 to 320"):
-        take.cut(10, 999)
-
-
 def test_what_comes_back_from_the_dark_has_other_ids(take):
     dark = hide_points(take, 60, 120)
     assert all(not len(seen_frame(dark, frame).points) for frame in range(60, 180))

@@ -78,14 +78,6 @@ def followed(
     return state, state.predict(frames / RATE)
 
 
-def test_targets_are_points_in_the_layouts_order():
-    points = np.arange(12.0).reshape(4, 3)
-    targets = targets_of(points, np.array([2, -1, 0, 4]), 5)
-    np.testing.assert_array_equal(targets[[2, 0, 4]], points[[0, 2, 3]])
-    assert np.isnan(targets[[1, 3]]).all()
-    assert np.isnan(targets_of(points[:0], np.array([], dtype=int), 5)).all()
-
-
 @pytest.mark.parametrize("frames", [1, 20, 150])
 def test_right_labels_stay_and_give_the_pose(hand, motion, markers, frames):
     state, prediction = followed(hand, motion, markers, frames)

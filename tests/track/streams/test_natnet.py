@@ -17,14 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gloves import Capture, Status, Take
+from gloves import Capture, Take
 from handsim import HandSimError
 from handsim.errors import ArgumentError, CaptureError
-from handsim.space.objects import named_object
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
-from track import LiveStream, ReplayServer, RigidTemplate, StreamedFrame, open_source
-from track.rigid_body import BodyTracker
+from track import LiveStream, ReplayServer, StreamedFrame, open_source
 from track.streams import natnet
 from track.streams.natnet import (
     NEWEST,
@@ -306,34 +304,12 @@ def test_frames_are_played_at_their_rate(monkeypatch):
             assert server.sent == last + 1, "those whose time has come"
 
 
-def test_a_body_is_tracked_live():
-    take = twin()
-    tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
-    with ReplayServer(take) as server, opened(server.url) as stream:
-        words = [
-            tracker.step(one.points, one.ids, one.time).status
-            for one in itertools.islice(stream, take.num_frames)
-        ]
-    assert words == [Status.INITIALIZED] + [Status.TRACKED] * (take.num_frames - 1)
-
-
 def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
     positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
     positions[1, 0] = np.nan
     with ReplayServer(Capture(("a", "b"), positions, 100.0)) as server, opened(server.url) as stream:
         ids = [list(one.ids) for one in itertools.islice(stream, 4)]
     assert ids == [[0, 1], [1], [2, 1], [2, 1]]
-
-
-def test_a_stream_that_stops_says_so():
-    take = twin()
-    server = ReplayServer(SimpleNamespace(points=take.points[:3], ids=take.ids[:3], rate=take.rate))
-    with server, opened(server.url, silence=0.2) as stream:
-        wait_for(lambda: server.finished)
-        got = list(itertools.islice(stream, 5))
-    assert [one.silent for one in got] == [False] * 3 + [True] * 2
-    assert got[3].number == 2 and got[2].time < got[3].time < got[4].time
-    assert got[3].points.shape == (0, 3) and got[3].ids.shape == (0,)
 
 
 def test_bad_packets_are_counted_and_left_out():
@@ -537,44 +513,3 @@ def test_the_port_for_data_is_the_server_s_too():
             for number in range(3):
                 data.sendto(frame(number, (4, 1)), server.client)
             assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
-
-
-def test_one_wild_time_does_not_end_a_stream():
-    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
-        for number in range(20):
-            for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
-                server.say(
-                    natnet.pack_frame(StreamedFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1))
-                )
-            server.say(frame(number, (4, 1)))
-        got = list(itertools.islice(stream, 20))
-        stream.end()
-        assert not [one.number for one in stream]
-        assert [one.number for one in got] == list(range(20))
-        assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
-
-
-MANY = 10_000  # frames, ten seconds of the server: a stream that yields so many does not end
-
-
-def test_a_stream_ends_while_frames_arrive():
-    ended = threading.Event()
-    with (
-        ReplayServer(twin(), rate=1000.0, loop=True) as server,
-        opened(server.url, ended=ended.is_set) as stream,
-    ):
-        list(itertools.islice(stream, 10))
-        ended.set()
-        assert len(list(itertools.islice(stream, MANY))) < MANY
-
-
-def test_a_stream_ends_when_it_is_told_to():
-    ended = threading.Event()
-    with Puppet(unicast((4, 1))) as server, opened(server.url, ended=ended.is_set, silence=1.0) as stream:
-        for number in (0, 1, 3):  # the last one is held, because one is missing before it
-            server.say(frame(number, (4, 1)))
-        got = [next(stream), next(stream)]
-        threading.Timer(0.3, ended.set).start()
-        rest = list(itertools.islice(stream, round(LONG)))
-        assert len(rest) < LONG, "it goes on"
-        assert [one.number for one in (*got, *rest) if not one.silent] == [0, 1, 3]

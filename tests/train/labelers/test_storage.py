@@ -390,14 +390,6 @@ def test_an_object_is_a_labeler_behind_checks():
         load_labeler("dense19", First())
 
 
-@pytest.mark.parametrize("wrong", [5, None, [], 2.5, First])
-def test_anything_else_is_told(wrong):
-    with pytest.raises(ArgumentError, match=r"^labeler is .*, expected a MarkerLayout, the name or path of"):
-        load_labeler(wrong)
-    with pytest.raises(ArgumentError, match=r"^glove is"):
-        load_labeler(wrong, "dense19")
-
-
 def test_an_unknown_name_is_told():
     with pytest.raises(WeightsError, match=r"unknown labeler or glove 'dense18' \(did you mean 'dense19'"):
         load_labeler("dense18")

@@ -11,7 +11,7 @@ import pytest
 
 from gloves import OpticsConfig, Take, load_layout, load_take
 from gloves.captures.capture import count_gaps
-from handsim import HandModel, HandSimError
+from handsim import HandModel
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
 from handsim.space.rig import ROOM_CENTER, load_rig
@@ -183,28 +183,6 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
     monkeypatch.setattr(takes, "sample_scene_motion", broken)
     with pytest.raises(ArgumentError, match="qpos has shape"):
         simulate_take(kind="hand-pen", num_frames=5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"kind": "hand-pn"}, "unknown kind 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
-        ({"num_frames": 0}, "num_frames is 0, expected at least 1"),
-        ({"num_frames": -5}, "num_frames is -5, expected at least 1"),
-        ({"seed": -1}, "seed is -1, expected 0 or more"),
-    ],
-)  # fmt: skip
-def test_a_mistake_is_one_sentence(arguments, words):
-    with error_names(ArgumentError, words):
-        SimulateSettings(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"), [({"glove": "dens19"}, "dense19"), ({"rig": "ten"}, "figure5")]
-)
-def test_unknown_gloves_and_rigs_are_told(arguments, words):
-    with pytest.raises(HandSimError, match=words):
-        simulate_take(num_frames=5, **arguments)
 
 
 def test_the_whole_hand_controller_twin_is_near_table_3():
