@@ -202,8 +202,9 @@ def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler,
     take = track_capture(Capture(("a", "b", "c"), positions, 120.0), hands=user, labeler=labeler)
     assert (take.status == LOST).all() and (take.labels == -1).all()
     assert np.isnan(take.qpos).all() and np.isnan(take.markers("left")).all()
-    nothing = track_capture(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), hands=user, labeler=labeler)
-    assert nothing.num_frames == 2
+    empty = Capture(("a",), np.full((2, 1, 3), np.nan), 120.0)
+    assert track_capture(empty, hands=user, labeler=labeler).num_frames == 2
+    assert (label_capture(empty).labels == -1).all()
 
 
 def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):

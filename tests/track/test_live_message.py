@@ -56,11 +56,8 @@ def test_the_header_names_everything(name, message):
         assert document[key] == list(getattr(header, key))
 
 
-def test_points_are_left_out_unless_asked_for(message):
+def test_a_frame_of_two_hands_takes_three_kilobytes_and_has_points_only_if_asked_for(message):
     assert not {"points", "labels"} & set(frame_document(message()))
-
-
-def test_a_frame_of_two_hands_takes_three_kilobytes(message):
     assert len(document_format("msgpack").frame(message())) < 3000
     assert len(document_format("json").frame(message())) < 3500
 

@@ -23,11 +23,12 @@ from train import simulate_take
 NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0
 NOISE = 0.0002  # [m]
+FRAMES = 240
 
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(kind="hand-controller", num_frames=240, seed=5)
+    return simulate_take(kind="hand-controller", num_frames=FRAMES, seed=5)
 
 
 def frames(take: Take):
@@ -355,7 +356,6 @@ def test_objects_of_handsim_have_names():
         ("name = ", "not a TOML file"),
         ("", "the file lacks the key 'name'"),
         ('name = "wand"', "wand: 0 markers, expected at least 3"),
-        (text(count=2), "wand: 2 markers, expected at least 3"),
         (text(head="name = 3"), "name is 3, expected text in quotes"),
         (text(head='name = " wand"'), "the body's name ' wand': expected printable characters"),
         (text(head='name = "wand"\ndescription = 3'), "description is 3, expected text in quotes"),
@@ -370,7 +370,6 @@ def test_objects_of_handsim_have_names():
         (text(place_mm="[50, 0, nan]"), "marker 'm1': place_mm is [50, 0, NaN], expected three numbers"),
         (text(place_mm='"50 0 0"'), "marker 'm1': place_mm is \"50 0 0\", expected three numbers"),
         (text(place_mm="[0.05, 0, 0]"), "m0 and m1 are 0.1 mm apart, expected at least 6 mm"),
-        (text(place_mm="[80, 0, 0]"), "its markers look the same from two sides (m1 at m2, m2 at m1)"),
     ],
 )
 def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
@@ -402,14 +401,6 @@ def test_bodies_that_are_tracked_together_have_names_of_their_own(tmp_path):
             load_bodies([other, path])
 
 
-FRAMES = 240
-
-
-@functools.cache
-def twin_take() -> Take:
-    return simulate_take(kind="hand-controller", num_frames=FRAMES)
-
-
 def capture_of(points: np.ndarray) -> Capture:
     points = points[:, np.isfinite(points[..., 0]).any(axis=0)]
     return Capture(tuple(f"*{number}" for number in range(points.shape[1])), points, 120.0)
@@ -417,7 +408,7 @@ def capture_of(points: np.ndarray) -> Capture:
 
 def controller(rng, ghosts: float = 0.0) -> Capture:
     """The controller alone, as the room saw it in a hand: columns end where markers are hidden."""
-    take = twin_take()
+    take = twin()
     body = np.where((take.labels >= take.hand_labels[-1].stop)[..., None], take.points, np.nan)
     false = rng.uniform(-0.2, 0.2, (FRAMES, 2, 3)) + np.nanmean(body, axis=(0, 1))
     false[rng.random((FRAMES, 2)) >= ghosts] = np.nan
@@ -443,7 +434,7 @@ def test_all_markers_are_where_they_are(ghosts, rng):
 
 
 def test_captures_of_anything_else_are_told(rng):
-    take = twin_take()
+    take = twin()
     hands = np.where(((take.labels >= 0) & (take.labels < 38))[..., None], take.points, np.nan)
     with error_names(CalibrationError, "points per frame, expected 3 to 20: one body and nothing else"):
         learn_body(capture_of(hands), "wand")

@@ -19,10 +19,10 @@ from hypothesis.extra import numpy as arrays
 
 from gloves import Capture, Take
 from handsim import HandSimError
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import CaptureError
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
-from track import LiveStream, ReplayServer, StreamedFrame, open_source
+from track import LiveStream, ReplayServer, StreamedFrame
 from track.streams import natnet
 from track.streams.natnet import (
     NEWEST,
@@ -365,18 +365,6 @@ def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, sp
         assert stream.counts["damaged_packets"] == 0
 
 
-def test_packets_of_others_are_not_heard():
-    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            try:
-                stranger.bind(("127.0.0.2", 0))
-            except OSError:
-                pytest.skip("this machine has one loopback address only")
-            stranger.sendto(frame(9, (4, 1)), server.client)
-        server.say(frame(10, (4, 1)))
-        assert next(stream).number == 10
-
-
 def test_the_client_listens_on_loopback_only_and_takes_leave():
     with Puppet(unicast((4, 1)), deaf=1) as server:
         with opened(server.url) as stream:
@@ -438,16 +426,6 @@ def test_multicast_is_heard_on_loopback():
                 assert [one.number for one in itertools.islice(stream, 2)] == [0, 1]
 
 
-@pytest.mark.parametrize(
-    "url",
-    ["", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
-     "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
-)  # fmt: skip
-def test_addresses_that_are_none_are_told(url):
-    with pytest.raises(ArgumentError, match=r"natnet://host|a port from 1 to 65535"):
-        open_source(url)
-
-
 def test_servers_that_cannot_be_used_are_told(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(natnet, "_PATIENCE", 0.2)
@@ -493,10 +471,14 @@ def test_what_cannot_be_replayed_is_told():
             ReplayServer(Capture(("a",), points[:, :1], 100.0), port=port)
 
 
-def test_only_the_server_s_ports_are_heard():
+@pytest.mark.parametrize("host", [LOOPBACK, "127.0.0.2"])
+def test_only_the_server_and_its_ports_are_heard(host):
     with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.bind((LOOPBACK, 0))
+            try:
+                stranger.bind((host, 0))
+            except OSError:
+                pytest.skip("this machine has one loopback address only")
             for number in range(5):
                 stranger.sendto(frame(900 + number, (4, 1)), server.client)
         for number in range(3):
