@@ -149,7 +149,8 @@ def test_a_gap_shows_in_the_angles(take):
     assert np.flatnonzero(~first.fitted).tolist() == list(range(20, 30)) and second.fitted.all()
 
 
-def test_whose_hands_they_are(take, tmp_path):
+def test_whose_hands_they_are(take, tmp_path, monkeypatch):
+    monkeypatch.setattr("track.take_page.picture", lambda *drawn, **options: "data:,")
     for user, words in {
         "S": "mean hands of size S, in a glove as designed",
         "user.json": "a user&#x27;s (user.json), as calibrated or given",

@@ -12,29 +12,17 @@ import torch
 from train import (
     CNNConfig,
     Corruption,
-    Dataset,
-    GenerateSettings,
-    SceneMix,
     evaluate_labeler,
     load_labeler,
     train_labeler,
 )
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.settings import usual_settings
-from train.simulation.generation import make_dataset
 
 CONFIG = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
 
 FIXED = dataclasses.replace(CONFIG, cnn=CNNConfig(reject=0.04, spread=0.005))
 """Without the choice of these two, which takes as long as many steps."""
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    config = GenerateSettings(num_frames=200, seed=3, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
-    make_dataset(config, out, workers=1)
-    return Dataset(out)
 
 
 @pytest.mark.slow

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from importlib import resources
 
-import numpy as np
 import pytest
 
 from gloves import load_layout
 from gloves.captures.formats import read_markers
-from handsim.errors import ArgumentError, WeightsError
+from handsim.errors import WeightsError
 from train import Corruption, evaluate_labeler, load_labeler
 from train.labelers.storage import shipped_labelers
 
@@ -33,19 +32,6 @@ def test_real_people_are_labeled(sig18, corruption, least, rng):
     markers = read_markers([files[number] for number in chosen], labeler.marker_names)
     frames = markers[rng.choice(len(markers), size=min(2000, len(markers)), replace=False)]
     assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
-
-
-def test_odd_clouds_are_labeled_or_told(rng):
-    labeler = load_labeler("dense19")
-    for count in (0, 1, 2, 60):
-        labeling = labeler.label_frames([rng.normal(scale=0.05, size=(count, 3))])[0]
-        assert len(labeling.labels) == len(labeling.confidence) == count
-        named = labeling.labels[labeling.labels >= 0]
-        assert len(set(named.tolist())) == len(named)
-    with pytest.raises(ArgumentError, match="frame 1 holds NaN"):
-        labeler.label_frames([np.zeros((3, 3)), np.full((3, 3), np.nan)])
-    with pytest.raises(ArgumentError, match="frame 0 holds 600 points, expected at most 512"):
-        labeler.label_frames([np.zeros((600, 3))])
 
 
 def test_damaged_weights_are_told(tmp_path):

@@ -11,7 +11,6 @@ from benchmarks.paper.assignment_trackers import GATE, NEAR, HungarianTracker, N
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
 from gloves import GloveFit, Take
-from handsim.errors import ArgumentError
 from train import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
@@ -51,17 +50,6 @@ def test_hands_are_lost_with_their_points_and_stay_so(kind, take, users):
     frame = tracker.step(seen.points, seen.ids, time)
     assert not np.array_equal(frame.labels, seen.labels)
     assert evaluate_tracker(dark, users, kind(users, seen_frame(dark, 0).labels)).right[220:].mean() < 0.2
-
-
-@BOTH
-def test_the_first_frame_is_as_it_is_told(kind, take, users):
-    seen = seen_frame(take, 0)
-    wrong = np.roll(seen.labels, 1)
-    assert np.array_equal(kind(users, wrong).step(seen.points, seen.ids, 0.0).labels, wrong)
-    with pytest.raises(ArgumentError, match="first_labels are of 38 points, but the first frame has 37"):
-        kind(users, wrong).step(seen.points[1:], seen.ids[1:], 0.0)
-    with pytest.raises(ArgumentError, match="first_labels go up to 38, expected less than 38"):
-        kind(users, wrong + 1)
 
 
 def test_names_go_with_ids_wherever_their_points_go(take, users):

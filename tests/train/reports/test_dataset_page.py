@@ -15,23 +15,12 @@ import pytest
 from handsim.cli.main import main
 from handsim.errors import DatasetError
 from handsim.hand.shape import JOINT_NAMES, JOINTS
-from train import Dataset, GenerateSettings
+from train import Dataset
 from train.data.shards import row_dtype
 from train.reports import dataset_page as report
-from train.simulation import generation
-from train.simulation.generation import make_dataset
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "ROWS_PER_SHARD", 150)
-        make_dataset(GenerateSettings(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
-    return Dataset(out)
 
 
 @pytest.fixture

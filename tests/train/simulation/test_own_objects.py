@@ -86,8 +86,6 @@ def test_a_sampler_that_no_process_can_import_is_told_when_several_were_asked_fo
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"glove": 5}, "glove is 5, expected a MarkerLayout, or the name or path of one; valid names: "),
-        ({"rig": [1]}, "rig is [1], expected a CameraRig, or the name or path of one; valid names: eight"),
         ({"sampler": 5}, "sampler is 5, expected a function (model, num_poses, *, rng)"),
         ({"sampler": degrees}, "holds an angle of 45 rad; are these degrees?"),
         ({"scenes": {"togeter": 1}}, "unknown setting of scenes 'togeter' (did you mean 'together'?)"),

@@ -107,6 +107,8 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
     first, again = simulate_take(settings=config), simulate_take(settings=config)
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    other = simulate_take(settings=dataclasses.replace(config, seed=8))
+    assert other.points.tobytes() != first.points.tobytes()
     assert first.hand_labels == (range(13), range(13, 26))
 
 
