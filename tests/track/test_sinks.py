@@ -52,15 +52,6 @@ class Failing(Counter):
 """
 
 
-@pytest.fixture
-def own(tmp_path, monkeypatch):
-    (tmp_path / "own_sinks.py").write_text(SOURCE)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    yield
-    sys.modules.pop("own_sinks", None)
-
-
 NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name",
                 "localhost:9000", "a b:c", "ws:8765", "9module:name")  # fmt: skip
 
@@ -99,22 +90,22 @@ def test_a_missing_package_is_told(address, package, monkeypatch):
 
 
 def test_a_sink_of_the_user_s_own(own, message):
-    with open_sinks(["own_sinks:Counter?step=3"]) as sinks:
-        import own_sinks
+    with open_sinks(["own_code:Counter?step=3"]) as sinks:
+        import own_code
 
         (sink,) = sinks._sinks.values()
         for number in range(3):
             sink.send(message(number))
-    assert own_sinks.Counter.sent == [0, 3, 6] and own_sinks.Counter.closed
+    assert own_code.Counter.sent == [0, 3, 6] and own_code.Counter.closed
 
 
 def test_what_is_no_sink_is_told(own):
-    with pytest.raises(ArgumentError, match="own_sinks:NoSink has no method send, expected the methods"):
-        open_sink("own_sinks:NoSink")
+    with pytest.raises(ArgumentError, match="own_code:NoSink has no method send, expected the methods"):
+        open_sink("own_code:NoSink")
     with pytest.raises(ArgumentError, match=r"does not take the arguments \(, stop=...\)|unexpected keyword"):
-        open_sink("own_sinks:Counter?stop=1")
+        open_sink("own_code:Counter?stop=1")
     with pytest.raises(HandSimError, match="ValueError: invalid literal"):
-        open_sink("own_sinks:Counter?step=x")
+        open_sink("own_code:Counter?step=x")
     with pytest.raises(ArgumentError, match="No module named 'no_such_module'"):
         open_sink("no_such_module:Sink")
 

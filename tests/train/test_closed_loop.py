@@ -11,7 +11,6 @@ from benchmarks.paper.take_evaluation import true_users
 from gloves import Capture, read_capture, write_capture
 from handsim.cli.main import main
 from handsim.hand.model import hand_keypoints
-from render import RenderConfig, ViewConfig, draw
 from track import track_capture
 from train import Dataset, simulate_take
 
@@ -64,7 +63,7 @@ def test_labels_do_not_depend_on_the_columns(run, rng):
     assert right.mean() > 0.85
 
 
-def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
+def test_a_small_labeler_tracks_to_a_millimeter(run):
     truth = simulate_take(num_frames=240)
     tracked = track_capture(truth, hands=true_users(truth), labeler=run / "run")
     model, mine, true = truth.hands[0].model, tracked.qpos[:, 0], truth.qpos[:, 0]
@@ -72,8 +71,3 @@ def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
     assert there.mean() > 0.95
     off = hand_keypoints(model, mine[there]) - hand_keypoints(model, true[there])
     assert 1e3 * np.linalg.norm(off, axis=-1).mean() < 1.0
-    config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("depth", "ids"), depth_sensor=None)
-    for frame in draw(tracked, config=config, frames=np.flatnonzero(there)[::60]):
-        points = hand_keypoints(model, true[frame.number : frame.number + 1])[0]
-        assert np.linalg.norm(frame.camera.project(points) - frame.hands[0].keypoints, axis=-1).mean() < 2.0
-        assert frame.hands[0].visible.sum() >= 5

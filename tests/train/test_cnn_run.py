@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from train import (
-    CNNConfig,
-    Corruption,
-    evaluate_labeler,
-    load_labeler,
-    train_labeler,
-)
+from train import CNNConfig, Corruption, evaluate_labeler, load_labeler, train_labeler
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.settings import usual_settings
 

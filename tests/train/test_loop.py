@@ -15,12 +15,7 @@ from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
 from tests.sentences import assert_names
-from train import (
-    SetLabelerConfig,
-    TrainSettings,
-    load_labeler,
-    train_labeler,
-)
+from train import SetLabelerConfig, TrainSettings, load_labeler, train_labeler
 from train.labelers.storage import WEIGHTS
 from train.loop import CHECKPOINT, TrainingError
 

@@ -14,6 +14,7 @@ from handsim import join_qpos
 from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
+from tests.labelers import CountingLabeler
 from track.association.hand_state import HandState
 from track.association.initialization import (
     MOST_POINTS,
@@ -133,20 +134,12 @@ def test_exchanged_hands_are_exchanged_back(initializer, states):
 
 def test_a_search_goes_on_from_call_to_call_and_no_call_labels_many_clouds(states, rng):
     """Points at random are looked at along six directions, three in the first call."""
-    labeler, sizes = load_labeler("dense19"), list[int]()
-
-    class Counting:
-        marker_names = labeler.marker_names
-
-        def label_frames(self, frames):
-            sizes.append(len(frames))
-            return labeler.label_frames(frames)
-
-    initializer, points = HandInitializer(states, Counting()), rng.uniform(0.0, 0.2, (60, 3))
+    labeler = CountingLabeler()
+    initializer, points = HandInitializer(states, labeler), rng.uniform(0.0, 0.2, (60, 3))
     for call in range(4):
         assert initializer.initialize(points, (0, 1)) == []
         assert initializer.is_searching((0, 1)) == (call < 3) and not initializer.is_searching((0,))
-    assert sizes[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
+    assert labeler.calls[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.1, 0.3])

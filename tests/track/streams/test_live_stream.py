@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -40,16 +39,7 @@ class NoSource:
 """
 
 
-@pytest.fixture
-def own(tmp_path, monkeypatch):
-    (tmp_path / "own_sources.py").write_text(SOURCE)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    yield
-    sys.modules.pop("own_sources", None)
-
-
-@pytest.mark.parametrize("address", ["own_sources:Counting", "own_sources:Counting?frames=5"])
+@pytest.mark.parametrize("address", ["own_code:Counting", "own_code:Counting?frames=5"])
 def test_a_class_of_the_user_s_own(own, address):
     count = 5 if "frames" in address else 2
     assert [frame.number for frame in open_source(address)] == list(range(count))
@@ -74,10 +64,10 @@ def test_a_source_may_be_an_object():
         ("natnet://localhost:x", "natnet://host"),
         ("natnet://localhost/take", "natnet://host"),
         ("natnet://[::1", "natnet://host"),
-        ("own_sources:Nothing", "own_sources"),
-        ("own_sources:NoSource", "no method __iter__"),
-        ("own_sources:Counting?frames=many", "many"),
-        ("own_sources:Counting?speed=2", "speed"),
+        ("own_code:Nothing", "own_code"),
+        ("own_code:NoSource", "no method __iter__"),
+        ("own_code:Counting?frames=many", "many"),
+        ("own_code:Counting?speed=2", "speed"),
         ("not_there:Source", "not_there"),
         ("qtm://host:port", "expected qtm://host:port or qtm://host"),
         ("qtm://host?rate=2", "unknown option 'rate', there are none"),

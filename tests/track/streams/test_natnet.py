@@ -23,7 +23,7 @@ from handsim.errors import CaptureError
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
 from track import LiveStream, ReplayServer, StreamedFrame
-from track.streams import natnet
+from track.streams import LOOPBACK, natnet
 from track.streams.natnet import (
     NEWEST,
     DamagedPacket,
@@ -206,9 +206,6 @@ def test_a_greeting_says_which_layout_is_wanted():
     kind, payload = unpack(pack_connect())
     assert kind == Kind.CONNECT and len(payload) == 270
     assert payload[:8] == b"handsim\0" and payload[265:269] == bytes((4, 1, 0, 0))
-
-
-LOOPBACK = "127.0.0.1"
 
 
 @pytest.fixture(autouse=True)
@@ -455,7 +452,6 @@ def test_what_cannot_be_replayed_is_told():
     points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
     for arguments, options, words in (
         ((points, ids[:1], 100.0), {}, "expected (T, N, 3) and (T, N)"),
-        ((points, ids, 100.0), {"rate": 0.0}, "rate is 0, expected a number above 0"),
         ((points, ids, 100.0), {"version": (2, 9)}, "unknown NatNet version '2.9'"),
         ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
     ):  # fmt: skip
@@ -463,10 +459,6 @@ def test_what_cannot_be_replayed_is_told():
             ReplayServer(
                 SimpleNamespace(**dict(zip(("points", "ids", "rate"), arguments, strict=True))), **options
             )
-    with ReplayServer(Capture(("a",), points[:, :1], 100.0)) as server:
-        port = int(server.url.rpartition(":")[2])
-        with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
-            ReplayServer(Capture(("a",), points[:, :1], 100.0), port=port)
 
 
 @pytest.mark.parametrize("host", [LOOPBACK, "127.0.0.2"])

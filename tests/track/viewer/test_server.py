@@ -63,8 +63,6 @@ def test_a_port_that_is_taken_or_none_is_told():
         port = other.getsockname()[1]
         with error_names(ArgumentError, f"--port {port} cannot be listened at | own address and a free"):
             opened_server(LOOPBACK, port, "").__enter__()
-    with pytest.raises(ArgumentError, match="--port is 65536, expected 0 to 65535"):
-        opened_server(LOOPBACK, 65536, "").__enter__()
     with pytest.raises(ArgumentError, match=r"--host 192\.0\.2\.1 cannot be listened at"):
         opened_server("192.0.2.1", None, "").__enter__()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +13,7 @@ import pytest
 from handsim.cli.main import main
 from handsim.errors import DatasetError
 from handsim.hand.shape import JOINT_NAMES, JOINTS
+from tests.train.reports.conftest import pictures
 from train import Dataset
 from train.data.shards import row_dtype
 from train.reports import dataset_page as report
@@ -30,11 +29,6 @@ def rows():
     made["markers"][..., 0] = [[0.0, 0.030, 0.070]] * 3 + [[0.0, 0.010, 0.070]]
     made["ghosts"] = np.nan
     return made
-
-
-def pictures(page: Path) -> list[str]:
-    found = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page.read_text("utf-8"))
-    return [base64.b64decode(picture).decode() for picture in found]
 
 
 def test_angles_are_counted_over_the_joints_own_range(rows):

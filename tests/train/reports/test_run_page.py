@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
-import re
 import shutil
 from importlib import resources
 from pathlib import Path
@@ -20,13 +18,8 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
 from handsim.hand.shape import BONES
 from handsim.pages import picture
 from tests.renames import fails_at
-from train import (
-    LabelingReport,
-    SetLabelerConfig,
-    TrainSettings,
-    load_labeler,
-    train_labeler,
-)
+from tests.train.reports.conftest import pictures
+from train import LabelingReport, SetLabelerConfig, TrainSettings, load_labeler, train_labeler
 from train.evaluation import (
     History,
     error_without,
@@ -52,11 +45,6 @@ from train.reports.run_page import (
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
-
-
-def pictures(page: Path) -> list[str]:
-    found = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page.read_text("utf-8"))
-    return [base64.b64decode(picture).decode() for picture in found]
 
 
 @pytest.fixture(scope="module")
