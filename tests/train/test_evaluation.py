@@ -59,7 +59,7 @@ def test_an_empty_frame_is_all_occluded_and_figures_are_printed_in_percent(capsy
     assert figures["slot_accuracy"] == figures["occlusion_recall"] == 1.0
     print_figures({"clean": {**figures, "macro_f1": 0.98765}}, title="Figures")
     said = capsys.readouterr().out
-    assert "macro f1" in said and "98.77" in said and "100.00" in said and " - " in said
+    assert "macro f1" in said and "98.77" in said and "100.00" in said and " -\n" in said
 
 
 def test_confusion_and_macro_f1_by_hand():

@@ -8,6 +8,7 @@ import itertools
 import json
 import subprocess
 import sys
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,13 +18,14 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from gloves import Capture, MarkerLayout, MarkerPlace, attach, load_layout, read_capture, write_capture
+from gloves.captures.formats import read_markers
 from handsim import HandModel, HandSimError, HandSimWarning
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
 from handsim.hand.shape import DIGITS
 from poses import sample_poses
 from tests.sentences import error_names
-from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, load_labeler
+from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, evaluate_labeler, load_labeler
 from train.labelers.cnn_labeler import MeanHand
 from train.labelers.layout_labeler import LayoutLabeler
 from train.labelers.networks import labeler_of, new_network
@@ -37,6 +39,7 @@ from train.labelers.storage import (
     export_onnx,
     load_network,
     save_network,
+    shipped_labelers,
     sign_model,
     weights_metadata,
 )
@@ -378,3 +381,31 @@ def test_an_object_is_a_labeler_behind_checks():
     assert load_labeler(shipped) is shipped
     with pytest.raises(WeightsError, match=r"the labeler knows markers .*, but glove 'dense19' has"):
         load_labeler("dense19", First())
+
+
+def test_cards_say_where_the_weights_come_from():
+    for name in shipped_labelers():
+        folder = resources.files("train").joinpath("weights")
+        card = json.loads(folder.joinpath(f"{name}.json").read_text())
+        assert card["trained_on"] == "simulated frames only"
+        assert tuple(card["marker_names"]) == load_layout(name).names
+        assert card["dataset"]["glove"] == name
+        assert len(folder.joinpath(f"{name}.safetensors").read_bytes()) < 5_000_000
+
+
+@pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.985), (Corruption(), 0.92)])
+def test_real_people_are_labeled(sig18, corruption, least, rng):
+    labeler = load_labeler("dense19")
+    files = sorted(sig18.rglob("*.trc"))
+    chosen = rng.choice(len(files), size=40, replace=False)
+    markers = read_markers([files[number] for number in chosen], labeler.marker_names)
+    frames = markers[rng.choice(len(markers), size=min(2000, len(markers)), replace=False)]
+    assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
+
+
+def test_damaged_weights_are_told(tmp_path):
+    folder = resources.files("train").joinpath("weights")
+    (tmp_path / "labeler.json").write_bytes(folder.joinpath("dense19.json").read_bytes())
+    (tmp_path / "labeler.safetensors").write_bytes(folder.joinpath("dense19.safetensors").read_bytes()[:-100])
+    with pytest.raises(WeightsError, match=r"labeler\.safetensors is damaged or not a labeler's"):
+        load_labeler(tmp_path)
