@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves import OpticsConfig, Take, load_layout, load_take
+from gloves import Take, load_layout, load_take
 from gloves.captures.capture import count_gaps
 from handsim import HandModel
 from handsim.errors import ArgumentError, PoseError
@@ -107,8 +107,6 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
     first, again = simulate_take(settings=config), simulate_take(settings=config)
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
-    other = simulate_take(settings=dataclasses.replace(config, seed=8))
-    assert other.points.tobytes() != first.points.tobytes()
     assert first.hand_labels == (range(13), range(13, 26))
 
 
@@ -147,18 +145,6 @@ def test_the_gloves_radius_reaches_the_optics(tmp_path):
     assert missing[8.0] > 2.0 * missing[3.2]
     own = dataclasses.replace(config, optics=OpticsOptions(marker_radius=0.0032))
     assert 1.0 - simulate_take(settings=own).markers_present().mean() < missing[8.0]
-
-
-def test_the_optics_have_options():
-    assert [field.name for field in dataclasses.fields(OpticsOptions)] == [
-        field.name for field in dataclasses.fields(OpticsConfig)
-    ]
-    blind = simulate_take(num_frames=60, optics=OpticsOptions(blob_loss=0.9))
-    clear = simulate_take(num_frames=60)
-    assert blind.markers_present().mean() < 0.8 < clear.markers_present().mean()
-    assert blind.settings["room"]["optics"]["blob_loss"] == 0.9 and "optics" not in clear.settings
-    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a number from 0 to 1"):
-        SimulateSettings(optics=OpticsOptions(blob_loss=2.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
