@@ -148,10 +148,6 @@ def candidates_of(points, assigned, evidence=12.0):
     )
 
 
-def test_a_whole_hand_has_nothing_to_decide():
-    assert candidates_of(PLACES, range(7)).counts.tolist() == [0, 0]
-
-
 def test_a_stray_is_tried_near_a_marker_that_is_seen_and_farther_around_one_that_is_not():
     stray = [0.06, -0.02, 0.0]
     assert candidates_of([*PLACES, stray], [*range(7), -1]).counts.tolist() == [0, 0]
