@@ -6,6 +6,7 @@ import os
 import resource
 import subprocess
 import sys
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, op
 from render.skin.look import TONES
 from render.studio import Moment
 from render.subject import subject_of_take
-from render.viewpoints import PLACEMENTS, Viewpoints
+from render.viewpoints import Placement, Viewpoints
 from tests.render.formats.reading import depth_of
 from train import simulate_take
 
@@ -145,7 +146,7 @@ def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
     studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
     pictures = 0
-    for placement in PLACEMENTS:
+    for placement in get_args(Placement):
         viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))
         for frame in range(0, 120, 20):
             cameras = viewpoints.cameras(frame)

