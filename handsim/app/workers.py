@@ -93,7 +93,12 @@ def _do(job: Job, number: int) -> int:
     try:
         return job(number)
     except Exception as error:
-        raise portable(error) from None
+        told = f"{type(error).__name__}: {error}"
+        try:
+            same = pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise HandSimError(told) from None
+        raise (same if isinstance(same, type(error)) else HandSimError(str(error))) from None
 
 
 class LocalProcesses(ProcessPoolExecutor):
@@ -110,7 +115,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
-        with _one_thread(), without_signals():  # submit starts a process if none is idle
+        with one_thread(), without_signals():  # submit starts a process if none is idle
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -136,7 +141,7 @@ def _end_with(channel: Connection) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Let processes started in the block use one thread each, unless the user chose otherwise."""
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
@@ -158,15 +163,6 @@ def without_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def portable(error: Exception) -> Exception:
-    """The error, or its text if it cannot be pickled."""
-    try:
-        same = pickle.loads(pickle.dumps(error))
-    except Exception:
-        return HandSimError(f"{type(error).__name__}: {error}")
-    return same if isinstance(same, type(error)) else HandSimError(str(error))
 
 
 LOCAL: Final = "local"

@@ -42,21 +42,6 @@ class Part:
 Solid = tuple[list[Part], Any]
 
 
-def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
-    """Parts and mesh of one entry of `data/objects.json` (millimeters and degrees there, meters here)."""
-    import trimesh
-
-    return _SOLIDS[kind](np.asarray(numbers, dtype=np.float64), trimesh)
-
-
-def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
-    """The convex hull of some points [m] as a part."""
-    import trimesh
-
-    hull = trimesh.convex.convex_hull(np.asarray(vertices))
-    return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
-
-
 def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDArray[np.float64]) -> Part:
     return Part(kind, np.asarray(size, dtype=np.float64), pose, np.empty((0, 3)))
 
@@ -107,7 +92,7 @@ def _ellipsoid(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
 
 
 def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    """A hollow cup to cameras, a full cylinder to fingers."""
+    """A cup, which cameras see hollow and fingers touch as a full cylinder."""
     low, high, radius, wall, depth = 1e-3 * numbers
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
@@ -117,7 +102,7 @@ def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
 
 
 def _arc(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    """A bent tube: a chain of capsules to fingers."""
+    """A bent tube, which fingers touch as a chain of capsules."""
     center, radius, tube = 1e-3 * numbers[:3], 1e-3 * numbers[9], 1e-3 * numbers[10]
     first, second = (axis / np.linalg.norm(axis) for axis in (numbers[3:6], numbers[6:9]))
     angles = np.deg2rad(np.linspace(numbers[11], numbers[12], int(numbers[13]) + 1))
@@ -292,20 +277,20 @@ def _read_mesh(path: Path) -> Any:
 
 
 def _close(mesh: Any, path: Path) -> Part:
-    """Join the seams of a mesh, turn its inside in, and give its hull; an `ObjectError` if it is open."""
+    """The convex hull of a mesh whose seams are joined and whose inside is turned in; refuse an open one."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
         closed = bool(mesh.is_watertight)
         if closed and mesh.volume < 0.0:
             mesh.invert()
-        hull = hull_part(mesh.vertices) if closed else None
+        hull = mesh.convex_hull if closed else None
     except Exception as error:  # odd triangles fail in many ways
         raise ObjectError(
             f"{path}: not a closed surface ({shortened(' '.join(str(error).split()), 80)})"
         ) from error
     if hull is None:
         raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
-    return hull
+    return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -323,7 +308,7 @@ def _build(name: str, entry: dict[str, Any]) -> RigidObject:
     parts: list[Part] = []
     surfaces: list[Any] = []
     for kind, numbers in entry["solids"]:
-        solid_parts, surface = build_solid(kind, numbers)
+        solid_parts, surface = _SOLIDS[kind](np.asarray(numbers, dtype=np.float64), trimesh)
         parts += solid_parts
         surfaces.append(surface)
     mesh = trimesh.util.concatenate(surfaces)

@@ -394,6 +394,12 @@ def test_cards_say_where_the_weights_come_from():
         assert len(folder.joinpath(f"{name}.safetensors").read_bytes()) < 5_000_000
 
 
+def test_an_unfinished_run_is_named(tmp_path):
+    (tmp_path / "train.json").write_text("{}")
+    with pytest.raises(WeightsError, match=r"is an unfinished run .* same handsim train command"):
+        load_labeler(tmp_path)
+
+
 @pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.985), (Corruption(), 0.92)])
 def test_real_people_are_labeled(sig18, corruption, least, rng):
     labeler = load_labeler("dense19")
