@@ -89,12 +89,9 @@ _MOST_OWN: Final = 16  # gloves of the working folder that are tried
 class SizeFit(NamedTuple):
     """Hands as measured."""
 
-    hand: GloveFit
-    """The right one; a left hand is its mirror image."""
-    rms: float
-    """Median RMS distance of the markers from this hand [m]."""
-    spread: float
-    """Standard deviation of its length [m]."""
+    hand: GloveFit  # the right one; a left hand is its mirror image
+    rms: float  # median RMS distance of the markers from this hand [m]
+    spread: float  # standard deviation of its length [m]
 
     def __str__(self) -> str:
         """Length and breadth [mm], and by how much the length may be off, with 95 %."""
@@ -168,10 +165,7 @@ def _fit_from(
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
-    """Whether hands that were measured by weak evidence are found by the usual one.
-
-    In most frames; or in some of them, where most of their markers are there and fit well.
-    """
+    """Whether measured hands are found in most frames, or in some where most markers fit well."""
     tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
@@ -212,10 +206,7 @@ def _label(
     labeler: Labeler,
     config: TrackerConfig,
 ) -> dict[Side, Float[np.ndarray, "F M 3"]]:
-    """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them.
-
-    Hands that few frames show are left out.
-    """
+    """Labeled markers [m] of each hand that enough frames show, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
@@ -250,14 +241,9 @@ def _as_right(markers: Mapping[Side, Float[np.ndarray, "F M 3"]]) -> Float[np.nd
 
 
 class _Search:
-    """The likeliest length and breadth of hands of mean proportions.
+    """The likeliest length and breadth of hands of mean proportions, as which some frames were labeled."""
 
-    Few markers fit hands of many sizes, so that the sizes of people count too.
-
-    Args:
-        markers: Labeled markers of each hand [m]; NaN where missing.
-        start: The right hand as which they were labeled.
-    """
+    # Few markers fit hands of many sizes, so that the sizes of people count too.
 
     def __init__(self, markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
         few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
@@ -296,11 +282,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
-    """One shape for all hands of a user, by a calibration without touches.
-
-    `seen` are labeled markers of right hands, at least four in every frame; `start` is a right hand of about
-    the right size in the glove as designed. What the frames do not tell stays as it was.
-    """
+    """One shape for right hands in some frames, by a calibration without touches."""
     worn, shape = start.attachment, start.model.shape
     coordinates = nearest_coordinates(worn.points, shape)
     problem = Problem(
@@ -324,14 +306,11 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
 class _Fit(NamedTuple):
     """How well hands fit some frames."""
 
-    log_odds: float = 0.0
-    """Mean over the frames of the hands' log-odds, less penalties."""
+    log_odds: float = 0.0  # mean over the frames of the hands' log-odds, less penalties
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
-    shown: int = 0
-    """Number of frames in which any hand is found."""
-    is_good: bool = False
-    """Whether the hands fit well enough not to look for others."""
+    shown: int = 0  # number of frames in which any hand is found
+    is_good: bool = False  # whether the hands fit well enough not to look for others
     is_whole: bool = False
     """Whether each marker is seen at times; otherwise the glove worn may have fewer markers."""
 
@@ -339,11 +318,9 @@ class _Fit(NamedTuple):
 class _Other(NamedTuple):
     """A glove or scale that may fit better."""
 
-    name: str
-    """Name of the glove, or path of its file."""
+    name: str  # name of the glove, or path of its file
     layout: MarkerLayout
-    scale: float
-    """Factor that makes the points ones in meters."""
+    scale: float  # factor that makes the points ones in meters
     fit: _Fit
 
 
@@ -359,10 +336,7 @@ class _AtOnce:
 
 
 def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Refuse points that fit hands at another scale, which distances between neighbors tell.
-
-    `check_hands` finds that too, after all else that may be wrong.
-    """
+    """Refuse points that fit hands at another scale, which distances between neighbors tell."""
     some = _compared(frames)
     if not some:
         return
@@ -384,11 +358,8 @@ def check_hands(
     *,
     options: Collection[str] = ("--hands", "--glove"),
 ) -> None:
-    """Tell of hands that do not fit, where another side, glove or unit fits clearly better.
-
-    That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
-    the working folder.
-    """
+    """Tell of hands that do not fit, where another side, glove or unit fits clearly better."""
+    # That takes seconds, where something is wrong; gloves of .toml files in the working folder are tried too.
     some = _compared(frames)
     if not some:
         return

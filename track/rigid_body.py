@@ -129,10 +129,7 @@ def _distances_between(positions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
-    """Another order of all markers that fits the body after a rotation, if there is one.
-
-    A part of the markers may still be symmetric; then the body is not found while only these are seen.
-    """
+    """Another order of all markers that fits the body after a rotation, if there is one."""
     count = len(positions)
     orders: list[tuple[int, ...]] = [()]
     for marker in range(count):  # orders that keep all distances so far
@@ -158,20 +155,13 @@ class BodyFrame:
     status: Status
     """`found` in the first frame after it was lost, `tracked` from then on, `coasting` for a few frames where
     fewer than three markers are seen and the pose is a prediction, `lost`."""
-    T_world_body: Float[np.ndarray, "4 4"] | None
-    """The body's frame in the world [m]; None when lost."""
-    labels: Int[np.ndarray, "N"]
-    """Index of each point's marker in the template, -1 for all others."""
-    rms: float
-    """RMS distance of the labeled points from their markers [m]; NaN without any."""
+    T_world_body: Float[np.ndarray, "4 4"] | None  # the body's frame in the world [m]; None when lost
+    labels: Int[np.ndarray, "N"]  # index of each point's marker in the template, -1 for all others
+    rms: float  # RMS distance of the labeled points from their markers [m]; NaN without any
 
 
 class BodyTracker:
-    """Tracks one rigid body through a stream of points.
-
-    Args:
-        template: The body's markers.
-    """
+    """Tracks one rigid body through a stream of points."""
 
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
@@ -286,10 +276,7 @@ class BodyTracker:
         assignment: NDArray[np.int64],
         pose: NDArray[np.float64],
     ) -> tuple[int, float]:
-        """The unique match of the markers within a radius of a pose, or anywhere; fills the last two arrays.
-
-        Returns the number of markers that match, 0 if there is no unique match, and their RMS distance [m].
-        """
+        """Count and RMS [m] of the unique match near a pose, or anywhere; the arrays are filled."""
         if len(points) > _MOST_SEARCHED_POINTS:
             return 0, np.nan
         expected = self._positions if near is None else transform_markers(self._positions, near)
@@ -339,12 +326,10 @@ class BodyTracker:
 
 
 def _frames_to_confirm(count: int, markers: int) -> float:
-    """Frames that a match of `count` of a body's markers must last before it is accepted without a pose.
-
-    Three markers of a larger body are never accepted: markers on the back of a hand keep their distances for
-    minutes, and in up to one of twenty frames some three markers of two hands match three of an object. Four
-    match in one of a thousand.
-    """
+    """Frames that a match of `count` markers must last before it is accepted without a pose."""
+    # Three markers of a larger body are never accepted: markers on the back of a hand keep their distances
+    # for minutes, and in up to one of twenty frames some three markers of two hands match three of an object.
+    # Four match in one of a thousand.
     if count == FEWEST:
         return 10 if markers == FEWEST else np.inf
     return 2 if count == FEWEST + 1 < markers else 1
@@ -359,10 +344,7 @@ class BodyError(HandSimError):
 
 
 def load_body(name_or_path: AnyBody) -> RigidTemplate:
-    """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
-
-    A body itself is given back.
-    """
+    """A body as it is, or the markers of handsim's object or `.toml` file of this name."""
     check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
     if isinstance(name_or_path, RigidTemplate):
         return name_or_path
@@ -438,11 +420,7 @@ def _printable(what: str, name: str) -> str:
 
 
 def learn_body(capture: Capture, name: str) -> RigidTemplate:
-    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers.
-
-    A first template is taken from one frame and tracked through all frames. Then each marker moves to its
-    median over the frames.
-    """
+    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers."""
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])

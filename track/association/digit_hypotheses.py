@@ -51,18 +51,14 @@ class DigitRanges(NamedTuple):
 class DigitModel(NamedTuple):
     """The model that the candidates of a digit are tested against."""
 
-    joint_prior: JointPrior
-    """Distribution of the hand's hinges before the frame's markers were used."""
-    predicted: MarkerPrediction
-    """The hand as fitted to the labels so far."""
-    variance: Float[np.ndarray, "M"]
-    """Variance of each marker around its position [m^2]."""
+    joint_prior: JointPrior  # distribution of the hand's hinges before the frame's markers were used
+    predicted: MarkerPrediction  # the hand as fitted to the labels so far
+    variance: Float[np.ndarray, "M"]  # variance of each marker around its position [m^2]
     peak_log_odds: Float[np.ndarray, "M"]
     """Log-odds of a point exactly at the predicted position of each marker."""
     slack: Float[np.ndarray, "M"]
     """Distance by which each marker may be off its position on the hand of the ranges [m]."""
-    ranges: DigitRanges
-    """Distances between markers of a digit over all poses."""
+    ranges: DigitRanges  # distances between markers of a digit over all poses
 
 
 class DigitHypotheses(NamedTuple):
@@ -70,10 +66,8 @@ class DigitHypotheses(NamedTuple):
 
     scores: Float[np.ndarray, "*D S"]
     """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
-    runners_up: Float[np.ndarray, "*D S"]
-    """The same of the next best assignment of the same points."""
-    assignments: Int[np.ndarray, "*D S K"]
-    """Candidate of each of the digit's markers, -1 for none."""
+    runners_up: Float[np.ndarray, "*D S"]  # the same of the next best assignment of the same points
+    assignments: Int[np.ndarray, "*D S K"]  # candidate of each of the digit's markers, -1 for none
 
 
 class DigitPoints(NamedTuple):
@@ -130,10 +124,7 @@ def evaluate_digit(
     log_odds: Float[np.ndarray, "N M"],
     found: DigitHypotheses,
 ) -> None:
-    """Evaluate all assignments of candidate points to the markers of one digit.
-
-    `log_odds` are those of each label beside the fit, from IDs, presence and queries.
-    """
+    """Evaluate all assignments of points to a digit's markers, with the labels' other log-odds."""
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     local, label_log_odds = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
@@ -196,10 +187,7 @@ def _fit_hypotheses(
 
 @kernel
 def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
-    """Write the hypothesis with a number to `hypothesis`, and return the set of points that it uses as bits.
-
-    The digits of the number to the base `choices` are each marker's candidate plus one, zero for none.
-    """
+    """Write the hypothesis of a number, and return the set of points that it uses as bits."""
     points_used = 0
     for slot in range(len(hypothesis)):
         hypothesis[slot] = number % choices - 1

@@ -164,11 +164,9 @@ class HandInitializer:
     def _sides_checked(
         self, hands: list[InitializedHand], points: Float[np.ndarray, "N 3"]
     ) -> list[InitializedHand]:
-        """Two hands as they are, or the other way round where both together fit better so.
-
-        One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
-        symmetric pattern, fit both hands nearly alike.
-        """
+        """Two hands as they are, or the other way round where both together fit better so."""
+        # One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
+        # symmetric pattern, fit both hands nearly alike.
         if len(hands) != 2:
             return hands
         one, two = hands
@@ -178,11 +176,8 @@ class HandInitializer:
         return _likelier([self._trim(fit, points) for fit in first], hands)
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
-        """Log-odds of `count` labeled points being a hand against their being strays.
-
-        Few points fit any pose; what a pose takes from them does not count. `spread` is the known standard
-        deviation around the markers in each direction [m], estimated from the fit when not given.
-        """
+        """Log-odds of labeled points being a hand against strays, by the markers' `spread` [m] if known."""
+        # Few points fit any pose; what a pose takes from them does not count.
         taken = min(_FREE_COORDINATES, 3.0 * count)
         square = count * rms**2
         variance = (square + _SPREAD_BEFORE_COORDINATES * _SPREAD_BEFORE**2) / (
@@ -308,10 +303,7 @@ class HandInitializer:
     def _divided(
         self, hands: list[InitializedHand], points: NDArray[np.float64], group: NDArray[np.int64]
     ) -> list[InitializedHand]:
-        """Hands of one group, each labeled once more among the points that the others leave.
-
-        The first one may have points of the others, such as a thumb's.
-        """
+        """Hands of one group, each labeled once more among the points that the others leave."""
         for number, hand in enumerate(hands if len(hands) > 1 else ()):
             others = [other.labels[group] >= 0 for other in hands if other is not hand]
             again = self._better(hand, points, group, [group[~np.any(others, axis=0)]], (hand.index,))
@@ -319,10 +311,8 @@ class HandInitializer:
         return hands
 
     def _uncrossed(self, hands: list[InitializedHand], points: NDArray[np.float64]) -> list[InitializedHand]:
-        """Two hands, with the points of a digit exchanged where both together fit better so.
-
-        A thumb fits the other hand's palm nearly as well as its own where hands touch.
-        """
+        """Two hands, with the points of a digit exchanged where both together fit better so."""
+        # A thumb fits the other hand's palm nearly as well as its own where hands touch.
         if len(hands) != 2:
             return hands
         digits = self._states[hands[0].index].solver.hand.digits
@@ -366,10 +356,8 @@ class HandInitializer:
     def _without_outliers(
         self, first: InitializedHand, points: NDArray[np.float64]
     ) -> InitializedHand | None:
-        """The hand without labels that a robust fit leaves aside; None where these are many.
-
-        One wrong label can bend a whole first fit.
-        """
+        """The hand without labels that a robust fit leaves aside; None where these are many."""
+        # One wrong label can bend a whole first fit.
         state = self._states[first.index]
         targets = targets_of(points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
@@ -382,10 +370,8 @@ class HandInitializer:
     def _fit(
         self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
-        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few.
-
-        Its score counts how unusual the pose is; a hand that was seen lately must fit as well as then.
-        """
+        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few."""
+        # An unusual pose costs score, and a hand that was seen lately must fit as well as then.
         count, state = int((labels >= 0).sum()), self._states[index]
         if count < self._least(index):
             return None
@@ -427,8 +413,7 @@ class FrameLabels(NamedTuple):
 
     labels: Int[np.ndarray, "N"]
     """Marker of each point, counted through the hands in their order; -1 for none."""
-    confidence: Float[np.ndarray, "N"]
-    """Confidence in each label, 0 to 1."""
+    confidence: Float[np.ndarray, "N"]  # confidence in each label, 0 to 1
 
 
 def label_alone(
@@ -437,11 +422,7 @@ def label_alone(
     labeler: Labeler,
     told: Callable[[int], None] = lambda count: None,
 ) -> list[FrameLabels]:
-    """Label every frame by itself.
-
-    A hand is there where a pose fits. In a capture that shows hands in most frames, a frame with enough
-    points holds one also where none fits: the labeler can be right where too many labels are wrong for a fit.
-    """
+    """Label every frame by itself; a hand is there where a pose fits."""
     finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []
     for points in frames:

@@ -197,12 +197,10 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
 class _Proposal(NamedTuple):
     """Labels of a hand's points by the labeler, and the pose that fits them."""
 
-    frame: FrameState
-    """The frame with these labels."""
+    frame: FrameState  # the frame with these labels
     confidence: Float[np.ndarray, "P"]
     """The labeler's confidence in each label; NaN for points that it was not shown."""
-    estimate: HandEstimate
-    """The pose fitted to them."""
+    estimate: HandEstimate  # the pose fitted to them
 
 
 class LabelerReview:

@@ -50,8 +50,7 @@ class DigitCandidates(NamedTuple):
 
     candidates: Int[np.ndarray, "D 7"]
     """Points of each digit: first those labeled as its markers, then others, the nearest first."""
-    counts: Int[np.ndarray, "D"]
-    """How many there are; zero where there is nothing to decide."""
+    counts: Int[np.ndarray, "D"]  # how many there are; zero where there is nothing to decide
 
 
 def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:

@@ -88,31 +88,24 @@ SMALL_GAIN: Final = 1e-4
 class Estimate:
     """All unknowns of a calibration at one iteration."""
 
-    parameters: Float[np.ndarray, "53"]
-    """Hand shape, see `hand_parameters`."""
+    parameters: Float[np.ndarray, "53"]  # hand shape, see `hand_parameters`
     points: Float[np.ndarray, "M 3"]
     """Marker centers on the rest hand of this shape, in the wrist's frame [m]."""
-    coordinates: SkinCoordinates
-    """The same points in coordinates of its skin."""
+    coordinates: SkinCoordinates  # the same points in coordinates of its skin
     qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts | None = None
-    """Their frames count in `qpos`."""
+    contacts: Contacts | None = None  # their frames count in `qpos`
 
 
 class Fit(NamedTuple):
     """Residuals and energy of an estimate."""
 
     model: HandModel
-    bones: Float[np.ndarray, "F L 4 4"]
-    """`T_world_bone` in every frame."""
-    residuals: Float[np.ndarray, "F M 3"]
-    """Model minus marker [m], zero where a marker is missing."""
+    bones: Float[np.ndarray, "F L 4 4"]  # `T_world_bone` in every frame
+    residuals: Float[np.ndarray, "F M 3"]  # model minus marker [m], zero where a marker is missing
     design_residuals: Float[np.ndarray, "M 3"]
     """Marker minus its position by the glove's design on this hand, in the wrist's frame [m]."""
-    normals: Float[np.ndarray, "M 3"]
-    """Unit normals of the rest skin under the markers."""
-    geometry: ContactGeometry | None
-    """How the pads of the contacts lie to each other."""
+    normals: Float[np.ndarray, "M 3"]  # unit normals of the rest skin under the markers
+    geometry: ContactGeometry | None  # how the pads of the contacts lie to each other
     cost: float
 
 
@@ -246,11 +239,9 @@ class Problem:
     def _rest_jacobian(
         self, estimate: Estimate, patch: SkinPatch, skin: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53).
-
-        The skin is built for every estimate, its derivative only when a parameter has changed: by 0.005 or
-        more changes the result by less than a micrometer, while four times as much is noticeable.
-        """
+        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53)."""
+        # The skin's derivative is renewed when a parameter has changed: by 0.005 or more changes the result
+        # by less than a micrometer, while four times as much is noticeable.
         if (
             self._surface_jacobian is None
             or np.abs(estimate.parameters - self._linearized_at).max() > self._relinearize
@@ -337,11 +328,7 @@ class Problem:
         weights: NDArray[np.float64],
         rest: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Jacobians of skinned points in some frames (T, M, 3, ...) by poses, parameters and rest points.
-
-        Also where each bone alone would put them (T, M, L, 3). `rest` (M, 3, 53) is the jacobian of the rest
-        points by the parameters.
-        """
+        """Jacobians of skinned points by poses, parameters and rest points, and the points by each bone."""
         bones, qpos = fit.bones[frames], estimate.qpos[frames]
         by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
         all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
@@ -381,12 +368,10 @@ class Contacts(NamedTuple):
 class ContactGeometry(NamedTuple):
     """How the pads of K contacts lie to each other in the world."""
 
-    directions: Float[np.ndarray, "K 3"]
-    """Unit vectors from thumb to finger."""
+    directions: Float[np.ndarray, "K 3"]  # unit vectors from thumb to finger
     gaps: Float[np.ndarray, "K"]
     """Distance of the pads, both compressed by `PAD_COMPRESSION` [m]; negative where they press harder."""
-    facing: Bool[np.ndarray, "K"]
-    """Whether the points are on the last bones and face each other."""
+    facing: Bool[np.ndarray, "K"]  # whether the points are on the last bones and face each other
 
 
 def find_touches(
@@ -473,11 +458,9 @@ def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: s
 def slide_contacts(
     contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Slide the contact points on the skin to where thumb and finger come nearest.
-
-    Each point moves to the point of its skin nearest to a target inside the other pad. A target on the other
-    skin would fail where the skins overlap.
-    """
+    """Slide the contact points on the skin to where thumb and finger come nearest."""
+    # Each moves to where its skin is nearest to a target inside the other pad. A target on the other skin
+    # would fail where the skins overlap.
     skin = build_skin(model.shape)
     sides = [contacts.thumb_coordinates, contacts.finger_coordinates]
     for _ in range(_SLIDE_ROUNDS):
@@ -530,11 +513,9 @@ def _on_tips(contacts: Contacts) -> NDArray[np.bool_]:
 
 
 def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    """Weight of each contact, 0 to 1: small where its gap is unlike the others of its finger.
-
-    Geman and McClure's weights (1987), around a lower quantile: a touch is the nearest that the thumb comes.
-    Contacts that do not face each other get none.
-    """
+    """Weight of each contact, 0 to 1: small where its gap is unlike the others of its finger."""
+    # Geman and McClure's weights (1987), around a lower quantile: a touch is the nearest that the thumb
+    # comes.
     weights = np.zeros(len(geometry.gaps))
     for finger in np.unique(fingers[geometry.facing]):
         mine = (fingers == finger) & geometry.facing
@@ -560,10 +541,7 @@ def levenberg_marquardt(
     progress: Progress | None,
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
-    """Minimize the energy until a step gains less than a share of it, or step number `most` has been made.
-
-    Returns the estimate, its fit, and the number of the last step; `steps` were made before.
-    """
+    """Minimize until a step gains less than a share, or step `most`; with the last step's number."""
     fit, damping, better = problem.fit(estimate), _FIRST_DAMPING, True
     while better and steps < most:
         before = fit.cost
@@ -599,11 +577,7 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 def eliminate_poses(
     equations: NormalEquations, damping: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Schur complement of the poses, with `damping` times the diagonal of their blocks added to it.
-
-    Returns the reduced system with its gradient as last column (S, S + 1), and the poses' blocks solved for
-    the shared unknowns and the gradient (F, 26, S + 1).
-    """
+    """The damped poses' Schur complement (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])
     pose[:, diagonal, diagonal] *= 1.0 + damping

@@ -91,10 +91,7 @@ def skinned_shape_jacobian(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> Float[np.ndarray, "T M 3 53"]:
-    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed.
-
-    A longer bone moves all bones beyond it, in the pose and at rest.
-    """
+    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed."""
     homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
     def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
@@ -115,10 +112,7 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """Blended rotations of skinned points, and the position that each bone alone would give them [m].
-
-    The hand is a right one, rest points [m] are in the wrist's frame.
-    """
+    """Blended rotations of skinned points, and the position that each bone alone would give them [m]."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
@@ -201,11 +195,7 @@ def _vertex_faces(faces: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 
 class SkinPatch:
-    """The part of the skin that determines some triangles and their normals, for any shape.
-
-    Args:
-        faces: Triangles of `skin_mesh`.
-    """
+    """The part of the skin that determines some triangles of `skin_mesh`, for any shape."""
 
     def __init__(self, faces: Int[np.ndarray, "P"]) -> None:
         mesh = skin_mesh()
@@ -297,11 +287,8 @@ def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[n
 def project_onto_skin(
     coordinates: SkinCoordinates, targets: Float[np.ndarray, "P 3"], skin: Skin
 ) -> SkinCoordinates:
-    """Coordinates of points, by Newton steps that walk from triangle to adjacent triangle.
-
-    The height of a point is its signed distance along the normal. Where the skin folds and the walk does not
-    converge, the foot point stays on the last edge. Targets are in the wrist's frame [m].
-    """
+    """Coordinates of points [m], by Newton steps that walk from triangle to adjacent triangle."""
+    # Where the skin folds and the walk does not converge, the foot point stays on the last edge.
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
     active = np.arange(len(faces))

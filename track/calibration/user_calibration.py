@@ -260,10 +260,8 @@ def _with_touches(
     track: PoseTrack,
     touches: list[tuple[int, str]],
 ) -> tuple[Problem, Estimate]:
-    """The problem with the frames of the touches, at the noise of the first fit.
-
-    The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
-    """
+    """The problem with the frames of the touches, at the noise of the first fit."""
+    # The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
     noise = marker_noise(problem, fit)
     chosen = informative_frames(track, markers)
     touching = np.array([frame for frame, _ in touches], dtype=np.int64)
@@ -353,10 +351,7 @@ def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment)
 
 
 def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
-    """Indices into a track of up to `NUM_FRAMES` frames with poses as different as possible.
-
-    Frames without missing markers are preferred; frames with an unusual RMS are left out.
-    """
+    """Indices into a track of well fitted frames, poses as different and complete as possible."""
     missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
     well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
@@ -382,12 +377,9 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
 
 
 def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray, "T M 3"]) -> float:
-    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints.
-
-    It is the correlation of each frame's residuals, in the wrist's frame, with those of the frame whose joint
-    angles are nearest. Noise that is independent from frame to frame gives zero. There are two poses at
-    least.
-    """
+    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints."""
+    # It is the correlation, in the wrist's frame, with the frame whose joint angles are nearest. Noise that
+    # is independent from frame to frame gives zero.
     from scipy.spatial import cKDTree
 
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
@@ -398,10 +390,7 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
 
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
-    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992).
-
-    Each marker counts as far as the data determine its place, beside a few of the usual spread.
-    """
+    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992)."""
     covariance = shared_covariance(problem, estimate, fit)
     own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
     blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
@@ -429,10 +418,9 @@ def _learned(
 def standard_errors(
     problem: Problem, estimate: Estimate, fit: Fit
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m].
-
-    Where the wrist is in the palm is a convention: of the palm's markers it is the error among the knuckles.
-    """
+    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
+    # Where the wrist is in the palm is a convention: of the palm's markers it is the error among the
+    # knuckles.
     covariance = shared_covariance(problem, estimate, fit)
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)

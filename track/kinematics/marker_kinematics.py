@@ -36,24 +36,17 @@ _MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from ther
 class HandArrays(NamedTuple):
     """A hand and its glove as plain arrays: L bones, J = 20 hinges, M markers."""
 
-    offsets: Float[np.ndarray, "L 3"]
-    """Origin of each bone in its parent's frame [m]."""
-    rotations: Float[np.ndarray, "L 3 3"]
-    """Rotation of each bone in its parent's frame, all hinges at zero."""
-    axes: Float[np.ndarray, "J 3"]
-    """Unit axis of each hinge in the frame of its bone."""
-    ranges: Float[np.ndarray, "J 2"]
-    """Lower and upper limit of each hinge [rad]."""
+    offsets: Float[np.ndarray, "L 3"]  # origin of each bone in its parent's frame [m]
+    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all hinges at zero
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge in the frame of its bone
+    ranges: Float[np.ndarray, "J 2"]  # lower and upper limit of each hinge [rad]
     bones: Int[np.ndarray, "M 4"]
     """The bones that carry each marker, largest weight first; -1 where there is no further one."""
-    bone_weights: Float[np.ndarray, "M 4"]
-    """Skinning weight of each of these bones; they sum to one."""
+    bone_weights: Float[np.ndarray, "M 4"]  # skinning weight of each of these bones; they sum to one
     positions: Float[np.ndarray, "M 4 3"]
     """Position of each marker in the frames of its bones [m], times the bone's weight."""
-    digits: Int[np.ndarray, "M"]
-    """Digit of the bone with the largest weight; -1 for the palm."""
-    hinge_span: Int[np.ndarray, "M 2"]
-    """First hinge that may move each marker, and the one after the last."""
+    digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
+    hinge_span: Int[np.ndarray, "M 2"]  # first hinge that may move each marker, and the one after the last
     skyline: Int[np.ndarray, "26"]
     """Column of the first entry of each row of the normal matrix that can differ from zero."""
 
@@ -61,37 +54,27 @@ class HandArrays(NamedTuple):
 class Workspace(NamedTuple):
     """Buffers for one pose: bones and markers in the wrist's frame, and the equations of its next step."""
 
-    rotations: Float[np.ndarray, "L 3 3"]
-    """Rotation of each bone."""
-    origins: Float[np.ndarray, "L 3"]
-    """Origin of each bone [m]."""
-    axes: Float[np.ndarray, "J 3"]
-    """Unit axis of each hinge."""
+    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone
+    origins: Float[np.ndarray, "L 3"]  # origin of each bone [m]
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge
     bone_terms: Float[np.ndarray, "M 4 3"]
     """Each bone's term of the weighted sum that is a marker's position [m]."""
-    markers: Float[np.ndarray, "M 3"]
-    """Position of each marker [m]."""
+    markers: Float[np.ndarray, "M 3"]  # position of each marker [m]
     residuals: Float[np.ndarray, "M 3"]
     """Model marker minus target marker [m]; NaN where the target is missing."""
-    jacobian: Float[np.ndarray, "M 3 26"]
-    """Derivatives of the markers by the unknowns [m/rad, m/m]."""
+    jacobian: Float[np.ndarray, "M 3 26"]  # derivatives of the markers by the unknowns [m/rad, m/m]
     normal: Float[np.ndarray, "26 26"]
     """Normal matrix, upper triangle; zero between digits that share no marker."""
-    gradient: Float[np.ndarray, "26"]
-    """Half the gradient of the cost."""
-    factor: Float[np.ndarray, "26 26"]
-    """Room for a factor of the normal matrix."""
-    step: Float[np.ndarray, "26"]
-    """Step of the unknowns [rad, m]."""
+    gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
+    factor: Float[np.ndarray, "26 26"]  # room for a factor of the normal matrix
+    step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
 
 
 class PoseEnergy(NamedTuple):
     """What a pose is fitted to: markers, and a prior."""
 
-    target: Float[np.ndarray, "M 3"]
-    """Markers in the world [m]; NaN where missing."""
-    prior_mean: Float[np.ndarray, "27"]
-    """Mean of the prior, a pose."""
+    target: Float[np.ndarray, "M 3"]  # markers in the world [m]; NaN where missing
+    prior_mean: Float[np.ndarray, "27"]  # mean of the prior, a pose
     precision: Float[np.ndarray, "26"]
     """Its diagonal precision, in the order of the unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none."""
     robust_scale: float
@@ -351,10 +334,7 @@ def _linearize(
     weights: Float[np.ndarray, "M"],
     work: Workspace,
 ) -> None:
-    """Normal matrix and half gradient at the pose for which `marker_residuals` was last called.
-
-    The robust loss is taken into account by reweighting; `weights` [1/m^2] is a buffer and is overwritten.
-    """
+    """Normal matrix and half gradient where `marker_residuals` was last called; `weights` is a buffer."""
     precision = energy.precision
     for marker in range(len(weights)):
         residual = work.residuals[marker]
@@ -379,10 +359,7 @@ def _linearize(
 
 @kernel
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
-    """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
-
-    Returns the expected decrease of the cost; a negative number when the matrix has no factor.
-    """
+    """Solve the damped equations by a skyline Cholesky factor; the expected gain, negative for none."""
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):
         start, own = skyline[row], factor[row]
@@ -413,10 +390,7 @@ def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> f
 def move_wrist(
     qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
 ) -> None:
-    """Write the wrist of a pose after the last six unknowns of a step to the first seven numbers of another.
-
-    The step [rad, m, rad] translates and rotates the wrist along its own axes.
-    """
+    """Write the wrist of a pose after a step, which is along the wrist's own axes, to another pose."""
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
     i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
@@ -430,11 +404,8 @@ def move_wrist(
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:
-    """Fill the last six numbers of a step: translation and rotation of the wrist from one pose to another.
-
-    They are along its axes in the second; the rotation is to first order, twice the vector part of the
-    quaternion.
-    """
+    """Fill the step of the wrist from one pose to another, along its axes in the second."""
+    # The rotation is to first order: twice the vector part of the quaternion.
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
     i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
@@ -451,10 +422,8 @@ def wrist_offsets(
 
 @kernel
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
-    """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read.
-
-    A call of LAPACK costs more than the inverse of so small a matrix.
-    """
+    """Overwrite a symmetric positive-definite matrix, given by its lower triangle, by its inverse."""
+    # A call of LAPACK costs more than the inverse of so small a matrix.
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):
@@ -483,11 +452,7 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
-    """Eliminate unknowns `first` to before `last` of a symmetric positive-definite system (Schur complement).
-
-    Matrix and right side are overwritten; the block below and right of the eliminated unknowns stays
-    symmetric and complete.
-    """
+    """Eliminate unknowns `first` to before `last` of a positive-definite system; the rest stays symmetric."""
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]
         for row in range(pivot + 1, len(matrix)):

@@ -74,10 +74,8 @@ _ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all 
 class _StartingShapes(NamedTuple):
     """K hand shapes with the wrist at the origin, and the positions of their markers."""
 
-    angles: Float[np.ndarray, "K 20"]
-    """Hinge angles [rad]."""
-    markers: Float[np.ndarray, "K M 3"]
-    """Markers in the wrist's frame [m]."""
+    angles: Float[np.ndarray, "K 20"]  # hinge angles [rad]
+    markers: Float[np.ndarray, "K M 3"]  # markers in the wrist's frame [m]
     weights: Float[np.ndarray, "M"]
     """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
 
@@ -111,10 +109,8 @@ class PoseFit:
 class AnglePrior(NamedTuple):
     """Independent normal priors of the hinges, for digits that lack a marker or have under three."""
 
-    angles: Float[np.ndarray, "T 20"]
-    """Mean angles [rad]."""
-    spread: float
-    """Their standard deviation [rad]."""
+    angles: Float[np.ndarray, "T 20"]  # mean angles [rad]
+    spread: float  # their standard deviation [rad]
 
 
 class PoseSolver:
@@ -292,10 +288,7 @@ def _read_markers(
     target: Float[np.ndarray, "M 3"],
     seen: Int[np.ndarray, "6"],
 ) -> int:
-    """Copy the markers of one frame to `target`, each complete or NaN, and return how many are present.
-
-    `seen` is filled with how many are present on each digit and on the palm (last).
-    """
+    """Copy a frame's complete markers, count those on each part in `seen`, and return how many there are."""
     seen[:] = 0
     present = 0
     for marker in range(len(given)):
@@ -373,11 +366,7 @@ def _write_world_markers(
 def _initial_poses(
     shapes: _StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "S 27"]:
-    """Poses to start from (K + 1, 27) for the markers of one frame, the most likely one first.
-
-    The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
-    aligned with the markers first.
-    """
+    """Poses to start a frame from (K + 1, 27): digits of the nearest shapes, then shapes, best first."""
     count = len(shapes.angles)
     aligned, poses, squares = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS)), np.empty(count)
     for number in range(count):
