@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,17 +17,24 @@ from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, 
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
-from handsim.hand.shape import BONE_NAMES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
+from handsim.hand.shape import BONE_NAMES, BONES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
 from handsim.hand.skin import HandSurface, vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 
-_MAX_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
 _MAX_NUMBER: Final = 100.0  # of positions [m], directions and indices of bones
 _SUM_TOLERANCE: Final = 1e-6
 _NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
+_DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
+# The digits of the palm's capsules: the fingers' metacarpals, and the wrist for the thumb.
+_PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
+_KNUCKLE_SLACK: Final = 0.003  # [m] that a palm's marker may be nearer to a digit's bone than to the palm's
+# From the wanted place of a marker (1) back to where it was designed (0), and to the middle of its bone (-1).
+_WAY_BACK: Final = (1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0)
+_DEEP: Final = 0.02  # [m] from a bone to the skin, more than in a finger or the back of the hand
+_LONGEST_SLIP: Final = 0.025  # [m]
 _SLACK: Final = 1e-9  # of barycentric weights, so that a ray through an edge meets a face
 
 
@@ -112,17 +120,49 @@ class Attachment:
 
 
 def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
-    """Put a glove on a hand: from each marker's point on its bone outwards to the skin."""
+    """Put a glove on a hand: from each marker's point on its bone outwards to the skin of its digit.
+
+    Raises:
+        LayoutError: A marker meets no skin, or the skin of another digit; the message names both.
+    """
+    worn, missed, others = _put_on(layout.markers, layout, model)
+    if missed:
+        raise LayoutError(_refusal(layout.markers[missed[0]], others[missed[0]]))
+    return worn
+
+
+def _refusal(marker: MarkerPlace, other: str) -> str:
+    """The sentence about a marker that meets no skin, or the skin of another digit."""
+    place = f"along {marker.along:g}, "
+    palm = marker.bone == BONE_NAMES[PALM]
+    place += f"across {marker.across:g}" if palm else f"around {np.rad2deg(marker.around):g}"
+    if not other:
+        return f"marker '{marker.name}' meets no skin from {marker.bone} at {place}; move it onto the hand"
+    return (
+        f"marker '{marker.name}' on {marker.bone} at {place} would lie on {other}; move it along or around "
+        "its bone to skin of its own digit"
+    )
+
+
+def _put_on(
+    markers: Sequence[MarkerPlace], layout: MarkerLayout, model: HandModel
+) -> tuple[Attachment, list[int], list[str]]:
+    """The layout's glove with its markers at these places of a hand, and the markers that miss their digit.
+
+    Returns:
+        The glove, the indices of markers that miss the skin of their digit, and for every marker the bone
+        of another digit that it would lie on, "" for none. The points of markers that meet no skin mean
+        nothing.
+    """
     surface = model.surface
-    rays = np.array([_ray(marker, model) for marker in layout.markers])
+    rays = np.array([_ray(marker, model) for marker in markers])
     origins, directions = rays[:, 0], rays[:, 1]
-    markers, faces, bary, distances = _first_exits(origins, directions, surface)
-    if len(markers) < layout.num_markers:
-        marker = layout.markers[int(np.setdiff1d(np.arange(layout.num_markers), markers)[0])]
-        raise LayoutError(
-            f"marker '{marker.name}' meets no skin from {marker.bone} at along {marker.along:g}, "
-            f"across {marker.across:g}; move it onto the hand"
-        )
+    faces, bary, distances = _exits(
+        origins, directions, surface.vertices, np.ascontiguousarray(surface.faces)
+    )
+    missed = faces < 0
+    distances[missed] = 0.0
+    bary[missed] = 1.0 / 3.0
     corners = surface.faces[faces]
     # Skin normals of a few vertices, from the faces around them alone.
     needed = np.zeros(len(surface.vertices), dtype=np.bool_)
@@ -130,9 +170,55 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     around = surface.faces[needed[surface.faces].any(axis=1)]
     normals = np.einsum("mk,mki->mi", bary, vertex_normals(surface.vertices, around)[corners])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = origins + distances[:, None] * directions + layout.heights[:, None] * normals
+    feet = origins + distances[:, None] * directions
+    points = feet + layout.heights[:, None] * normals
     indices, shares = _blend_weights(surface, corners, bary)
-    return Attachment(layout, points, normals, indices, shares)
+    bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
+    others = _other_digits(feet, points, bones, model)
+    others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]
+    astray = np.flatnonzero(missed | (np.array(others) != "")).tolist()
+    return Attachment(layout, points, normals, indices, shares), astray, others
+
+
+def _other_digits(
+    feet: NDArray[np.float64], points: NDArray[np.float64], bones: NDArray[np.int64], model: HandModel
+) -> list[str]:
+    """For each marker the nearest bone of the flat hand if it is of another digit, "" otherwise.
+
+    A finger's metacarpal counts as the finger's for its own markers, and as the palm's for the palm's; a
+    thumb's marker may lie over the index finger's metacarpal and the wrist. The end of a stalk may not be
+    inside another digit.
+
+    Args:
+        feet: The places under the markers on the skin (M, 3) [m].
+        points: The markers' centers (M, 3) [m].
+        bones: The bone of each marker (M,).
+    """
+    capsules = model.capsules
+    axes = capsules.posed(model.rest_transforms[None])[0]
+    digits = _DIGIT_OF_BONE[bones][:, None]
+    own = _DIGIT_OF_BONE[capsules.bones] == digits
+    own[:, capsules.bones == PALM] |= (digits == _PALM_DIGITS) | ((digits == 0) & (_PALM_DIGITS == 1))
+    distances = _axis_distances(feet, axes)
+    nearest = np.where(own, distances, np.inf).min(axis=1)
+    rival = np.where(own, np.inf, distances)
+    slack = np.where(digits[:, 0] < 0, _KNUCKLE_SLACK, 0.0)
+    inside = np.where(own, np.inf, _axis_distances(points, axes) - capsules.radii)
+    return [
+        BONE_NAMES[capsules.bones[depths.argmin() if depths.min() < 0.0 else others.argmin()]]
+        if others.min() + allowed < own_distance or depths.min() < 0.0
+        else ""
+        for others, own_distance, allowed, depths in zip(rival, nearest, slack, inside, strict=True)
+    ]
+
+
+def _axis_distances(points: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (M, K) [m] of points (M, 3) from segments (K, 2, 3)."""
+    spans = axes[:, 1] - axes[:, 0]
+    offsets = points[:, None] - axes[:, 0]
+    shares = np.einsum("mki,ki->mk", offsets, spans) / np.einsum("ki,ki->k", spans, spans)
+    nearest = np.clip(shares, 0.0, 1.0)[..., None] * spans
+    return np.asarray(np.linalg.norm(offsets - nearest, axis=-1))
 
 
 def vary_layout(
@@ -159,13 +245,58 @@ def vary_layout(
 def wear(
     layout: MarkerLayout, model: HandModel, *, along: float, around: float, rng: np.random.Generator
 ) -> Attachment:
-    """Put on a glove with random shifts (`vary_layout`), or as designed if twenty draws miss the hand."""
-    for _ in range(_MAX_FITTINGS):
-        try:
-            return attach_markers(vary_layout(layout, along=along, around=around, rng=rng), model)
-        except LayoutError:
-            continue
+    """Put on a glove with random shifts (`vary_layout`).
+
+    A shift that would carry a marker off the skin of its digit is shortened until it does not.
+    """
+    return _settled(layout, vary_layout(layout, along=along, around=around, rng=rng), model)
+
+
+def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
+    """Put a glove on a hand of any proportions: as designed where the skin of each marker's digit reaches.
+
+    A marker that would lie on another digit of this hand moves towards the middle of its bone's back.
+    """
+    return GloveFit(model, _settled(layout, layout, model))
+
+
+def _settled(layout: MarkerLayout, wanted: MarkerLayout, model: HandModel) -> Attachment:
+    """The glove with each marker at its wanted place, or on the way from there to where it was designed."""
+    markers, missed = list(wanted.markers), list(range(layout.num_markers))
+    for share in _WAY_BACK:
+        for index in missed:
+            markers[index] = _on_the_way(layout.markers[index], wanted.markers[index], share)
+        worn, missed, _ = _put_on(markers, wanted, model)
+        if share > 0.0:
+            missed = sorted({*missed, *_leaps(layout, worn, markers, model)})
+        if not missed:
+            return dataclasses.replace(worn, layout=dataclasses.replace(wanted, markers=tuple(markers)))
     return attach_markers(layout, model)
+
+
+def _leaps(
+    layout: MarkerLayout, worn: Attachment, markers: Sequence[MarkerPlace], model: HandModel
+) -> list[int]:
+    """Markers deep in the flesh that a small shift carries far over the skin, as from palm to thumb."""
+    origins = np.array([_ray(marker, model)[0] for marker in markers])
+    deep = np.flatnonzero(np.linalg.norm(worn.points - origins, axis=1) - layout.heights > _DEEP).tolist()
+    if not deep:
+        return []
+    designed, missed, _ = _put_on(layout.markers, layout, model)
+    moved = np.linalg.norm(worn.points - designed.points, axis=1)
+    return [index for index in deep if index not in missed and moved[index] > _LONGEST_SLIP]
+
+
+def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
+    """A place between the wanted one (1), the designed one (0), and the middle of the bone's back (-1)."""
+    if share == 1.0:
+        return wanted
+    end = wanted if share >= 0.0 else dataclasses.replace(designed, along=0.5, around=0.0, across=0.0)
+    values = {
+        key: getattr(designed, key) + abs(share) * (getattr(end, key) - getattr(designed, key))
+        for key in ("along", "around", "across")
+    }
+    return dataclasses.replace(designed, **values)
 
 
 def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -178,16 +309,6 @@ def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], ND
         local[1] = sideways * marker.across * model.shape.breadth
     direction = np.array([0.0, sideways * np.sin(marker.around), np.cos(marker.around)])
     return T_wrist_bone[:3, :3] @ local + T_wrist_bone[:3, 3], T_wrist_bone[:3, :3] @ direction
-
-
-def _first_exits(
-    origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """First exits of rays from the skin: rays that have one, faces, barycentric weights, distances [m]."""
-    exits = _exits(origins, directions, surface.vertices, np.ascontiguousarray(surface.faces))
-    rays = np.flatnonzero(exits[0] >= 0)
-    faces, weights, distances = (each[rays] for each in exits)
-    return rays, faces, weights, distances
 
 
 @kernel

@@ -33,6 +33,7 @@ from handsim.space.transforms import (
     MIRROR,
     pose_matrices,
     quaternion_matrix,
+    rigid,
     rotation_quaternions,
     transform_poses,
     vector_quaternions,
@@ -302,9 +303,7 @@ def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
     low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
     shortest, _, longest = np.argsort(high - low, kind="stable")
     x, z = np.eye(3)[shortest], np.eye(3)[longest]
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2
-    return frame
+    return rigid(np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2)
 
 
 def _perpendicular(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:

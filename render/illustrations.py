@@ -21,6 +21,7 @@ from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
 from handsim.space.camera import Camera, pinhole
 from handsim.space.rig import CameraRig
+from handsim.space.transforms import rigid
 from poses.shapes import gesture, make_valid
 from render.captions import (
     BACKGROUND,
@@ -132,9 +133,7 @@ def view_along(
     above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
     below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
     distance = max(*((above + below) / (2 * slope)), 2 * NEAR - local[:, 2].min())
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
+    pose = rigid(rotation, rotation @ np.array([*(above - below) / 2, -distance]))
     return pinhole("view", size, float(0.5 * size[1] / np.tan(field_of_view / 2))).at(pose)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from gloves.fit import GloveFit, attach
+from gloves.fit import GloveFit, settle_glove
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_choice, check_count, check_type
@@ -272,7 +272,7 @@ class Cast:
         else:
             shape = sample_shape(rng=SpawnKey.PERSON.rng(self.seed, person, 0))
         model = HandModel(shape.with_side("right"))
-        return tuple(attach(fit.layout, model).with_side(fit.side) for fit in worn)
+        return tuple(settle_glove(fit.layout, model).with_side(fit.side) for fit in worn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -419,7 +419,7 @@ def _posed(
     record: dict[str, Any],
 ) -> Subject:
     """The subject of poses on these hands in gloves."""
-    hands = tuple(attach(layout, HandModel(model.shape.with_side("right"))) for model in models)
+    hands = tuple(settle_glove(layout, HandModel(model.shape.with_side("right"))) for model in models)
     hands = tuple(fit.with_side(model.shape.side) for fit, model in zip(hands, models, strict=True))
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
     rate = _SECOND if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)

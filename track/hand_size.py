@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import spacing
-from gloves.fit import GloveFit, attach
+from gloves.fit import GloveFit, settle_glove
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
@@ -196,7 +196,7 @@ def usual_breadth(length: float) -> float:
 
 def _hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
     """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
-    return attach(layout, HandModel(shape_from_measures(length, breadth, side="right")))
+    return settle_glove(layout, HandModel(shape_from_measures(length, breadth, side="right")))
 
 
 def _label(

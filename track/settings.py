@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
-from gloves.fit import GloveFit, attach
+from gloves.fit import GloveFit, settle_glove
 from gloves.layout import list_layouts, load_layout
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
@@ -115,9 +115,9 @@ class TrackerSetup:
     @property
     def start(self) -> tuple[GloveFit, ...]:
         """The hands that a calibration begins with; measured ones in the glove as it was designed."""
-        return (
-            tuple(attach(hand.layout, hand.model) for hand in self.user) if self.is_auto else self.user.hands
-        )
+        if not self.is_auto:
+            return self.user.hands
+        return tuple(settle_glove(hand.layout, hand.model) for hand in self.user)
 
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
         """The setup with the hands as measured in some frames, if they are to be measured."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset
-from train.evaluation import CLEAN, evaluate_labeler
+from train.evaluation import CLEAN, evaluate_labeler, percent
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.generation import generate_dataset
@@ -43,15 +43,14 @@ _PAPER: Final = Corruption(occlude=5, ghosts=2)  # Han et al. 2018, section 5
 _TIMED: Final = 1024  # frames that time the labeler
 _CANDIDATES: Final = 400  # frames from which the shown one is chosen
 
-# The figures on the page. A figure is undefined if the ratio beside it is zero.
-_SHOWN: Final = {
-    "slot_accuracy": "",
-    "point_accuracy": "",
-    "occlusion_precision": "occlusion_ratio",
-    "occlusion_recall": "occlusion_ratio",
-    "ghost_precision": "ghost_ratio",
-    "ghost_recall": "ghost_ratio",
-}
+_FIGURES: Final = (
+    "slot_accuracy",
+    "point_accuracy",
+    "occlusion_precision",
+    "occlusion_recall",
+    "ghost_precision",
+    "ghost_recall",
+)
 
 
 def demo_sections(
@@ -154,7 +153,13 @@ def _generate_and_label(
         f"{num_frames} freshly generated frames (seed {seed}) of random people, none of whom is in the "
         f"training set. Occluded: 0 to {_PAPER.occlude} markers dropped and 0 to {_PAPER.ghosts} ghosts per "
         "frame.",
-        table=_table(columns),
+        table=[
+            ["", *(f"{title} [%]" for title in columns)],
+            *(
+                [name.replace("_", " ").capitalize(), *(percent(one[name]) for one in columns.values())]
+                for name in _FIGURES
+            ),
+        ],
         notes=[
             f"generated {num_frames / seconds:,.0f} frames/s (start included), "
             f"labeled {labeled:,.0f} frames/s, on {usable_cores()} CPU cores",
@@ -230,12 +235,3 @@ def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
         f"joints is {np.mean(errors):.2f} mm. The tracked hands are drawn, with the truth of every pixel.",
         pictures=[("pictures.png", "Colors with keypoints, and depth of a time-of-flight sensor.")],
     )
-
-
-def _table(columns: dict[str, dict[str, Any]]) -> list[list[str]]:
-    """Header and rows in percent, with a dash for undefined figures."""
-    table = [["", *(f"{title} [%]" for title in columns)]]
-    for name, ratio in _SHOWN.items():
-        cells = ("-" if ratio and not one[ratio] else f"{100 * one[name]:.2f}" for one in columns.values())
-        table.append([name.replace("_", " ").capitalize(), *cells])
-    return table

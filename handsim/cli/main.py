@@ -25,92 +25,58 @@ from handsim.files.signals import Stopped, signals_raise
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
 Table = Mapping[str, tuple[Any, str]]
 """For each command "module:function", or a table of its sub-commands, and a line of help."""
-_GLOVE: Final[Table] = {
-    "list": (
-        "handsim.cli.glove:list_gloves",
-        "List the marker layouts that come with handsim: markers, labeler and source of each.",
-    ),
-    "show": ("handsim.cli.glove:show_glove", "Show a layout's markers."),
-    "new": (
-        "handsim.cli.glove:new_glove",
-        "Write a commented layout file as a start for a glove of your own.",
-    ),
-    "check": (
-        "handsim.cli.glove:check_glove",
-        "Check a layout on hands of all five sizes, and draw it from the back, the palm and the thumb's "
-        "side.",
-    ),
-    "score": (
-        "handsim.cli.glove_advice:score_glove",
-        "Say how well a layout can be labeled and what it tells of each joint; nothing is trained.",
-    ),
-    "improve": (
-        "handsim.cli.glove_advice:improve_glove",
-        "Look for a better layout near a given one: move, add or drop markers.",
-    ),
+_HELP: Final = {
+    "demo": "Run the whole chain on a built-in example; ends with a page of pictures.",
+    "hand": "Write a hand as a MuJoCo model, a URDF or a rigged mesh.",
+    "glove": "List, show, start and check marker layouts; score and improve one before it is worn.",
+    "glove list": "List the marker layouts that come with handsim: markers, labeler and source of each.",
+    "glove show": "Show a layout's markers.",
+    "glove new": "Write a commented layout file as a start for a glove of your own.",
+    "glove check": "Check a layout on hands of all five sizes, and draw it from the back, the palm and the "
+    "thumb's side.",
+    "glove score": "Say how well a layout can be labeled and what it tells of each joint; nothing is "
+    "trained.",
+    "glove improve": "Look for a better layout near a given one: move, add or drop markers.",
+    "rig": "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
+    "rig list": "List the camera rigs that come with handsim: how many cameras, their pictures, and what "
+    "they are.",
+    "rig new": "Write a commented rig file as a start for a rig of your own.",
+    "rig check": "Check a rig's file: where its cameras stand and look, and what is suspicious.",
+    "rig import": "Write a rig's file of the calibration of a camera system: all its cameras, pictures and "
+    "lenses.",
+    "rig score": "Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is "
+    "recorded.",
+    "rig plan": "Look for the best places of a number of cameras, for hands at work in a volume.",
+    "generate": "Make a training set; goes on where it was stopped.",
+    "train": "Train a labeler on a training set; goes on where it was stopped.",
+    "label": "Label every frame of a marker capture.",
+    "export": "Write a take's motion for other programs (.glb, .bvh, .usdc, .csv, ...), or a labeler as "
+    ".onnx.",
+    "evaluate": "Measure a labeler on a labeled capture.",
+    "simulate": "Simulate a capture of hands, with its truth.",
+    "calibrate": "Fit hands and gloves to a user, from a capture.",
+    "track": "Follow hands through a marker capture or a live stream.",
+    "report": "Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.",
+    "replay": "Play a capture as a NatNet server, to try a live set-up.",
+    "view": "Show a file or a live tracker in the browser.",
+    "body": "Write a rigid body's markers as a file, to track it with.",
+    "render": "Draw the hands of a take, with the truth of each picture.",
+    "doctor": "Say what is missing on this machine, and how to get it.",
 }
-_RIG: Final[Table] = {
-    "list": (
-        "handsim.cli.rig:list_shipped",
-        "List the camera rigs that come with handsim: how many cameras, their pictures, and what they are.",
-    ),
-    "new": ("handsim.cli.rig:new_rig", "Write a commented rig file as a start for a rig of your own."),
-    "check": (
-        "handsim.cli.rig:check_rig",
-        "Check a rig's file: where its cameras stand and look, and what is suspicious.",
-    ),
-    "import": (
-        "handsim.cli.rig:import_rig",
-        "Write a rig's file of the calibration of a camera system: all its cameras, pictures and lenses.",
-    ),
-    "score": (
-        "handsim.cli.rig:score_rig",
-        "Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is recorded.",
-    ),
-    "plan": (
-        "handsim.cli.rig:plan_rig",
-        "Look for the best places of a number of cameras, for hands at work in a volume.",
-    ),
-}
+"""Every command with its line of help; `handsim glove list` is `list_glove` in the module `glove`."""
+
+
+def _target(command: str) -> str | Table:
+    """Where a command's function is, or the table of its sub-commands."""
+    inner = [name for name in _HELP if name.startswith(f"{command} ")]
+    if inner:
+        return {name.split()[1]: (_target(name), _HELP[name]) for name in inner}
+    words = command.split()
+    return f"handsim.cli.{words[0]}:{'_'.join(reversed(words))}"
+
+
 # Modules are imported when their command runs, and not for the help of a table.
-COMMANDS: Final[Table] = {
-    "demo": (
-        "handsim.cli.demo:demo",
-        "Run the whole chain on a built-in example; ends with a page of pictures.",
-    ),
-    "hand": ("handsim.cli.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
-    "glove": (
-        _GLOVE,
-        "List, show, start and check marker layouts; score and improve one before it is worn.",
-    ),
-    "rig": (
-        _RIG,
-        "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
-    ),
-    "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
-    "train": (
-        "handsim.cli.train:train",
-        "Train a labeler on a training set; goes on where it was stopped.",
-    ),
-    "label": ("handsim.cli.label:label", "Label every frame of a marker capture."),
-    "export": (
-        "handsim.cli.export:export",
-        "Write a take's motion for other programs (.glb, .bvh, .usdc, .csv, ...), or a labeler as .onnx.",
-    ),
-    "evaluate": ("handsim.cli.train:evaluate", "Measure a labeler on a labeled capture."),
-    "simulate": ("handsim.cli.simulate:simulate", "Simulate a capture of hands, with its truth."),
-    "calibrate": ("handsim.cli.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
-    "track": ("handsim.cli.track:track", "Follow hands through a marker capture or a live stream."),
-    "report": (
-        "handsim.cli.report:report",
-        "Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.",
-    ),
-    "replay": ("handsim.cli.replay:replay", "Play a capture as a NatNet server, to try a live set-up."),
-    "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
-    "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),
-    "render": ("handsim.cli.render:render", "Draw the hands of a take, with the truth of each picture."),
-    "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
-}
+COMMANDS: Final[Table] = {name: (_target(name), line) for name, line in _HELP.items() if " " not in name}
 _SHELLS: Final = ("bash", "fish", "zsh")
 _SYSTEM_SENTENCES: Final = {
     errno.ENOSPC: "the disk is full; free some space and run the same command again",

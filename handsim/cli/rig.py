@@ -26,39 +26,11 @@ from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 if TYPE_CHECKING:
     from train.forecast.rig_forecast import Forecast
 
-_STARTER: Final = """\
-# A camera rig (docs/rigs.md): lengths in meters, z up, the origin on the floor. Edit it, then run
-#   handsim rig check FILE
-#   handsim rig score FILE
-
-name = "my rig"
-description = "Four cameras at the corners of a table."
-size = [1280, 1024]  # width and height of the pictures [px]
-horizontal_field_of_view = 56.0  # [deg], as data sheets state it; or focal = 1204.0 [px] of a calibration
-
-# One table for each camera, two to thirty-two of them; what it says goes before what stands at the top. Hands
-# work around (0, 0, 1.1): place the origin so, or tell `handsim rig score` where they work with --center.
-
-[[camera]]
-position = [-1.2, -0.9, 2.2]  # of the lens
-target = [0.0, 0.0, 1.1]  # a point in the middle of its picture
-
-[[camera]]
-position = [-1.2, 0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-
-[[camera]]
-position = [1.2, -0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-
-[[camera]]
-position = [1.2, 0.9, 2.2]
-target = [0.0, 0.0, 1.1]
-"""
+_STARTER: Final = Path(__file__).parents[1] / "data" / "starter_rig.toml"
 _Sides = tuple[float, float, float]
 
 
-def list_shipped() -> None:
+def list_rig() -> None:
     """List the camera rigs that come with handsim: how many cameras, their pictures, and what they are."""
     rigs = [(name, load_rig(name)) for name in list_rigs()]
     rows = [(name, str(len(rig.cameras)), rig.pictures(), rig_description(name)) for name, rig in rigs]
@@ -72,7 +44,7 @@ def new_rig(file: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         file: A new .toml file.
     """
-    write_starter(file, _STARTER, error=RigError)
+    write_starter(file, _STARTER.read_text("utf-8"), error=RigError)
     print_line(f"{file}: edit it, then run `handsim rig check {file}`")
 
 

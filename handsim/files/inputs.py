@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -170,6 +170,14 @@ def numbers(owner: str, value: object, shape: tuple[int, ...], expected: str) ->
     ):
         raise HandSimError(f"{owner} is {shown(value)}, expected {expected}")
     return np.array(flat, dtype=np.float64).reshape(shape)
+
+
+def words_numbers(words: Sequence[str]) -> tuple[float, ...]:
+    """Words as numbers; empty if a word is not a number."""
+    try:
+        return tuple(float(word) for word in words)
+    except ValueError:
+        return ()
 
 
 def number_list(owner: str, value: object) -> tuple[float, ...]:

@@ -36,7 +36,7 @@ from handsim.hand.shape import (
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
 from handsim.kernels import pose_bones
-from handsim.space.transforms import MIRROR, euler_matrix
+from handsim.space.transforms import MIRROR, euler_matrix, rigid
 
 if TYPE_CHECKING:
     import mujoco
@@ -67,8 +67,7 @@ class Skeleton:
         transforms = np.tile(np.eye(4), (NUM_BONES, 1, 1))
         for number, bone in enumerate(BONES):
             if bone.parent >= 0:
-                local = np.eye(4)
-                local[:3, :3], local[:3, 3] = self.rotations[number], self.offsets[number]
+                local = rigid(self.rotations[number], self.offsets[number])
                 transforms[number] = transforms[bone.parent] @ local
         return transforms
 

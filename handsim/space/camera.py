@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
+from handsim.space.transforms import rigid
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
@@ -382,6 +383,11 @@ def _checked_size(name: str, size: object) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
+def brown_lens(*coefficients: float) -> Lens:
+    """OpenCV's lens of k1, k2, p1, p2 and k3; a pinhole where all are zero."""
+    return Lens("brown", coefficients) if any(coefficients) else Lens()
+
+
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
     """K of focal lengths and a principal point [px]."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -409,10 +415,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = position
-    return pose
+    return rigid(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
 def focal_of_angle(length: float, angle: float) -> float:

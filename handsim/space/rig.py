@@ -60,6 +60,10 @@ _MAX_FILE_CAMERAS: Final = 256
 _MAX_DISTANCE: Final = 50.0  # [m] from the origin
 _CLOSEST: Final = 1e-3  # [m] from a camera to its target, or to another camera
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
+"""What a camera's name cannot have."""
+_MAX_NAME: Final = 56  # characters of a name that a number may follow
+_ROTATION_TOLERANCE: Final = 1e-3  # deviation of a rounded matrix from a rotation
 
 
 class RigFile(NamedTuple):
@@ -102,6 +106,24 @@ def check_names(owner: str, cameras: Sequence[Camera]) -> None:
             )
         if names.count(name) > 1:
             raise RigError(f"{owner}: two cameras are called '{name}', expected different names")
+
+
+def camera_names(given: Sequence[str]) -> list[str]:
+    """Unique names of cameras, with letters, digits, - and _ only."""
+    names: list[str] = []
+    for number, text in enumerate(given, 1):
+        plain = NAMELESS.sub("_", text).strip("_")[:_MAX_NAME] or f"camera{number}"
+        names.append(plain if plain not in names else f"{plain}_{number}")
+    return names
+
+
+def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """The rotation (3, 3) nearest to a rounded one."""
+    left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    rotation: NDArray[np.float64] = left @ right
+    if np.abs(stretch - 1.0).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise RigError(f"{owner} is not a rotation matrix")
+    return rotation
 
 
 def check_near(owner: str, camera: Camera) -> None:

@@ -1,4 +1,4 @@
-"""Calibrations of cameras as other programs write them: Vicon, Qualisys, Motive, COLMAP and OpenCV.
+"""Calibrations of cameras as other programs write them: Vicon, Qualisys, Motive and COLMAP.
 
 Vicon Nexus, Shogun, Tracker and Blade keep an `.xcp` beside a capture. A `KeyFrame` has the position [mm] and
 the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down, z ahead.
@@ -14,22 +14,16 @@ by row, the matrix whose columns are the camera's axes in the world: x right, y 
 has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; the one of `Intrinsic` is Motive's own.
 
 COLMAP's reconstructions are read as text: `cameras.txt` with the lenses, `images.txt` with the poses.
-
-OpenCV's files are YAML or JSON of one camera, a stereo pair, or many. They are flat tables of numbers, which
-are parsed here because OpenCV's parser may never return from a damaged file.
 """
 
 from __future__ import annotations
 
 import codecs
 import dataclasses
-import itertools
-import json
 import re
-import textwrap
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 from xml.parsers import expat
@@ -39,15 +33,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
-from handsim.files.inputs import read_bytes, shown
-from handsim.space.camera import Camera, Lens, camera_matrix
-from handsim.space.rig import checked_cameras, read_rig_file
-from handsim.space.transforms import quaternion_matrix, vector_quaternions
+from handsim.files.inputs import read_bytes, shown, words_numbers
+from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
+from handsim.space.opencv_cameras import read_opencv_cameras
+from handsim.space.rig import NAMELESS, camera_names, checked_cameras, nearest_rotation, read_rig_file
+from handsim.space.transforms import quaternion_matrix, rigid
 
 _MAX_VALUE: Final = 1e9  # of a number in any unit
-_ROTATION_TOLERANCE: Final = 1e-3  # deviation of a rounded matrix from a rotation
-_NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
-_MAX_NAME: Final = 56  # characters
 
 
 class LabCamera(NamedTuple):
@@ -82,7 +74,7 @@ class _Element(NamedTuple):
         text = self.element.get(key)
         if text is None:
             raise RigError(f"{self.owner} lacks {key}")
-        values = _words_numbers(text.split())
+        values = words_numbers(text.split())
         if len(values) != count or not all(abs(value) < _MAX_VALUE for value in values):  # never so for NaN
             expected = "a finite number" if count == 1 else f"{count} finite numbers"
             raise RigError(f"{self.owner}: {key} is {shown(text)}, expected {expected}")
@@ -100,14 +92,6 @@ class _Element(NamedTuple):
         return _Element(found, self.owner)
 
 
-def _words_numbers(words: list[str]) -> tuple[float, ...]:
-    """Words as numbers; empty if a word is not a number."""
-    try:
-        return tuple(float(word) for word in words)
-    except ValueError:
-        return ()
-
-
 def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     """Width and height [px]."""
     if width != int(width) or height != int(height) or min(width, height) < 1:
@@ -122,38 +106,6 @@ def checked_matrix(owner: str, focal: Sequence[float], center: Sequence[float]) 
             f"{owner}: the focal lengths are {focal[0]:g} and {focal[1]:g}, expected positive pixels"
         )
     return camera_matrix(*focal, *center)
-
-
-def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
-    """The rotation (3, 3) nearest to a rounded one."""
-    left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
-    rotation: NDArray[np.float64] = left @ right
-    if np.abs(stretch - 1.0).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
-        raise RigError(f"{owner} is not a rotation matrix")
-    return rotation
-
-
-def rigid(
-    rotation: Float[np.ndarray, "3 3"], position: Sequence[float] | Float[np.ndarray, "3"]
-) -> NDArray[np.float64]:
-    """The transform (4, 4) of a rotation and a position."""
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, position
-    return transform
-
-
-def brown_lens(*coefficients: float) -> Lens:
-    """OpenCV's lens of k1, k2, p1, p2 and k3; a pinhole where all are zero."""
-    return Lens("brown", coefficients) if any(coefficients) else Lens()
-
-
-def camera_names(given: Sequence[str]) -> list[str]:
-    """Unique names of cameras, with letters, digits, - and _ only."""
-    names: list[str] = []
-    for number, text in enumerate(given, 1):
-        plain = _NAMELESS.sub("_", text).strip("_")[:_MAX_NAME] or f"camera{number}"
-        names.append(plain if plain not in names else f"{plain}_{number}")
-    return names
 
 
 _MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
@@ -446,7 +398,7 @@ def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
         raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
     R_world_camera = quaternion_matrix(pose[:4] / length).T
     lens = lenses[words[8]]
-    name = _NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
+    name = NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
     return Camera(name, lens.size, lens.K, rigid(R_world_camera, -R_world_camera @ pose[4:]), lens.lens)
 
 
@@ -460,303 +412,6 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
         if not abs(values[-1]) < 1e9:
             raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
     return values
-
-
-_MAX_OPENCV_BYTES: Final = 1 << 24
-_MAX_NUMBERS: Final = 16  # of a value; longer lists, such as corners of a board, are ignored
-_CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
-_MAX_BASELINE: Final = 5.0  # [m]
-_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
-_DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
-_LIST: Final = re.compile(r"[\[\],\s]+")
-_K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
-_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist")
-_WIDTH: Final = ("image_width", "imageWidth", "img_width", "width")
-_HEIGHT: Final = ("image_height", "imageHeight", "img_height", "height")
-_SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
-_FISHEYE: Final = ("fisheye_model", "fisheye")
-_R: Final = ("R", "Rot", "rvec", "rotation")
-_T: Final = ("T", "t", "tvec", "translation")
-_PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
-"""Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
-_OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
-_OF_ONE: Final = (*_K, *_D, *_WIDTH, "W", *_HEIGHT, "H", *_SIZE, *_FISHEYE, *_R, *_T)
-_SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
-_MAX_CAMERAS: Final = 256
-
-Values = dict[str, tuple[float, ...] | str]
-Sections = dict[str, Values]
-"""Tables of one camera each, by the cameras' names."""
-
-
-def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
-    """All cameras of a `.yml`, `.yaml` or `.json` (names: docs/rendering.md), or of such a pair of files."""
-    values, sections = _read(path)
-    other = path.with_stem(_OTHERS.get(path.stem, path.stem))
-    if other != path and other.is_file():
-        more, others = _read(other)
-        values, sections = more | values, others | sections
-    try:
-        sections = sections or _numbered_sections(values)
-        if sections:
-            cameras = _many(values, sections)
-        elif _find(values, _numbered(_K, 1)) is not None:
-            cameras = _stereo(values)
-        elif _find(values, ("P1",)) is not None:
-            cameras = _rectified(values)
-        else:
-            cameras = [_camera(values, "camera", _K, _D, _pose(values))]
-    except HandSimError as error:
-        raise RigError(f"{path}: {error}") from error
-    return checked_cameras(path, cameras)
-
-
-def _many(values: Values, sections: Sections) -> list[Camera]:
-    """Cameras in one world; a size of the pictures outside their sections holds for all."""
-    if len(sections) > _MAX_CAMERAS:
-        raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
-    cameras = []
-    common = {key: value for key, value in values.items() if key in (*_WIDTH, *_HEIGHT, *_SIZE)}
-    for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
-        try:
-            if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
-                raise RigError("no R and T, the rotation and translation from the world to the camera")
-            cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
-        except HandSimError as error:
-            raise RigError(f"camera '{shortened(given)}': {error}") from error
-    return cameras
-
-
-def _numbered_sections(values: Values) -> Sections:
-    """A table for each camera with a translation among K_1, dist_1, R_1, T_1, K_2, ..."""
-    found: Sections = {}
-    for key, separator in itertools.product(list(values), ("_", "")):
-        base = next((one for one in _K if key.startswith(one + separator) and key != one + separator), None)
-        if base is None:
-            continue
-        ending = key[len(base) :]
-        own = {one: values[one + ending] for one in _OF_ONE if one + ending in values}
-        for short, name in (("W", _WIDTH[0]), ("H", _HEIGHT[0])):
-            if short in own:
-                own[name] = own.pop(short)
-        if _find(own, _T) is not None:
-            found[ending.removeprefix("_")] = own
-    return found
-
-
-def _camera(
-    values: Values, name: str, K: tuple[str, ...], D: tuple[str, ...], pose: NDArray[np.float64]
-) -> Camera:
-    matrix = _matrix(values, K, (3, 3))
-    return Camera(name, _size(values), _from_corner(matrix), pose, _lens(values, D))
-
-
-def _stereo(values: Values) -> list[Camera]:
-    """A stereo pair, whose R and T map coordinates of the first camera to the second."""
-    first, shift = _own_pose(values), np.array(_value_numbers(values, "T", (3,)))
-    _check_baseline(shift)
-    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), shift))
-    return [
-        _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
-        for name, number, pose in (("left", 1, first), ("right", 2, second))
-    ]
-
-
-def _rectified(values: Values) -> list[Camera]:
-    """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
-    first, cameras = _own_pose(values), []
-    for name, key in (("left", "P1"), ("right", "P2")):
-        P = _matrix(values, (key,), (3, 4))
-        if not np.linalg.det(P[:, :3]):
-            raise RigError(f"{key} is not a projection matrix of a camera")
-        shift = np.linalg.solve(P[:, :3], P[:, 3]).astype(np.float64)
-        _check_baseline(shift)
-        pose = first @ np.linalg.inv(rigid(np.eye(3), shift))
-        cameras.append(Camera(name, _size(values), _from_corner(P[:, :3]), pose))
-    return cameras
-
-
-def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
-    moved: NDArray[np.float64] = K.astype(np.float64)
-    moved[:2, 2] += _CENTER
-    return moved
-
-
-def _lens(values: Values, names: tuple[str, ...]) -> Lens:
-    found = _find(values, names)
-    given = () if found is None else _value_numbers(values, found, None)
-    model = str(values.get("distortion_model", ""))
-    flag = _find(values, _FISHEYE)
-    if model in ("equidistant", "fisheye") or (flag is not None and any(_value_numbers(values, flag, (1,)))):
-        if len(given) != 4:
-            raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
-        return Lens("fisheye", given)
-    if any(given[5:]):
-        raise RigError(
-            f"{found} has {len(given)} coefficients, of which those after the fifth are not 0, expected the "
-            "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like"
-        )
-    if any(given) and len(given) < 4:
-        raise RigError(f"{found} has {len(given)} coefficients, expected 4 or 5: k1, k2, p1, p2, k3")
-    return brown_lens(*(*given, *[0.0] * 5)[:5])
-
-
-def _size(values: Values) -> tuple[int, int]:
-    width, height, both = (_find(values, names) for names in (_WIDTH, _HEIGHT, _SIZE))
-    if width is not None and height is not None:
-        size = _value_numbers(values, width, (1,)) + _value_numbers(values, height, (1,))
-    elif both is not None:
-        size = _value_numbers(values, both, (2,))
-    else:
-        raise RigError("no size of the pictures; add image_width and image_height in pixels")
-    if not all(length == int(length) for length in size):
-        raise RigError(f"the pictures are {size[0]:g} x {size[1]:g}, expected whole numbers of pixels")
-    return int(size[0]), int(size[1])
-
-
-def _pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`, or the inverse of R and T; without them the identity."""
-    R, T = _find(values, _R), _find(values, _T)
-    if "T_world_camera" not in values and (R is not None or T is not None):
-        outer = rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
-        return np.linalg.inv(outer).astype(np.float64)
-    return _own_pose(values)
-
-
-def _own_pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`, or the identity."""
-    return _matrix(values, ("T_world_camera",), (4, 4)) if "T_world_camera" in values else np.eye(4)
-
-
-def _rotation(values: Values, key: str) -> NDArray[np.float64]:
-    """The rotation of a matrix or of a rotation vector [rad]."""
-    given = np.array(_value_numbers(values, key, None))
-    if given.size == 3:
-        turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
-        return turned
-    if given.size != 9:
-        raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
-    return nearest_rotation(key, given.reshape(3, 3))
-
-
-def _check_baseline(vector: NDArray[np.float64]) -> None:
-    length = float(np.linalg.norm(vector))
-    if length > _MAX_BASELINE:
-        raise RigError(
-            f"the cameras are {length:.4g} m apart, expected at most {_MAX_BASELINE:g} m; are these "
-            "millimeters, or squares of the board? Positions are in meters"
-        )
-
-
-def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> NDArray[np.float64]:
-    found = _find(values, names)
-    if found is None:
-        raise RigError(f"no '{names[0]}', expected OpenCV's calibration with that name")
-    return np.array(_value_numbers(values, found, shape)).reshape(shape)
-
-
-def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
-    return tuple(name + separator + str(number) for name in names for separator in ("", "_"))
-
-
-def _find(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
-    return next((name for name in names if name in values), None)
-
-
-def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[float, ...]:
-    if key not in values:
-        raise RigError(f"no '{key}'")
-    given = values[key]
-    if isinstance(given, str) or not np.isfinite(given).all():
-        raise RigError(f"{key} is no list of at most {_MAX_NUMBERS} finite numbers")
-    if shape is not None and len(given) != np.prod(shape):
-        expected = " x ".join(map(str, shape))
-        raise RigError(f"{key} has {len(given)} numbers, expected {expected}")
-    return given
-
-
-def _read(path: Path) -> tuple[Values, Sections]:
-    data = read_bytes(path, error=RigError, most=_MAX_OPENCV_BYTES)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
-    if text.lstrip().startswith("<"):
-        raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
-    if not text.lstrip().startswith("{"):
-        return _yaml_tables(text)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise RigError(f"{path}: not a calibration: it is no JSON") from error
-    if not isinstance(content, dict):
-        raise RigError(f"{path}: not a calibration: its JSON is no table")
-    values = {str(key): _json_value(value) for key, value in content.items()}
-    return values, dict(_json_sections(content))
-
-
-def _yaml_tables(text: str) -> tuple[Values, Sections]:
-    """The values at the top level, and the cameras below them."""
-    values: Values = {}
-    sections: Sections = {}
-    for name, body in _yaml_bodies(text):
-        if _SECTION.search(body):
-            inner = _yaml_bodies(textwrap.dedent(body.strip("\n")))
-            sections[name] = {key: _yaml_value(value) for key, value in inner}
-        else:
-            values[name] = _yaml_value(body)
-    return values, sections
-
-
-def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
-    """Each key at the left margin, and the text after it."""
-    starts = list(_ENTRY.finditer(text))
-    ends = [start.start() for start in starts[1:]]
-    for start, end in itertools.zip_longest(starts, ends):
-        yield start[1], text[start.end() : end]
-
-
-def _yaml_value(body: str) -> tuple[float, ...] | str:
-    """The numbers of a number, list or matrix; anything else as text."""
-    body = body.strip()
-    data = _DATA.search(body)
-    words = [word for word in _LIST.split(data[1] if data else body, _MAX_NUMBERS + 2) if word]
-    return _few_numbers(words) or body.strip("\"' ")
-
-
-def _few_numbers(words: list[str]) -> tuple[float, ...]:
-    """Words as numbers; empty if a word is not a number, or if there are too many."""
-    return _words_numbers(words) if len(words) <= _MAX_NUMBERS else ()
-
-
-def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
-    """The tables of cameras, at the top level or in a table or list `cameras`."""
-    cameras = content.get("cameras", content)
-    if isinstance(cameras, list):
-        named = [
-            (str(one["name"]) if "name" in one else str(n), one)
-            for n, one in enumerate(cameras, 1)
-            if isinstance(one, dict)
-        ]
-    else:
-        named = list(cameras.items()) if isinstance(cameras, dict) else []
-    for name, one in named[: _MAX_CAMERAS + 1]:
-        if isinstance(one, dict) and _find(one, _K) is not None:
-            yield name, {str(key): _json_value(value) for key, value in one.items()}
-
-
-def _json_value(value: object) -> tuple[float, ...] | str:
-    if isinstance(value, dict):
-        value = value.get("data")
-    words: list[str] = []
-    waiting = [value]
-    while waiting and len(words) <= _MAX_NUMBERS:
-        first = waiting.pop(0)
-        if isinstance(first, list):
-            waiting[:0] = first[: _MAX_NUMBERS + 1]
-        else:
-            words.append(str(float(first) if isinstance(first, bool) else first))
-    return _few_numbers(words) or str(value)[:80]
 
 
 Up = Literal["y", "z"]

@@ -5,6 +5,7 @@ Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of fram
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,15 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], position: Sequence[float] | Float[np.ndarray, "3"]
+) -> NDArray[np.float64]:
+    """The transform (4, 4) of a rotation and a position."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, position
+    return transform
 
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:

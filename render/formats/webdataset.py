@@ -28,7 +28,7 @@ from handsim.errors import HandSimError
 from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import JOINTS, NUM_BONES, NUM_JOINTS, HandShape
 from handsim.space.camera import Camera
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import quaternion_matrix, rigid
 from render.formats.records import (
     CENTER,
     JOINT_ORDERS,
@@ -86,9 +86,7 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     streams = [(frame.camera.name, by_side(frame)) for frame in frames]
     record: dict[str, Any] = {"left": None, "right": None}
     for side, hand in streams[0][1].items():
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = quaternion_matrix(hand.qpos[3:7]), hand.qpos[:3]
-        wrist = umetrack_wrist(pose)
+        wrist = umetrack_wrist(rigid(quaternion_matrix(hand.qpos[3:7]), hand.qpos[:3]))
         record[side] = {
             "umetrack_pose": {
                 "joint_angles": hand.qpos[7:].tolist(),

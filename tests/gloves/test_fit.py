@@ -12,7 +12,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gloves import MarkerLayout, MarkerPlace, attach, load_layout
-from gloves.fit import _ray, attach_markers, nearest_markers, nominal_fit, place_marker, vary_layout
+from gloves.fit import (
+    _ray,
+    attach_markers,
+    nearest_markers,
+    nominal_fit,
+    place_marker,
+    settle_glove,
+    vary_layout,
+    wear,
+)
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import LayoutError
 from handsim.hand.model import build_spec
@@ -201,3 +210,58 @@ def test_a_marker_goes_to_the_skin_below_the_point(side, index, place, height):
     assume(nearest > LAYOUT.radius + height - 1e-4)  # no marker fits into the folds between the fingers
     assert np.linalg.norm(center - point) < height + 0.016  # the wrist's cut is beyond what a layout reaches
     assert LAYOUT.radius - 1e-3 < np.linalg.norm(surface.vertices - center, axis=1).min() < 0.008
+
+
+def worn_by(*places: MarkerPlace) -> MarkerLayout:
+    """A glove of these markers, numbered; the first is repeated until there are five."""
+    markers = (*places, *[places[0]] * (5 - len(places)))
+    named = [dataclasses.replace(marker, name=str(number)) for number, marker in enumerate(markers)]
+    return MarkerLayout("own", tuple(named), 0.003)
+
+
+def nearest_digits(points: np.ndarray, model: HandModel) -> np.ndarray:
+    """The digit of the moving bone whose segment at rest is nearest to each point: thumb 0 to little 4."""
+    starts = model.rest_transforms[1:, :3, 3]
+    spans = model.skeleton.lengths[1:, None] * model.rest_transforms[1:, :3, 0]
+    offsets = points[:, None] - starts
+    shares = np.clip((offsets * spans).sum(-1) / (spans**2).sum(-1), 0.0, 1.0)
+    distances = np.linalg.norm(offsets - shares[..., None] * spans, axis=-1)
+    return distances.argmin(axis=1) // 3
+
+
+@pytest.mark.parametrize(
+    ("bone", "along", "around", "other"),
+    [("ring_proximal", 0.45, 90, "index_proximal"), ("little_proximal", 0.5, 90, "proximal")],
+)
+def test_a_place_in_the_web_between_fingers_is_refused_with_the_bone_it_would_be_on(
+    bone, along, around, other
+):
+    layout = worn_by(MarkerPlace("R1", bone, along, np.deg2rad(around)))
+    for size in ("XS", "M", "XL"):
+        with pytest.raises(LayoutError, match=rf"marker '0' on {bone} .* would lie on \w*{other}"):
+            attach(layout, size)
+    attach(worn_by(MarkerPlace("R1", bone, 0.7, np.deg2rad(around))), "M")
+
+
+def test_a_stalk_that_ends_inside_the_neighboring_finger_is_refused():
+    side = MarkerPlace("M1", "middle_middle", 0.4, np.pi / 2)
+    attach(worn_by(side), "M")
+    with pytest.raises(LayoutError, match=r"would lie on index_"):
+        attach(worn_by(dataclasses.replace(side, height=0.008)), "M")
+
+
+def test_slips_leave_lateral_markers_on_the_skin_of_their_digit(rng):
+    fingers = ("index", "middle", "ring", "little")
+    sides = [
+        (f"{name}_{part}", turn) for name in fingers for part in ("proximal", "middle") for turn in (1, -1)
+    ]
+    layout = worn_by(*(MarkerPlace("x", bone, 0.68, turn * np.pi / 2) for bone, turn in sides))
+    own = np.array([1 + fingers.index(bone.split("_")[0]) for bone, _ in sides])
+    for _ in range(60):
+        model = HandModel(sample_shape(EVERYBODY, rng=rng))
+        designed = settle_glove(layout, model).attachment
+        worn = wear(layout, model, along=0.1, around=np.deg2rad(10), rng=rng)
+        feet = worn.points - layout.heights[:, None] * worn.normals
+        np.testing.assert_array_equal(nearest_digits(feet, model), own)
+        assert np.linalg.norm(worn.points - designed.points, axis=1).max() < 0.025
+        assert worn.layout.names == layout.names

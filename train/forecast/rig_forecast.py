@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths, runs_of
-from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.fit import GlovedHand, GloveFit, settle_glove
 from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
 from gloves.takes.take import Take
@@ -126,7 +126,7 @@ def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
 
 def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
     """Scenes of the first frames of a take in which every hand has a pose, perhaps in another glove."""
-    fits = [hand if layout is None else attach(layout, hand.model) for hand in take.hands]
+    fits = [hand if layout is None else settle_glove(layout, hand.model) for hand in take.hands]
     whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames
     for first, last in runs_of(whole):
@@ -186,7 +186,7 @@ def observe_motion(
     poses = take.qpos[chosen]
     poses[..., :3] += ROOM_CENTER - poses[..., :3].mean(axis=(0, 1))
     models = tuple(hand.model for hand in take.hands)
-    fits = tuple(attach(layout, model) for model in models)
+    fits = tuple(settle_glove(layout, model) for model in models)
     qpos = tuple(np.ascontiguousarray(poses[:, number]) for number in range(len(models)))
     return list(_observe(FrameScene(models, qpos), fits, rig, rng))
 

@@ -11,6 +11,7 @@ middle and 0.5 m down: below by 1200 * 0.5 / 3.6 = 166.667.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 POINT = np.array([0.4, 1.0, 1.5])
@@ -175,3 +176,15 @@ def written(folder):
     for name, content in files.values():
         (folder / name).write_bytes(content)
     return {kind: folder / name for kind, (name, _) in files.items()}
+
+
+K = np.array([[610.0, 0, 321.5], [0, 612.0, 238.25], [0, 0, 1]])
+R, T = cv2.Rodrigues(np.array([0.02, -0.08, 0.03]))[0], np.array([[-0.12], [0.003], [0.01]])
+POINTS = np.random.default_rng(3).uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.9], (40, 3))
+
+
+def projected(rotation, translation, matrix, coefficients):
+    """OpenCV's projection, with pixels counted from the corner."""
+    vector = cv2.Rodrigues(np.asarray(rotation, dtype=float))[0]
+    pixels = cv2.projectPoints(POINTS, vector, np.asarray(translation, dtype=float), matrix, coefficients)[0]
+    return pixels[:, 0] + 0.5
