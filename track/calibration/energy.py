@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
-from handsim.hand.model import HandModel, skinned_jacobian
+from handsim.hand.model import NUM_VELOCITIES, HandModel, skinned_jacobian
 from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
@@ -167,11 +167,11 @@ class Problem:
         residuals = np.where(self.present[..., None], predicted - self.targets, 0.0)
         faces, count = self._all_coordinates(estimate).faces, len(estimate.points)
         corners = SkinPatch(faces).corners(model.surface.vertices)
-        _, normals = skin_points(estimate.coordinates, _part(corners, 0, count))
-        design, _ = skin_points(self.design, _part(corners, count, 2 * count))
+        _, normals = skin_points(estimate.coordinates, corners.part(0, count))
+        design, _ = skin_points(self.design, corners.part(count, 2 * count))
         geometry = None
         if estimate.contacts is not None:
-            pads = _part(corners, 2 * count, len(faces))
+            pads = corners.part(2 * count, len(faces))
             geometry = contact_geometry(estimate.contacts, pads, model, bones[estimate.contacts.frames])
         fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
         return fit._replace(cost=self._cost(estimate, fit))
@@ -180,7 +180,8 @@ class Problem:
         squares = (fit.residuals**2).sum(axis=2)
         cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
         cost += estimate.parameters @ self.precision @ estimate.parameters
-        cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
+        off = fit.design_residuals
+        cost += np.einsum("mi,mij,mj->", off, self._position_precision(fit), off)
         cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
@@ -190,11 +191,11 @@ class Problem:
             cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
-    def _apply_position_precision(self, fit: Fit, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """E_prior's precision matrix of each marker [1/m^2] times vectors (M, 3)."""
-        along = (vectors * fit.normals).sum(axis=1, keepdims=True) * fit.normals
-        product: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
-        return product / self.position_spread**2
+    def _position_precision(self, fit: Fit) -> NDArray[np.float64]:
+        """E_prior's precision matrix of each marker (M, 3, 3) [1/m^2]."""
+        normal = fit.normals[:, :, None] * fit.normals[:, None]
+        precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
+        return precision / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Joint angles (F, 20) [rad] beyond their limits, and from the mean of gestures."""
@@ -208,32 +209,43 @@ class Problem:
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._all_coordinates(estimate).faces)
-        corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        bone_weights = skin_weights(estimate.coordinates)
-        by_pose, by_shape, by_point, by_bone = self._point_jacobians(
-            fit, estimate, slice(None), estimate.points, bone_weights, rest[:count]
+        corners, rest = patch.corners(skin).part(0, count), self._rest_jacobian(estimate, patch, skin)
+        # A frame has a row for each coordinate of a marker, and the last one for the gap of its contact.
+        by_pose = np.zeros((frames, 3 * count + 1, NUM_VELOCITIES))
+        by_shared = np.zeros((frames, 3 * count + 1, NUM_PARAMETERS + 3 * count))
+        residuals, precision = np.zeros((2, frames, 3 * count + 1))
+        poses, shapes, by_point, by_bone = self._point_jacobians(
+            fit, estimate, slice(None), estimate.points, skin_weights(estimate.coordinates), rest[:count]
         )
-        weight_jacobian = skin_weight_jacobian(estimate.coordinates, _part(corners, 0, count))
+        weight_jacobian = skin_weight_jacobian(estimate.coordinates, corners)
         by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
-        by_marker = np.zeros((frames, count, 3, count, 3))
+        by_pose[:, :-1] = poses.reshape(frames, 3 * count, -1)
+        by_shared[:, :-1, :NUM_PARAMETERS] = shapes.reshape(frames, 3 * count, -1)
+        by_marker = by_shared[:, :-1, NUM_PARAMETERS:].reshape(frames, count, 3, count, 3)
         by_marker[:, np.arange(count), :, np.arange(count)] = by_point.swapaxes(0, 1)
-        by_pose = by_pose.reshape(frames, 3 * count, -1)
-        by_shared = np.concatenate([by_shape, by_marker.reshape(frames, count, 3, -1)], axis=-1)
-        by_shared = by_shared.reshape(frames, 3 * count, -1)
+        residuals[:, :-1] = fit.residuals.reshape(frames, -1)
         squares = (fit.residuals**2).sum(axis=2)
         weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
-        rows = np.repeat(weights, 3, axis=1)[..., None]
-        residual = fit.residuals.reshape(len(fit.residuals), -1, 1)
-        pose = by_pose.swapaxes(1, 2) @ (rows * by_pose)
-        mixed = by_pose.swapaxes(1, 2) @ (rows * by_shared)
-        flat = (np.sqrt(rows) * by_shared).reshape(-1, by_shared.shape[2])
-        shared = flat.T @ flat
-        pose_gradient = (by_pose.swapaxes(1, 2) @ (rows * residual))[..., 0]
-        shared_gradient = np.einsum("fns,fn->s", by_shared, (rows * residual)[..., 0])
-        result = NormalEquations(pose, mixed, shared, pose_gradient, shared_gradient)
+        precision[:, :-1] = np.repeat(weights, 3, axis=1)
+        contacts, geometry = estimate.contacts, fit.geometry
+        if contacts is not None and geometry is not None:
+            at = contacts.frames, -1
+            by_pose[at], by_shared[*at, :NUM_PARAMETERS] = self._gap_jacobians(
+                estimate, fit, contacts, geometry, rest[2 * count :]
+            )
+            residuals[at] = geometry.gaps
+            precision[at] = contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2
+        root = np.sqrt(precision)[..., None]
+        by_pose, by_shared, residuals = root * by_pose, root * by_shared, root[..., 0] * residuals
+        transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
+        result = NormalEquations(
+            transposed @ by_pose,
+            transposed @ by_shared,
+            flat.T @ flat,
+            (transposed @ residuals[..., None])[..., 0],
+            residuals.ravel() @ flat,
+        )
         self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
-        if estimate.contacts is not None and fit.geometry is not None:
-            self._add_contacts(estimate, fit, rest[2 * count :], result)
         return result
 
     def _rest_jacobian(
@@ -260,64 +272,49 @@ class Problem:
         """Skin coordinates of the markers, of their design, and of compressed pads at the contacts."""
         parts = [estimate.coordinates, self.design]
         if estimate.contacts is not None:
-            parts += [
-                side._replace(heights=np.full(len(estimate.contacts.frames), -PAD_COMPRESSION))
-                for side in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates)
-            ]
+            pads = estimate.contacts.pads
+            parts.append(pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION)))
         return SkinCoordinates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     def _add_priors(
         self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
     ) -> None:
         """Add the priors; `design_jacobian` (M, 3, 53): marker minus design, at fixed skin coordinates."""
-        count = len(estimate.points)
-        first = NUM_PARAMETERS
+        first, count = NUM_PARAMETERS, len(estimate.points)
+        by_marker = np.eye(3 * count).reshape(count, 3, -1)
         result.shared[:first, :first] += self.precision
         result.shared_gradient[:first] += self.precision @ estimate.parameters
-        jacobian = np.concatenate([design_jacobian, np.zeros((count, 3, 3 * count))], axis=2)
-        heights = np.zeros((count, result.shared.shape[0]))
-        for marker in range(count):
-            mine = slice(first + 3 * marker, first + 3 * marker + 3)
-            jacobian[marker, :, mine] = np.eye(3)
-            heights[marker, mine] = fit.normals[marker]
-        columns = [self._apply_position_precision(fit, jacobian[..., s]) for s in range(jacobian.shape[2])]
-        weighted = np.stack(columns, axis=-1)
+        jacobian = np.concatenate([design_jacobian, by_marker], axis=2)
+        weighted = self._position_precision(fit) @ jacobian
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
-        result.shared[:] += heights.T @ heights / self.height_spread**2
-        result.shared_gradient[:] += (
-            (estimate.coordinates.heights - self.heights) @ heights / self.height_spread**2
-        )
+        lifts, higher = np.einsum("mi,mis->ms", fit.normals, by_marker), estimate.coordinates.heights
+        result.shared[first:, first:] += lifts.T @ lifts / self.height_spread**2
+        result.shared_gradient[first:] += (higher - self.heights) @ lifts / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         result.pose[:, 6:, 6:] += self._pose_precision
         angles = np.arange(6, 26)
         result.pose[:, angles, angles] += (beyond != 0.0) / _LIMIT_SPREAD**2
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
-    def _add_contacts(
-        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64], result: NormalEquations
-    ) -> None:
-        """Add each contact's gap; `rest` (2 K, 3, 53): jacobian of the pads' rest points."""
-        contacts, geometry = estimate.contacts, fit.geometry
-        assert contacts is not None
-        assert geometry is not None
-        frames, rows, count = contacts.frames, np.arange(len(contacts.frames)), len(contacts.frames)
-        coordinates = self._all_coordinates(estimate)
-        pads = SkinCoordinates(*(values[len(values) - 2 * count :] for values in coordinates))
+    def _gap_jacobians(
+        self,
+        estimate: Estimate,
+        fit: Fit,
+        contacts: Contacts,
+        geometry: ContactGeometry,
+        rest: NDArray[np.float64],
+    ) -> list[NDArray[np.float64]]:
+        """Jacobians of the gaps by poses (K, 26) and parameters (K, 53), given those of points at rest."""
+        count = len(contacts.frames)
+        rows, coordinates = np.arange(count), self._all_coordinates(estimate)
+        pads = coordinates.part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        jacobians = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
-        pose, shape = (
-            np.einsum("ki,kis->ks", geometry.directions, by[rows, count + rows] - by[rows, rows])
-            for by in jacobians[:2]
-        )
-        shared = np.pad(shape, ((0, 0), (0, result.shared.shape[0] - NUM_PARAMETERS)))
-        precision = (contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2)[:, None]
-        pull = precision * geometry.gaps[:, None]
-        np.add.at(result.pose, frames, (precision * pose)[:, :, None] * pose[:, None])
-        np.add.at(result.mixed, frames, (precision * pose)[:, :, None] * shared[:, None])
-        np.add.at(result.pose_gradient, frames, pull * pose)
-        result.shared[:] += shared.T @ (precision * shared)
-        result.shared_gradient[:] += (pull * shared).sum(axis=0)
+        by = self._point_jacobians(fit, estimate, contacts.frames, points, skin_weights(pads), rest)
+        return [
+            np.einsum("ki,kis->ks", geometry.directions, one[rows, count + rows] - one[rows, rows])
+            for one in by[:2]
+        ]
 
     def _point_jacobians(
         self,
@@ -352,17 +349,12 @@ class Problem:
         )
 
 
-def _part(corners: Corners, first: int, last: int) -> Corners:
-    return Corners(corners.points[first:last], corners.normals[first:last])
-
-
 class Contacts(NamedTuple):
     """K contacts of the thumb, each in one frame, with a point on either pad."""
 
     frames: Int[np.ndarray, "K"]
     fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
-    thumb_coordinates: SkinCoordinates
-    finger_coordinates: SkinCoordinates
+    pads: SkinCoordinates  # points on the thumb, then those on the fingers
 
 
 class ContactGeometry(NamedTuple):
@@ -432,10 +424,11 @@ def initialize_contacts(
             bone = bones_of(digit)[2]
             local = np.linalg.inv(T_world_bone[number, bone]) @ np.append(ends[part], 1.0)
             points[part, number] = (model.rest_transforms[bone] @ local)[:3]
-    sides = [nearest_coordinates(side, model.shape)._replace(heights=np.zeros(len(side))) for side in points]
+    pads = nearest_coordinates(points.reshape(-1, 3), model.shape)
+    pads = pads._replace(heights=np.zeros(len(pads.faces)))
     frames = np.array([frame for frame, _ in touches], dtype=np.int64)
     fingers = np.array([DIGITS.index(finger) for _, finger in touches], dtype=np.int64)
-    return slide_contacts(Contacts(frames, fingers, *sides), model, T_world_bone)
+    return slide_contacts(Contacts(frames, fingers, pads), model, T_world_bone)
 
 
 def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray[np.float64]:
@@ -461,55 +454,42 @@ def slide_contacts(
     """Slide the contact points on the skin to where thumb and finger come nearest."""
     # Each moves to where its skin is nearest to a target inside the other pad. A target on the other skin
     # would fail where the skins overlap.
-    skin = build_skin(model.shape)
-    sides = [contacts.thumb_coordinates, contacts.finger_coordinates]
+    skin, count = build_skin(model.shape), len(contacts.frames)
+    sides = [contacts.pads.part(0, count), contacts.pads.part(count, None)]
     for _ in range(_SLIDE_ROUNDS):
         for own, other in ((0, 1), (1, 0)):
-            inner = sides[other]._replace(heights=np.full(len(contacts.frames), -_PAD_DEPTH))
+            inner = sides[other]._replace(heights=np.full(count, -_PAD_DEPTH))
             points, _ = skin_points(inner, skin.corners(inner.faces))
             blend = _blend_transforms(inner, model, T_world_bone)
             target = np.einsum("kij,kj->ki", blend[:, :, :3], points) + blend[:, :, 3]
             blend = _blend_transforms(sides[own], model, T_world_bone)
             rest = np.linalg.solve(blend[:, :, :3], (target - blend[:, :, 3])[..., None])[..., 0]
             slid = project_onto_skin(sides[own], rest, skin)
-            sides[own] = slid._replace(heights=np.zeros(len(contacts.frames)))
-    return contacts._replace(thumb_coordinates=sides[0], finger_coordinates=sides[1])
+            sides[own] = slid._replace(heights=np.zeros(count))
+    return contacts._replace(pads=SkinCoordinates(*map(np.concatenate, zip(*sides, strict=True))))
 
 
 def contact_geometry(
     contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> ContactGeometry:
     """How the pads lie to each other."""
-    count = len(contacts.frames)
-    points, normals = [], []
-    for part, coordinates in enumerate((contacts.thumb_coordinates, contacts.finger_coordinates)):
-        mine = slice(part * count, (part + 1) * count)
-        rest, normal = skin_points(coordinates, Corners(corners.points[mine], corners.normals[mine]))
-        blend = _blend_transforms(coordinates, model, T_world_bone)
-        points.append(np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3])
-        normals.append(np.einsum("kij,kj->ki", blend[:, :, :3], normal))
+    rest, rest_normals = skin_points(contacts.pads, corners)
+    blend = _blend_transforms(contacts.pads, model, np.concatenate([T_world_bone, T_world_bone]))
+    points = (np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]).reshape(2, -1, 3)
+    normals = np.einsum("kij,kj->ki", blend[:, :, :3], rest_normals).reshape(2, -1, 3)
     direction = normals[0] - normals[1]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     offset = points[1] - points[0]
     along = (offset * direction).sum(axis=1)
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
-    normals = [normal / np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
-    facing = (
-        ((normals[0] * normals[1]).sum(axis=1) < _FACING_COSINE)
-        & (across < _MOST_PAD_OFFSET)
-        & _on_tips(contacts)
-    )
-    return ContactGeometry(direction, along + 2.0 * PAD_COMPRESSION, facing)
-
-
-def _on_tips(contacts: Contacts) -> NDArray[np.bool_]:
-    """Whether both points are on last bones and have not slid away (K,)."""
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    # Both points are on last bones, and have not slid away.
     last = np.array([bones_of(digit)[2] for digit in DIGITS])
-    rows = np.arange(len(contacts.frames))
-    thumb = skin_weights(contacts.thumb_coordinates)[:, last[0]]
-    finger = skin_weights(contacts.finger_coordinates)[rows, last[contacts.fingers]]
-    tips: NDArray[np.bool_] = np.minimum(thumb, finger) > 0.5
-    return tips
+    bones = np.append(np.full(len(offset), last[0]), last[contacts.fingers])
+    on_tips = (skin_weights(contacts.pads)[np.arange(len(bones)), bones] > 0.5).reshape(2, -1).all(axis=0)
+    facing = (normals[0] * normals[1]).sum(axis=1) < _FACING_COSINE
+    facing &= (across < _MOST_PAD_OFFSET) & on_tips
+    return ContactGeometry(direction, along + 2.0 * PAD_COMPRESSION, facing)
 
 
 def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
@@ -542,10 +522,17 @@ def levenberg_marquardt(
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
     """Minimize until a step gains less than a share, or step `most`; with the last step's number."""
-    fit, damping, better = problem.fit(estimate), _FIRST_DAMPING, True
-    while better and steps < most:
-        before = fit.cost
-        estimate, fit, damping, better = _step(problem, estimate, fit, damping)
+    fit, damping = problem.fit(estimate), _FIRST_DAMPING
+    while steps < most:
+        before, equations = fit.cost, problem.normal_equations(estimate, fit)
+        for _ in range(_MOST_DAMPING_TRIALS):
+            trial = problem.apply_step(estimate, *_damped_step(equations, damping))
+            trial_fit = problem.fit(trial)
+            if trial_fit.cost < before:
+                estimate, fit = _with_slid_contacts(problem, trial, trial_fit)
+                damping = max(_DAMPING_CUT * damping, _LEAST_DAMPING)
+                break
+            damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
         steps += 1
         if progress is not None:
             progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
@@ -595,28 +582,14 @@ def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[n
     return np.linalg.inv(reduced[:, :-1])
 
 
-def _step(
-    problem: Problem, estimate: Estimate, fit: Fit, damping: float
-) -> tuple[Estimate, Fit, float, bool]:
-    """One step: the new estimate, its fit, the next damping, and whether the energy fell."""
-    equations = problem.normal_equations(estimate, fit)
-    for _ in range(_MOST_DAMPING_TRIALS):
-        reduced, solved = eliminate_poses(equations, damping)
-        system, gradient = reduced[:, :-1].copy(), reduced[:, -1]
-        diagonal = np.arange(len(system))
-        system[diagonal, diagonal] += damping * equations.shared[diagonal, diagonal]
-        shared = -np.linalg.solve(system, gradient)
-        poses = -solved[..., -1] - solved[..., :-1] @ shared
-        trial = problem.apply_step(estimate, poses, shared)
-        trial_fit = problem.fit(trial)
-        if trial_fit.cost < fit.cost:
-            return (
-                *_with_slid_contacts(problem, trial, trial_fit),
-                max(_DAMPING_CUT * damping, _LEAST_DAMPING),
-                True,
-            )
-        damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
-    return estimate, fit, damping, False
+def _damped_step(
+    equations: NormalEquations, damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The step of the poses (F, 26) and that of the shared unknowns (S,)."""
+    reduced, solved = eliminate_poses(equations, damping)
+    system = reduced[:, :-1] + np.diag(damping * equations.shared.diagonal())
+    shared = -np.linalg.solve(system, reduced[:, -1])
+    return -solved[..., -1] - solved[..., :-1] @ shared, shared
 
 
 def _with_slid_contacts(problem: Problem, estimate: Estimate, fit: Fit) -> tuple[Estimate, Fit]:

@@ -126,7 +126,6 @@ class SkinTopology(NamedTuple):
     subdivide: sparse.csr_array  # matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
     adjacent: Int[np.ndarray, "F 3"]  # the triangle beyond the edge opposite to each corner
-    vertex_faces: Int[np.ndarray, "V A"]  # triangles at each vertex, the last one repeated
     weights: Float[np.ndarray, "V 16"]  # skinning weights of all bones
 
 
@@ -137,12 +136,20 @@ class SkinCoordinates(NamedTuple):
     bary: Float[np.ndarray, "P 3"]  # barycentric coordinates of the foot points
     heights: Float[np.ndarray, "P"]  # above the skin, along the normal [m]
 
+    def part(self, first: int, last: int | None) -> SkinCoordinates:
+        """Those of some of the points."""
+        return SkinCoordinates(*(values[first:last] for values in self))
+
 
 class Corners(NamedTuple):
     """Corners of some triangles on one hand's skin."""
 
     points: Float[np.ndarray, "P 3 3"]  # in the wrist's frame [m]
     normals: Float[np.ndarray, "P 3 3"]  # unit vertex normals
+
+    def part(self, first: int, last: int) -> Corners:
+        """Those of some of the triangles."""
+        return Corners(self.points[first:last], self.normals[first:last])
 
 
 class Skin(NamedTuple):
@@ -168,9 +175,7 @@ def skin_mesh() -> SkinTopology:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     weights = np.zeros((len(coarse.vertices), NUM_BONES))
     np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
-    return SkinTopology(
-        step, faces, _adjacent_faces(faces), _vertex_faces(faces, step.shape[0]), step @ weights
-    )
+    return SkinTopology(step, faces, _adjacent_faces(faces), step @ weights)
 
 
 def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -183,23 +188,12 @@ def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return neighbors.reshape(faces.shape)
 
 
-def _vertex_faces(faces: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Triangles (V, A) at each of `count` vertices, the last one repeated."""
-    vertex, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    order = np.argsort(vertex, kind="stable")
-    number = np.bincount(vertex, minlength=count)
-    first = np.cumsum(number) - number
-    slots = np.minimum(np.arange(number.max()), number[:, None] - 1)
-    vertex_faces: NDArray[np.int64] = face[order][first[:, None] + slots]
-    return vertex_faces
-
-
 class SkinPatch:
     """The part of the skin that determines some triangles of `skin_mesh`, for any shape."""
 
     def __init__(self, faces: Int[np.ndarray, "P"]) -> None:
         mesh = skin_mesh()
-        needed = np.unique(mesh.vertex_faces[mesh.faces[faces]])
+        needed = np.isin(mesh.faces, mesh.faces[faces]).any(axis=1)  # the triangles around a vertex
         vertices, local = np.unique(mesh.faces[needed], return_inverse=True)
         self._rows = mesh.subdivide[vertices]
         self._faces = local.reshape(-1, 3)
@@ -244,20 +238,6 @@ def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: Han
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     shares = np.clip(np.take_along_axis(weights, bones, axis=1), 0.0, None)
     return Attachment(layout, points, normals, bones, shares / shares.sum(axis=1, keepdims=True))
-
-
-def displace_markers(
-    worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
-) -> Attachment:
-    """A glove on a right hand with every marker displaced along the skin, as on a real glove."""
-    steps = rng.normal(size=worn.points.shape)
-    steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
-    steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)
-    coordinates = project_onto_skin(
-        nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
-    )
-    heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
-    return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)
 
 
 def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Float[np.ndarray, "P 16 3"]:

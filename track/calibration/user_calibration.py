@@ -297,13 +297,9 @@ def _touches(
     if estimate.contacts is None or fit.geometry is None:
         return ()
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-    sides: list[NDArray[np.float64]] = []
-    for coordinates in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates):
-        sides.append(
-            skin_points(coordinates, SkinPatch(coordinates.faces).corners(fit.model.surface.vertices))[0]
-            @ mirror
-        )
-    points, after = np.stack(sides, axis=1), fit.geometry.gaps
+    pads, after = estimate.contacts.pads, fit.geometry.gaps
+    ends, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
+    points = (ends @ mirror).reshape(2, -1, 3).swapaxes(0, 1)
     return tuple(
         Touch(int(frames[frame]), finger, float(before[k]), float(after[k]), float(weights[k]), points[k])
         for k, (frame, finger) in enumerate(touches)
@@ -456,8 +452,8 @@ def contact_gaps(
     """Gaps between thumb and finger (K,) [m] of touches on a right hand, in the poses (K, 27) of each."""
     bones = model.forward_kinematics(qpos)
     contacts = initialize_contacts(model, touches, bones)
-    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
-    return contact_geometry(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
+    corners = SkinPatch(contacts.pads.faces).corners(model.surface.vertices)
+    return contact_geometry(contacts, corners, model, bones).gaps
 
 
 def still_joints(
