@@ -311,8 +311,7 @@ class _Fit(NamedTuple):
     """Number of frames in which each hand is found."""
     shown: int = 0  # number of frames in which any hand is found
     is_good: bool = False  # whether the hands fit well enough not to look for others
-    is_whole: bool = False
-    """Whether each marker is seen at times; otherwise the glove worn may have fewer markers."""
+    is_whole: bool = False  # whether each marker is seen at times; if not, the glove may have fewer
 
 
 class _Other(NamedTuple):

@@ -30,8 +30,7 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_prior
 
-IMPOSSIBLE: Final = 1e9
-"""Minus the score of a hypothesis that is excluded."""
+IMPOSSIBLE: Final = 1e9  # minus the score of a hypothesis that is excluded
 _ANGLES_PER_HINGE: Final = 5  # angles of each hinge at which distances are taken
 _LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
 _PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
@@ -54,18 +53,15 @@ class DigitModel(NamedTuple):
     joint_prior: JointPrior  # distribution of the hand's hinges before the frame's markers were used
     predicted: MarkerPrediction  # the hand as fitted to the labels so far
     variance: Float[np.ndarray, "M"]  # variance of each marker around its position [m^2]
-    peak_log_odds: Float[np.ndarray, "M"]
-    """Log-odds of a point exactly at the predicted position of each marker."""
-    slack: Float[np.ndarray, "M"]
-    """Distance by which each marker may be off its position on the hand of the ranges [m]."""
+    peak_log_odds: Float[np.ndarray, "M"]  # of a point exactly at the predicted position of each marker
+    slack: Float[np.ndarray, "M"]  # by which each marker may be off its place on the hand of the ranges [m]
     ranges: DigitRanges  # distances between markers of a digit over all poses
 
 
 class DigitHypotheses(NamedTuple):
     """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
 
-    scores: Float[np.ndarray, "*D S"]
-    """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
+    scores: Float[np.ndarray, "*D S"]  # log-odds against all points being strays; `-IMPOSSIBLE` if excluded
     runners_up: Float[np.ndarray, "*D S"]  # the same of the next best assignment of the same points
     assignments: Int[np.ndarray, "*D S K"]  # candidate of each of the digit's markers, -1 for none
 

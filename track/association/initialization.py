@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS
-from handsim.kernels import kernel, squared_distance
 from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
@@ -27,13 +27,11 @@ from track.kinematics.pose_solver import PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
-MOST_POINTS: Final = 100
-"""Largest number of points of a group that may be a hand."""
+MOST_POINTS: Final = 100  # largest number of points of a group that may be a hand
 _LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
 _LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand are linked
 _LEAST_LABELED_SHARE: Final = 0.45  # of a hand's markers that must be labeled
-FEWEST_POINTS: Final = 4
-"""Least number of labeled points of a hand; a pose needs as many."""
+FEWEST_POINTS: Final = 4  # least number of labeled points of a hand; a pose needs as many
 SPARE_POINTS: Final = 6
 """Points beyond a hand's markers from which on a group may be two hands that touch, at most."""
 _SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few markers mislead the labeler
@@ -130,7 +128,7 @@ class HandInitializer:
         initialized: list[InitializedHand] = []
         cut = False
         least = min((self._least(index) for index in hands), default=0)
-        for group in linked_groups(np.ascontiguousarray(points), self._link_distance):
+        for group in linked_groups(points, self._link_distance):
             if not least <= len(group) <= MOST_POINTS:
                 continue
             done = {hand.index for hand in initialized}
@@ -411,8 +409,7 @@ def _link_distance(hand: GloveFit) -> float:
 class FrameLabels(NamedTuple):
     """Labels of a frame's points."""
 
-    labels: Int[np.ndarray, "N"]
-    """Marker of each point, counted through the hands in their order; -1 for none."""
+    labels: Int[np.ndarray, "N"]  # marker of each point, counted through the hands; -1 for none
     confidence: Float[np.ndarray, "N"]  # confidence in each label, 0 to 1
 
 
@@ -464,8 +461,10 @@ def _clouds(
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
     """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
-    number = _single_linkage(points, distance)
-    groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
+    number = np.zeros(len(points), dtype=np.int64)
+    if len(points) > 1:
+        number = fcluster(linkage(points, "single"), distance, "distance")
+    groups = [np.flatnonzero(number == one) for one in dict.fromkeys(number)]
     return sorted(groups, key=len, reverse=True)
 
 
@@ -477,48 +476,6 @@ def distances_to_nearest(
     return distances
 
 
-@kernel
-def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np.ndarray, "N"]:
-    """Number of the group of each point."""
-    number = np.full(len(points), -1)
-    stack = np.zeros(len(points), dtype=np.int64)
-    groups = 0
-    for first in range(len(points)):
-        if number[first] >= 0:
-            continue
-        number[first], stack[0], height = groups, first, 1
-        while height > 0:
-            height -= 1
-            here = stack[height]
-            for other in range(len(points)):
-                if number[other] >= 0:
-                    continue
-                if squared_distance(points[here], points[other]) <= distance**2:
-                    number[other] = groups
-                    stack[height] = other
-                    height += 1
-        groups += 1
-    return number
-
-
-@kernel
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
-    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
-    longest = np.zeros(len(points))
-    for frame in range(len(points)):
-        nearest = np.full(points.shape[1], np.inf)
-        added = 0
-        for _ in range(1, points.shape[1]):
-            nearest[added] = -1.0  # is in the tree
-            least, following = np.inf, added
-            for other in range(points.shape[1]):
-                if nearest[other] < 0.0:
-                    continue
-                square = squared_distance(points[frame, other], points[frame, added])
-                nearest[other] = min(nearest[other], square)
-                if nearest[other] < least:
-                    least, following = nearest[other], other
-            longest[frame] = max(longest[frame], least)
-            added = following
-        longest[frame] = np.sqrt(longest[frame])
-    return longest
+    """The least distance at which the points of each frame are linked to one group [m]."""
+    return np.array([linkage(frame, "single")[-1, 2] for frame in points])

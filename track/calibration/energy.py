@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
-from handsim.hand.model import NUM_VELOCITIES, HandModel, skinned_jacobian
+from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
 from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
@@ -52,14 +52,12 @@ ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 POSITION_SPREAD: Final = 0.002
 """Standard deviation of a marker's slip along the skin [m], to begin with; (noise / spread)^2 is the paper's
 lambda_1."""
-HEIGHT_SPREAD: Final = 0.0005
-"""The same of a marker center's height around that of the design [m]."""
+HEIGHT_SPREAD: Final = 0.0005  # the same of a marker center's height around that of the design [m]
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
-RELINEARIZE: Final = 0.005
-"""Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
+RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
 """Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
@@ -80,8 +78,7 @@ _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors of the damping after a failed step and a good one
 _LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
-SMALL_GAIN: Final = 1e-4
-"""Share of the energy; a step that gains less is the last one."""
+SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +86,7 @@ class Estimate:
     """All unknowns of a calibration at one iteration."""
 
     parameters: Float[np.ndarray, "53"]  # hand shape, see `hand_parameters`
-    points: Float[np.ndarray, "M 3"]
-    """Marker centers on the rest hand of this shape, in the wrist's frame [m]."""
+    points: Float[np.ndarray, "M 3"]  # marker centers on the rest hand, in the wrist's frame [m]
     coordinates: SkinCoordinates  # the same points in coordinates of its skin
     qpos: Float[np.ndarray, "F 27"]
     contacts: Contacts | None = None  # their frames count in `qpos`
@@ -102,8 +98,7 @@ class Fit(NamedTuple):
     model: HandModel
     bones: Float[np.ndarray, "F L 4 4"]  # `T_world_bone` in every frame
     residuals: Float[np.ndarray, "F M 3"]  # model minus marker [m], zero where a marker is missing
-    design_residuals: Float[np.ndarray, "M 3"]
-    """Marker minus its position by the glove's design on this hand, in the wrist's frame [m]."""
+    design_residuals: Float[np.ndarray, "M 3"]  # marker minus its designed position, in the wrist's frame [m]
     normals: Float[np.ndarray, "M 3"]  # unit normals of the rest skin under the markers
     geometry: ContactGeometry | None  # how the pads of the contacts lie to each other
     cost: float
@@ -361,8 +356,7 @@ class ContactGeometry(NamedTuple):
     """How the pads of K contacts lie to each other in the world."""
 
     directions: Float[np.ndarray, "K 3"]  # unit vectors from thumb to finger
-    gaps: Float[np.ndarray, "K"]
-    """Distance of the pads, both compressed by `PAD_COMPRESSION` [m]; negative where they press harder."""
+    gaps: Float[np.ndarray, "K"]  # distance of the compressed pads [m]; negative where they press harder
     facing: Bool[np.ndarray, "K"]  # whether the points are on the last bones and face each other
 
 
@@ -400,9 +394,7 @@ def _speed(
     model: HandModel, angles: NDArray[np.float64], finger: str, window: int, rate: float
 ) -> NDArray[np.float64]:
     """Speed of the finger's tip in the frame of the thumb's last bone (T,) [m/s]."""
-    qpos = np.zeros((len(angles), 27))
-    qpos[:, 3], qpos[:, 7:] = 1.0, angles
-    bones = model.forward_kinematics(qpos)
+    bones = model.forward_kinematics(join_qpos(angles))
     thumb, other = bones_of("thumb")[2], bones_of(finger)[2]
     tip = bones[:, other, :3, 3] + model.skeleton.lengths[other] * bones[:, other, :3, 0]
     position = np.einsum("tji,tj->ti", bones[:, thumb, :3, :3], tip - bones[:, thumb, :3, 3])

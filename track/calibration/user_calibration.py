@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
@@ -51,21 +51,18 @@ from track.calibration.hand_parameters import (
     skin_points,
     skin_weights,
 )
-from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_solver import PoseFit, PoseSolver
 
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
-MOST_STEPS: Final = 30
-"""Steps in all, at most."""
+MOST_STEPS: Final = 30  # steps in all, at most
 _SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
 _BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
 _SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
-NUM_FRAMES: Final = 240
-"""Frames that a calibration is solved on."""
-FEWEST_FRAMES: Final = 100
-"""Usable frames without which a capture is refused."""
+NUM_FRAMES: Final = 240  # frames that a calibration is solved on
+FEWEST_FRAMES: Final = 100  # usable frames without which a capture is refused
 _INITIAL_FRAMES: Final = 800
 _FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
 _LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
@@ -199,27 +196,28 @@ def calibrate_hand(
     mirror = MIRROR if start.side == "left" else np.eye(3)
     markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
-    complete = complete_digits(markers, right.attachment)
+    seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)
     # Poses of frames spread over the capture, on the hand that the calibration begins with.
-    track = solve_frames(markers, right, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
-    problem, estimate = _initial_problem(markers, right, track)
+    some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
+    track = PoseSolver(right).solve(some)
+    problem, estimate = _initial_problem(some, right, track)
     # Distant markers lose their weight only when the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
     rough = user_hand(right, problem, estimate)
-    rough_track = solve_frames(markers, rough, usable)
-    touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
-    problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
+    rough_track = PoseSolver(rough).solve(seen)
+    touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
+    problem, estimate = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
         learn_spreads(problem, estimate, problem.fit(estimate))
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)
     before = np.empty(0)
     if touches:
-        touching = usable[[frame for frame, _ in touches]]
-        before = contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
-    final = solve_frames(markers, done, usable, rough_track.qpos)
+        touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
+        before = contact_gaps(right.model, touches, touching.qpos)
+    final = PoseSolver(done).solve(seen, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
         hand=done.with_side(start.side),
@@ -229,13 +227,13 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        touches=_touches(estimate, fit, touches, rough_track.frames, before, mirror),
-        still_joints=still_joints(final.qpos[:, 7:], complete[usable], done.model),
+        touches=_touches(estimate, fit, touches, usable, before, mirror),
+        still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
 
 
 def _initial_problem(
-    markers: NDArray[np.float64], right: GloveFit, track: PoseTrack
+    markers: NDArray[np.float64], right: GloveFit, track: PoseFit
 ) -> tuple[Problem, Estimate]:
     """The problem without contacts, and the estimate that the first poses give."""
     chosen = informative_frames(track, markers)
@@ -245,7 +243,7 @@ def _initial_problem(
         shape,
         coordinates,
         worn.layout.heights,
-        markers[track.frames[chosen]],
+        markers[chosen],
         noise=_FIRST_NOISE,
         robust_scale=_FIRST_SCALE,
     )
@@ -257,7 +255,7 @@ def _with_touches(
     estimate: Estimate,
     fit: Fit,
     markers: NDArray[np.float64],
-    track: PoseTrack,
+    track: PoseFit,
     touches: list[tuple[int, str]],
 ) -> tuple[Problem, Estimate]:
     """The problem with the frames of the touches, at the noise of the first fit."""
@@ -272,7 +270,7 @@ def _with_touches(
         problem.shape,
         problem.design,
         problem.heights,
-        markers[track.frames[frames]],
+        markers[frames],
         noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
     )
@@ -306,15 +304,6 @@ def _touches(
     )
 
 
-class PoseTrack(NamedTuple):
-    """Poses of K frames of a capture."""
-
-    frames: Int[np.ndarray, "K"]  # their numbers in the capture
-    qpos: Float[np.ndarray, "K 27"]
-    rms: Float[np.ndarray, "K"]  # 3D RMS distance of the markers from the model's [m]
-    residuals: Float[np.ndarray, "K M 3"]  # model minus marker [m], NaN where a marker is missing
-
-
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
     """Numbers of the frames with enough markers for a pose."""
     count = markers.shape[1]
@@ -328,17 +317,6 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
     return usable
 
 
-def solve_frames(
-    markers: Float[np.ndarray, "T M 3"],
-    hand: GloveFit,
-    frames: NDArray[np.int64],
-    initial: NDArray[np.float64] | None = None,
-) -> PoseTrack:
-    """Solve the poses of frames by their numbers, from initial poses (K, 27) if there are any."""
-    solved = PoseSolver(hand).solve(markers[frames], initial)
-    return PoseTrack(frames, solved.qpos, solved.rms, solved.residuals)
-
-
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
     """Whether all markers of a digit are seen."""
     present = np.isfinite(markers[..., 0])
@@ -346,9 +324,9 @@ def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment)
     return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
-def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
+def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
     """Indices into a track of well fitted frames, poses as different and complete as possible."""
-    missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
+    missing = np.isnan(markers[..., 0]).sum(axis=1)
     well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
         candidates = np.flatnonzero((missing <= allowed) & well_fitted)

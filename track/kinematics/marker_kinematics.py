@@ -40,15 +40,12 @@ class HandArrays(NamedTuple):
     rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all hinges at zero
     axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge in the frame of its bone
     ranges: Float[np.ndarray, "J 2"]  # lower and upper limit of each hinge [rad]
-    bones: Int[np.ndarray, "M 4"]
-    """The bones that carry each marker, largest weight first; -1 where there is no further one."""
+    bones: Int[np.ndarray, "M 4"]  # bones that carry each marker, largest weight first; -1 for none
     bone_weights: Float[np.ndarray, "M 4"]  # skinning weight of each of these bones; they sum to one
-    positions: Float[np.ndarray, "M 4 3"]
-    """Position of each marker in the frames of its bones [m], times the bone's weight."""
+    positions: Float[np.ndarray, "M 4 3"]  # each marker in the frames of its bones [m], times the weight
     digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
     hinge_span: Int[np.ndarray, "M 2"]  # first hinge that may move each marker, and the one after the last
-    skyline: Int[np.ndarray, "26"]
-    """Column of the first entry of each row of the normal matrix that can differ from zero."""
+    skyline: Int[np.ndarray, "26"]  # first column of each row of the normal matrix that can be nonzero
 
 
 class Workspace(NamedTuple):
@@ -57,14 +54,11 @@ class Workspace(NamedTuple):
     rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone
     origins: Float[np.ndarray, "L 3"]  # origin of each bone [m]
     axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge
-    bone_terms: Float[np.ndarray, "M 4 3"]
-    """Each bone's term of the weighted sum that is a marker's position [m]."""
+    bone_terms: Float[np.ndarray, "M 4 3"]  # each bone's term of the weighted sum that is a marker [m]
     markers: Float[np.ndarray, "M 3"]  # position of each marker [m]
-    residuals: Float[np.ndarray, "M 3"]
-    """Model marker minus target marker [m]; NaN where the target is missing."""
+    residuals: Float[np.ndarray, "M 3"]  # model minus target marker [m]; NaN where that is missing
     jacobian: Float[np.ndarray, "M 3 26"]  # derivatives of the markers by the unknowns [m/rad, m/m]
-    normal: Float[np.ndarray, "26 26"]
-    """Normal matrix, upper triangle; zero between digits that share no marker."""
+    normal: Float[np.ndarray, "26 26"]  # upper triangle; zero between digits that share no marker
     gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
     factor: Float[np.ndarray, "26 26"]  # room for a factor of the normal matrix
     step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
@@ -75,10 +69,8 @@ class PoseEnergy(NamedTuple):
 
     target: Float[np.ndarray, "M 3"]  # markers in the world [m]; NaN where missing
     prior_mean: Float[np.ndarray, "27"]  # mean of the prior, a pose
-    precision: Float[np.ndarray, "26"]
-    """Its diagonal precision, in the order of the unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none."""
-    robust_scale: float
-    """Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for least squares."""
+    precision: Float[np.ndarray, "26"]  # its precision by unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none
+    robust_scale: float  # inverse square distance where the robust loss levels off [1/m^2]; zero for none
 
 
 def hand_arrays(fit: GloveFit) -> HandArrays:

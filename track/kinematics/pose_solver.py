@@ -33,12 +33,10 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 
-FEWEST_MARKERS: Final = 4
-"""Least number of markers of a frame for a pose to be solved."""
+FEWEST_MARKERS: Final = 4  # least number of markers of a frame for a pose to be solved
 FEWEST_ON_PART: Final = 3
 """Markers that determine a digit's hinges, also when it is straight, or a palm's pose."""
-RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
-"""Hinge angles of a relaxed hand [rad]."""
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # hinge angles of a relaxed hand [rad]
 # Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
 # knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
 # finger, opposed, opposed and bent, across the palm.
@@ -76,8 +74,7 @@ class _StartingShapes(NamedTuple):
 
     angles: Float[np.ndarray, "K 20"]  # hinge angles [rad]
     markers: Float[np.ndarray, "K M 3"]  # markers in the wrist's frame [m]
-    weights: Float[np.ndarray, "M"]
-    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
+    weights: Float[np.ndarray, "M"]  # of each marker in aligning whole hands [1/m^2]: small if shapes differ
 
 
 class _PosePrior(NamedTuple):
@@ -175,10 +172,10 @@ class PoseSolver:
         small_gain: float,
     ) -> PoseFit:
         """Solve with the arrays of the kernel."""
-        scale, frames = self._robust_scale, (targets, starts, prior)
-        return PoseFit(
-            *_fit_frames(self.hand, self._shapes, self.on_part, *frames, scale, iterations, small_gain)
-        )
+        whole = np.isfinite(targets).all(axis=-1, keepdims=True)
+        frames = np.where(whole, targets, np.nan), starts, prior
+        steps = self._robust_scale, iterations, small_gain
+        return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, *frames, *steps))
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
@@ -250,11 +247,11 @@ def _fit_frames(
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
-    mean, precision, seen = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS), np.empty(len(on_part), dtype=np.int64)
-    work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
+    mean, precision = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS)
+    work, pose = workspace(count), np.empty(NUM_QPOS)
     for frame in range(frames):
-        present = _read_markers(hand.digits, targets[frame], target, seen)
-        _set_prior(seen, on_part, prior, frame, mean, precision)
+        target = targets[frame]
+        present = _set_prior(hand.digits, on_part, target, prior, frame, mean, precision)
         if len(initial) > 0:
             starts = initial[frame : frame + 1].copy()
             starts[0, 3:7] /= np.sqrt((starts[0, 3:7] ** 2).sum())
@@ -282,35 +279,20 @@ def _fit_frames(
 
 
 @kernel
-def _read_markers(
-    digits: Int[np.ndarray, "M"],
-    given: Float[np.ndarray, "M 3"],
-    target: Float[np.ndarray, "M 3"],
-    seen: Int[np.ndarray, "6"],
-) -> int:
-    """Copy a frame's complete markers, count those on each part in `seen`, and return how many there are."""
-    seen[:] = 0
-    present = 0
-    for marker in range(len(given)):
-        if np.isfinite(given[marker, 0] + given[marker, 1] + given[marker, 2]):
-            target[marker] = given[marker]
-            present += 1
-            seen[digits[marker]] += 1
-        else:
-            target[marker] = np.nan
-    return present
-
-
-@kernel
 def _set_prior(
-    seen: Int[np.ndarray, "6"],
+    digits: Int[np.ndarray, "M"],
     on_part: Int[np.ndarray, "6"],
+    target: Float[np.ndarray, "M 3"],
     prior: _PosePrior,
     frame: int,
     mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],
-) -> None:
-    """Fill mean and precision of the prior of one frame; see `PoseEnergy`."""
+) -> int:
+    """Fill the prior of a frame, see `PoseEnergy`; return how many markers it has, each complete or NaN."""
+    seen = np.zeros(len(on_part), dtype=np.int64)
+    for marker in range(len(target)):
+        if not np.isnan(target[marker, 0]):
+            seen[digits[marker]] += 1
     mean[:7] = prior.wrist[:7]
     incomplete = seen[-1] < max(on_part[-1], FEWEST_ON_PART)
     precision[NUM_JOINTS : NUM_JOINTS + 3] = prior.wrist[7] if incomplete else 0.0
@@ -324,6 +306,7 @@ def _set_prior(
             rest += (prior.angles[frame, hinge] - rest) * prior.precision[frame, hinge] / both
             weight = both
         mean[7 + hinge], precision[hinge] = rest, weight
+    return seen.sum()
 
 
 @kernel

@@ -87,18 +87,13 @@ class JointPrior(NamedTuple):
 class MarkerPrediction(NamedTuple):
     """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The pose; hinges of digits that lack markers are moved to the optimum of markers and prior."""
+    qpos: Float[np.ndarray, "27"]  # the pose; digits that lack markers at the optimum of markers and prior
     positions: Float[np.ndarray, "M 3"]  # markers in the world [m]
-    covariances: Float[np.ndarray, "M 3 3"]
-    """Covariance of each marker in the world [m^2]: that of the pose, and the marker's own variance."""
-    rotations: Float[np.ndarray, "M 3 3"]
-    """Rotation in the world of the bone with the largest weight of each marker."""
+    covariances: Float[np.ndarray, "M 3 3"]  # of each marker in the world [m^2]: the pose's and its own
+    rotations: Float[np.ndarray, "M 3 3"]  # in the world, of each marker's bone with the largest weight
     joint_covariance: Float[np.ndarray, "20 20"]  # covariance of the hinges [rad^2]
-    information_matrix: Float[np.ndarray, "20 20"]
-    """Information of the markers alone on the hinges, the palm being held [1/rad^2]."""
-    information_vector: Float[np.ndarray, "20"]
-    """The matrix times the angles that the markers alone would give [1/rad]."""
+    information_matrix: Float[np.ndarray, "20 20"]  # of the markers alone on hinges, the palm held [1/rad^2]
+    information_vector: Float[np.ndarray, "20"]  # the matrix times the angles by the markers alone [1/rad]
 
 
 class HandDoubt(NamedTuple):
@@ -109,11 +104,9 @@ class HandDoubt(NamedTuple):
     places: Float[np.ndarray, "M"]  # of each marker's place on its bone, in each direction [m]
     knuckles: Float[np.ndarray, "5"]  # of where each digit begins on the palm, in each direction [m]
     directions: Float[np.ndarray, "5 3"]  # of the way each digit points, about the axes of the palm [rad]
-    bones: Float[np.ndarray, "5 2"]
-    """Of the length of each bone of a digit, and of all of them together, logarithms."""
+    bones: Float[np.ndarray, "5 2"]  # of the length of each bone of a digit, and of all together, logarithms
     wrist: float  # of where the wrist is in the palm, which no marker shows, in each direction [m]
-    joints: Float[np.ndarray, "5 2"]
-    """Of where a digit's joints and its tip are, as far as no marker shows it, in each direction [m]."""
+    joints: Float[np.ndarray, "5 2"]  # of a digit's joints and tip, beyond what markers show, each way [m]
 
 
 class _Proportions(NamedTuple):
@@ -151,22 +144,11 @@ def predict_joints(
     """Prior of the hinges `span` seconds after they were estimated, near these predicted angles [rad]."""
     kept, resting = np.exp(-max(span, 0.0) / _JOINT_MEMORY), resting_prior()
     mean = angles + (1.0 - kept) * (resting.angles - angles)
-    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
-    _predict_covariance(covariance, resting.covariance, kept**2, prior)
-    return prior
-
-
-@kernel
-def _predict_covariance(
-    known: Float[np.ndarray, "20 20"], resting: Float[np.ndarray, "20 20"], kept: float, prior: JointPrior
-) -> None:
-    """Fill covariance and precision of a prior: a share of what is known, the rest of a resting hand."""
-    for row in range(len(known)):
-        for column in range(len(known)):
-            prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
-        prior.covariance[row, row] += _JOINT_SPREAD**2
-    prior.precision[:] = prior.covariance
-    invert_positive(prior.precision)
+    covariance = kept**2 * covariance + (1.0 - kept**2) * resting.covariance
+    covariance += _JOINT_SPREAD**2 * np.eye(NUM_JOINTS)
+    precision = covariance.copy()
+    invert_positive(precision)
+    return JointPrior(mean, covariance, precision)
 
 
 @kernel
