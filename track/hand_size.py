@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -29,8 +29,8 @@ from handsim.hand.shape import SIZES, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
-from track.calibration.energy import Estimate, Problem, levenberg_marquardt, shared_covariance, user_hand
-from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, nearest_coordinates
+from track.calibration.energy import levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.hand_parameters import LENGTH
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
@@ -161,7 +161,7 @@ def _fit_from(
         markers = _label(frames, start, sides, labeler, config) or markers
         search = _Search(markers, start)
         found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    return _fit_proportions(_as_right(markers), _hand(*search.measures(found), layout))
+    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(found), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
@@ -205,8 +205,8 @@ def _label(
     sides: Sequence[Side],
     labeler: Labeler,
     config: TrackerConfig,
-) -> dict[Side, Float[np.ndarray, "F M 3"]]:
-    """Labeled markers [m] of each hand that enough frames show, NaN where missing."""
+) -> list[Float[np.ndarray, "F M 3"]]:
+    """Labeled markers [m] of each hand that enough frames show, as a right one's, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
@@ -220,11 +220,11 @@ def _label(
                 markers = seen.markers.copy()
                 markers[seen.filled] = np.nan
                 some.append(markers)
-    return {
-        side: _spread_out(np.array(some), _PROPORTION_FRAMES)
+    return [
+        _spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
-    }
+    ]
 
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
@@ -235,21 +235,16 @@ def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return chosen
 
 
-def _as_right(markers: Mapping[Side, Float[np.ndarray, "F M 3"]]) -> Float[np.ndarray, "F M 3"]:
-    """The markers of all hands as those of right hands [m]."""
-    return np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
-
-
 class _Search:
     """The likeliest length and breadth of hands of mean proportions, as which some frames were labeled."""
 
     # Few markers fit hands of many sizes, so that the sizes of people count too.
 
-    def __init__(self, markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
-        few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
-        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few.values()])
+    def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
+        few = [_spread_out(some, _FRAMES) for some in markers]
+        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few])
         self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
-        self._markers, self._layout = _as_right(few), start.layout
+        self._markers, self._layout = np.concatenate(few), start.layout
         self._poses = PoseSolver(start).solve(self._markers).qpos
 
     def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
@@ -273,9 +268,8 @@ class _Search:
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
     """The argument between two bounds [m] with the least value of a function."""
-    from scipy.optimize import (
-        minimize_scalar,  # a quarter of a second, which a user's known hands do not need
-    )
+    # A quarter of a second, which a user's known hands do not need.
+    from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
     return float(found.x)
@@ -283,19 +277,8 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
     """One shape for right hands in some frames, by a calibration without touches."""
-    worn, shape = start.attachment, start.model.shape
-    coordinates = nearest_coordinates(worn.points, shape)
-    problem = Problem(
-        shape,
-        coordinates,
-        worn.layout.heights,
-        seen,
-        noise=_FIT_NOISE,
-        robust_scale=_ROBUST_SCALE,
-        relinearize=_RELINEARIZE,
-    )
-    poses = PoseSolver(start).solve(seen).qpos
-    estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
+    options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
+    problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))

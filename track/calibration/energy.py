@@ -344,6 +344,15 @@ class Problem:
         )
 
 
+def first_estimate(
+    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
+) -> tuple[Problem, Estimate]:
+    """The problem of a right hand's labeled markers [m] with its options, and the hand as it is."""
+    worn, coordinates = hand.attachment, nearest_coordinates(hand.attachment.points, hand.shape)
+    problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
+    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, qpos)
+
+
 class Contacts(NamedTuple):
     """K contacts of the thumb, each in one frame, with a point on either pad."""
 

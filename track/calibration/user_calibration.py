@@ -35,6 +35,7 @@ from track.calibration.energy import (
     contact_geometry,
     contact_weights,
     find_touches,
+    first_estimate,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -45,7 +46,6 @@ from track.calibration.hand_parameters import (
     LENGTH,
     NUM_PARAMETERS,
     SkinPatch,
-    nearest_coordinates,
     shape_at,
     shape_jacobian,
     skin_points,
@@ -200,7 +200,8 @@ def calibrate_hand(
     # Poses of frames spread over the capture, on the hand that the calibration begins with.
     some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
     track = PoseSolver(right).solve(some)
-    problem, estimate = _initial_problem(some, right, track)
+    chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
+    problem, estimate = first_estimate(right, some[chosen], track.qpos[chosen], **scales)
     # Distant markers lose their weight only when the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
@@ -230,24 +231,6 @@ def calibrate_hand(
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
-
-
-def _initial_problem(
-    markers: NDArray[np.float64], right: GloveFit, track: PoseFit
-) -> tuple[Problem, Estimate]:
-    """The problem without contacts, and the estimate that the first poses give."""
-    chosen = informative_frames(track, markers)
-    shape, worn = right.model.shape, right.attachment
-    coordinates = nearest_coordinates(worn.points, shape)
-    problem = Problem(
-        shape,
-        coordinates,
-        worn.layout.heights,
-        markers[chosen],
-        noise=_FIRST_NOISE,
-        robust_scale=_FIRST_SCALE,
-    )
-    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, track.qpos[chosen])
 
 
 def _with_touches(
