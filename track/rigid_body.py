@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -160,6 +160,15 @@ class BodyFrame:
     rms: float  # RMS distance of the labeled points from their markers [m]; NaN without any
 
 
+class _Match(NamedTuple):
+    """Points that are a body's markers."""
+
+    count: int  # number of these points; 0 where there is no unique match
+    rms: float  # their RMS distance from the markers [m]
+    pose: NDArray[np.float64]  # of the body (7,)
+    assignment: NDArray[np.int64]  # index of each marker's point, -1 for none
+
+
 class BodyTracker:
     """Tracks one rigid body through a stream of points."""
 
@@ -198,22 +207,21 @@ class BodyTracker:
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame | None:
         """The body by the IDs of its points, or near its predicted pose."""
-        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        pose, assignment = self._no_match
         count, rms = track_by_ids(
             self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
         )
+        match = _Match(count, rms, pose, assignment)
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
-            predicted = self._predict(elapsed)
-            count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
-        if count < FEWEST:
+            match = self._match(points, self._predict(elapsed), self._search_radius(elapsed))
+        if match.count < FEWEST:
             return None
-        if max(self._most_markers, count) <= FEWEST < len(self._positions):
+        if max(self._most_markers, match.count) <= FEWEST < len(self._positions):
             # Three points may match three markers by chance: a larger match elsewhere is the body.
-            other, other_assignment = np.empty(7), np.empty_like(assignment)
-            more, spread = self._match(points, None, np.inf, other_assignment, other)
-            if more > FEWEST:
-                return self._accept(Status.INITIALIZED, other, spread, other_assignment, ids, time)
-        return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
+            other = self._match(points)
+            if other.count > FEWEST:
+                return self._accept(Status.INITIALIZED, other, ids, time)
+        return self._accept(Status.TRACKED, match, ids, time)
 
     def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
         """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
@@ -233,27 +241,26 @@ class BodyTracker:
             else:
                 assignment[:] = -1
         self._status = Status.COASTING
-        return self._result(pose, rms, assignment, ids)
+        return self._result(_Match(len(seen), rms, pose, assignment), ids)
 
     def _initialize(
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame:
         """The body near its predicted pose, or anywhere."""
-        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
-            radius, predicted = self._search_radius(elapsed), self._predict(elapsed)
-            count, rms = self._match(points, predicted, radius, assignment, pose)
-            if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
-                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
-        count, rms = self._match(points, None, np.inf, assignment, pose)
-        if count >= FEWEST:
-            there = transform_markers(self._positions, pose)
+            radius = self._search_radius(elapsed)
+            match = self._match(points, self._predict(elapsed), radius)
+            if match.count > FEWEST or (match.count == FEWEST and radius <= _CONFIDENT_RADIUS):
+                return self._accept(Status.INITIALIZED, match, ids, time)
+        match = self._match(points)
+        if match.count >= FEWEST:
+            there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
             moved = np.linalg.norm(there - before, axis=1).max()
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
-            self._candidate = pose
-            if self._confirmed >= _frames_to_confirm(count, len(self._positions)):
-                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
+            self._candidate = match.pose
+            if self._confirmed >= _frames_to_confirm(match.count, len(self._positions)):
+                return self._accept(Status.INITIALIZED, match, ids, time)
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
@@ -269,60 +276,51 @@ class BodyTracker:
         return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
 
     def _match(
-        self,
-        points: NDArray[np.float64],
-        near: NDArray[np.float64] | None,
-        radius: float,
-        assignment: NDArray[np.int64],
-        pose: NDArray[np.float64],
-    ) -> tuple[int, float]:
-        """Count and RMS [m] of the unique match near a pose, or anywhere; the arrays are filled."""
-        if len(points) > _MOST_SEARCHED_POINTS:
-            return 0, np.nan
+        self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
+    ) -> _Match:
+        """The unique match of the markers within a radius of a pose, or anywhere."""
+        pose, assignment = self._no_match
         expected = self._positions if near is None else transform_markers(self._positions, near)
+        if len(points) > _MOST_SEARCHED_POINTS:
+            return _Match(0, np.nan, pose, assignment)
         count, _, rival = search_constellation(
             self._positions, self._distances, points, expected, radius, _TIGHT, assignment, pose
         )
+        if count == FEWEST > rival:
+            count, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
         if count < FEWEST or rival >= count:
-            return 0, np.nan
-        if count == FEWEST:
-            kept, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
-            if kept < FEWEST:
-                return 0, np.nan
-        return assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+            return _Match(0, np.nan, pose, assignment)
+        fit = assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+        return _Match(*fit, pose, assignment)
 
-    def _accept(
-        self,
-        status: Status,
-        pose: NDArray[np.float64],
-        rms: float,
-        assignment: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        time: float,
-    ) -> BodyFrame:
+    @property
+    def _no_match(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """A pose and an assignment to be filled."""
+        return np.empty(7), np.full(len(self._positions), -1)
+
+    def _accept(self, status: Status, match: _Match, ids: NDArray[np.int64], time: float) -> BodyFrame:
         """Update pose and velocity by a fit."""
         elapsed = time - self._time
         if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _LONGEST_PREDICTION:
             weight = _VELOCITY_SMOOTHING if self._fits > 1 else 1.0
-            self._velocity += weight * (velocity_of(self._pose, pose, elapsed) - self._velocity)
+            self._velocity += weight * (velocity_of(self._pose, match.pose, elapsed) - self._velocity)
         self._fits += 1
-        self._pose, self._time, self._status = pose, time, status
-        self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
-        return self._result(pose, rms, assignment, ids)
+        self._pose, self._time, self._status = match.pose, time, status
+        self._most_markers = max(self._most_markers, int((match.assignment >= 0).sum()))
+        return self._result(match, ids)
 
-    def _result(
-        self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> BodyFrame:
+    def _result(self, match: _Match, ids: NDArray[np.int64]) -> BodyFrame:
         """The result of a fit; the IDs are kept for the next frame."""
-        seen, labels, transform = np.flatnonzero(assignment >= 0), np.full(len(ids), -1), np.eye(4)
-        labels[assignment[seen]] = seen
+        seen, labels = np.flatnonzero(match.assignment >= 0), np.full(len(ids), -1)
+        labels[match.assignment[seen]] = seen
         self._last_ids[:] = -1
-        self._last_ids[seen] = ids[assignment[seen]]
-        write_quaternion_matrix(transform, *pose[3:])
-        transform[:3, 3] = pose[:3]
-        return BodyFrame(self._status, transform, labels, rms)
+        self._last_ids[seen] = ids[match.assignment[seen]]
+        transform = np.eye(4)
+        write_quaternion_matrix(transform, *match.pose[3:])
+        transform[:3, 3] = match.pose[:3]
+        return BodyFrame(self._status, transform, labels, match.rms)
 
 
 def _frames_to_confirm(count: int, markers: int) -> float:

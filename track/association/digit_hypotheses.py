@@ -14,7 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.shape import NUM_JOINTS
+from gloves.fit import GloveFit
+from handsim.hand.model import join_qpos
 from handsim.kernels import kernel, point_distance, write_quaternion_matrix
 from track.kinematics.marker_kinematics import (
     LIMIT_PRECISION,
@@ -78,27 +79,13 @@ class DigitPoints(NamedTuple):
     precision: Float[np.ndarray, "4 4"]  # its precision [1/rad^2]
 
 
-@kernel
-def digit_ranges(hand: HandArrays) -> DigitRanges:
+def digit_ranges(hand: GloveFit) -> DigitRanges:
     """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
-    count, work = len(hand.digits), workspace(len(hand.digits))
-    nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
-    np.fill_diagonal(nearest, 0.0)
-    angles = np.empty(NUM_JOINTS)
-    for number in range(_ANGLES_PER_HINGE**4):
-        for hinge in range(NUM_JOINTS):
-            share = (
-                number // _ANGLES_PER_HINGE ** (3 - hinge % 4) % _ANGLES_PER_HINGE / (_ANGLES_PER_HINGE - 1)
-            )
-            low, high = hand.ranges[hinge]
-            angles[hinge] = low + share * (high - low)
-        compute_markers(hand, angles, work)
-        for one in range(count):
-            for other in range(one):
-                distance = point_distance(work.markers[one], work.markers[other])
-                nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
-                farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
-    return DigitRanges(nearest, farthest)
+    shares = np.indices((_ANGLES_PER_HINGE,) * 4).reshape(4, -1).T / (_ANGLES_PER_HINGE - 1)
+    low, high = hand.model.skeleton.ranges.T
+    markers, _ = hand.markers(join_qpos(low + np.tile(shares, 5) * (high - low)))
+    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
+    return DigitRanges(apart.min(axis=0), apart.max(axis=0))
 
 
 def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:

@@ -133,7 +133,7 @@ class HandState:
         self._spread_model = SpreadModel(hand, origin)
         self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
-        self._ranges = digit_ranges(self.adapted)
+        self._ranges = digit_ranges(hand)
         self._now = 0.0  # [s] of the last prediction
 
     def predict(self, time: float) -> Prediction:

@@ -81,6 +81,18 @@ _MOST_DAMPING_TRIALS: Final = 8
 SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
 
 
+class Contacts(NamedTuple):
+    """K contacts of the thumb, each in one frame, with a point on either pad."""
+
+    frames: Int[np.ndarray, "K"]
+    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
+    pads: SkinCoordinates  # points on the thumb, then those on the fingers
+
+
+_NO_COORDINATES: Final = SkinCoordinates(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
+_NO_CONTACTS: Final = Contacts(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), _NO_COORDINATES)
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """All unknowns of a calibration at one iteration."""
@@ -89,7 +101,7 @@ class Estimate:
     points: Float[np.ndarray, "M 3"]  # marker centers on the rest hand, in the wrist's frame [m]
     coordinates: SkinCoordinates  # the same points in coordinates of its skin
     qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts | None = None  # their frames count in `qpos`
+    contacts: Contacts = _NO_CONTACTS  # their frames count in `qpos`
 
 
 class Fit(NamedTuple):
@@ -100,7 +112,7 @@ class Fit(NamedTuple):
     residuals: Float[np.ndarray, "F M 3"]  # model minus marker [m], zero where a marker is missing
     design_residuals: Float[np.ndarray, "M 3"]  # marker minus its designed position, in the wrist's frame [m]
     normals: Float[np.ndarray, "M 3"]  # unit normals of the rest skin under the markers
-    geometry: ContactGeometry | None  # how the pads of the contacts lie to each other
+    geometry: ContactGeometry  # how the pads of the contacts lie to each other
     cost: float
 
 
@@ -160,14 +172,12 @@ class Problem:
         _, by_bone = skinning_terms(model, bones, estimate.points, weights)
         predicted = np.einsum("ml,tmli->tmi", weights, by_bone, optimize=True)
         residuals = np.where(self.present[..., None], predicted - self.targets, 0.0)
-        faces, count = self._all_coordinates(estimate).faces, len(estimate.points)
-        corners = SkinPatch(faces).corners(model.surface.vertices)
+        contacts, count = estimate.contacts, len(estimate.points)
+        corners = SkinPatch(self._all_coordinates(estimate).faces).corners(model.surface.vertices)
         _, normals = skin_points(estimate.coordinates, corners.part(0, count))
         design, _ = skin_points(self.design, corners.part(count, 2 * count))
-        geometry = None
-        if estimate.contacts is not None:
-            pads = corners.part(2 * count, len(faces))
-            geometry = contact_geometry(estimate.contacts, pads, model, bones[estimate.contacts.frames])
+        pads = corners.part(2 * count, None)
+        geometry = contact_geometry(contacts, pads, model, bones[contacts.frames])
         fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
         return fit._replace(cost=self._cost(estimate, fit))
 
@@ -181,9 +191,8 @@ class Problem:
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
         cost += ((off @ self._pose_precision) * off).sum()
-        if fit.geometry is not None and estimate.contacts is not None:
-            weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-            cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
+        weights = contact_weights(fit.geometry, estimate.contacts.fingers)
+        cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
     def _position_precision(self, fit: Fit) -> NDArray[np.float64]:
@@ -222,14 +231,12 @@ class Problem:
         squares = (fit.residuals**2).sum(axis=2)
         weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
         precision[:, :-1] = np.repeat(weights, 3, axis=1)
-        contacts, geometry = estimate.contacts, fit.geometry
-        if contacts is not None and geometry is not None:
-            at = contacts.frames, -1
-            by_pose[at], by_shared[*at, :NUM_PARAMETERS] = self._gap_jacobians(
-                estimate, fit, contacts, geometry, rest[2 * count :]
-            )
-            residuals[at] = geometry.gaps
-            precision[at] = contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2
+        if len(estimate.contacts.frames):
+            at = estimate.contacts.frames, -1
+            gaps = self._gap_jacobians(estimate, fit, rest[2 * count :])
+            by_pose[at], by_shared[*at, :NUM_PARAMETERS] = gaps
+            residuals[at] = fit.geometry.gaps
+            precision[at] = contact_weights(fit.geometry, estimate.contacts.fingers) / CONTACT_SPREAD**2
         root = np.sqrt(precision)[..., None]
         by_pose, by_shared, residuals = root * by_pose, root * by_shared, root[..., 0] * residuals
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
@@ -265,11 +272,10 @@ class Problem:
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
         """Skin coordinates of the markers, of their design, and of compressed pads at the contacts."""
-        parts = [estimate.coordinates, self.design]
-        if estimate.contacts is not None:
-            pads = estimate.contacts.pads
-            parts.append(pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION)))
-        return SkinCoordinates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        pads = estimate.contacts.pads
+        pads = pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION))
+        parts = zip(estimate.coordinates, self.design, pads, strict=True)
+        return SkinCoordinates(*map(np.concatenate, parts))
 
     def _add_priors(
         self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
@@ -293,21 +299,15 @@ class Problem:
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
     def _gap_jacobians(
-        self,
-        estimate: Estimate,
-        fit: Fit,
-        contacts: Contacts,
-        geometry: ContactGeometry,
-        rest: NDArray[np.float64],
+        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
         """Jacobians of the gaps by poses (K, 26) and parameters (K, 53), given those of points at rest."""
-        count = len(contacts.frames)
-        rows, coordinates = np.arange(count), self._all_coordinates(estimate)
-        pads = coordinates.part(-2 * count, None)
+        frames, count = estimate.contacts.frames, len(estimate.contacts.frames)
+        rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        by = self._point_jacobians(fit, estimate, contacts.frames, points, skin_weights(pads), rest)
+        by = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
         return [
-            np.einsum("ki,kis->ks", geometry.directions, one[rows, count + rows] - one[rows, rows])
+            np.einsum("ki,kis->ks", fit.geometry.directions, one[rows, count + rows] - one[rows, rows])
             for one in by[:2]
         ]
 
@@ -351,14 +351,6 @@ def first_estimate(
     worn, coordinates = hand.attachment, nearest_coordinates(hand.attachment.points, hand.shape)
     problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
     return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, qpos)
-
-
-class Contacts(NamedTuple):
-    """K contacts of the thumb, each in one frame, with a point on either pad."""
-
-    frames: Int[np.ndarray, "K"]
-    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
-    pads: SkinCoordinates  # points on the thumb, then those on the fingers
 
 
 class ContactGeometry(NamedTuple):
@@ -550,7 +542,7 @@ def marker_rms(problem: Problem, fit: Fit) -> float:
 
 def contact_gap(estimate: Estimate, fit: Fit) -> float:
     """Weighted RMS gap of the contacts [m], NaN without any."""
-    if estimate.contacts is None or fit.geometry is None:
+    if not len(estimate.contacts.frames):
         return float("nan")
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
     return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
@@ -595,7 +587,7 @@ def _damped_step(
 
 def _with_slid_contacts(problem: Problem, estimate: Estimate, fit: Fit) -> tuple[Estimate, Fit]:
     """The estimate after its contact points have slid on the skin, and its fit."""
-    if estimate.contacts is None:
+    if not len(estimate.contacts.frames):
         return estimate, fit
     contacts = slide_contacts(estimate.contacts, fit.model, fit.bones[estimate.contacts.frames])
     slid = dataclasses.replace(estimate, contacts=contacts)

@@ -147,7 +147,7 @@ class Corners(NamedTuple):
     points: Float[np.ndarray, "P 3 3"]  # in the wrist's frame [m]
     normals: Float[np.ndarray, "P 3 3"]  # unit vertex normals
 
-    def part(self, first: int, last: int) -> Corners:
+    def part(self, first: int, last: int | None) -> Corners:
         """Those of some of the triangles."""
         return Corners(self.points[first:last], self.normals[first:last])
 

@@ -275,8 +275,6 @@ def _touches(
     mirror: NDArray[np.float64],
 ) -> tuple[Touch, ...]:
     """The touches with their gaps on the first and on the calibrated hand."""
-    if estimate.contacts is None or fit.geometry is None:
-        return ()
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
     pads, after = estimate.contacts.pads, fit.geometry.gaps
     ends, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))

@@ -306,7 +306,7 @@ def _set_prior(
             rest += (prior.angles[frame, hinge] - rest) * prior.precision[frame, hinge] / both
             weight = both
         mean[7 + hinge], precision[hinge] = rest, weight
-    return seen.sum()
+    return int(seen.sum())
 
 
 @kernel
