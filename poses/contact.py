@@ -242,19 +242,16 @@ def first_contact(
     moving_qpos: Float[np.ndarray, "T 27"],
     axis: Float[np.ndarray, "T 3"],
 ) -> Float[np.ndarray, "T"]:
-    """Distance along `axis` [m] at which the moving hand, coming from outside, first touches the still one.
+    """Distance along `axis` [m] at which a hand from outside touches a still one, or else `NEAREST`.
 
-    Frames without a contact give `NEAREST`. The axis is the unit direction in which the moving hand backs
-    off from its given poses, which have distance zero.
+    The moving hand backs off along this unit direction; at distance zero it has the given poses.
     """
-    distance: NDArray[np.float64] = search_contact(
-        moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
-        moving.capsules.radii,
-        still.capsules.posed(still.forward_kinematics(still_qpos)),
-        still.capsules.radii,
-        axis,
-    )
-    return distance
+    segments = [
+        model.capsules.posed(model.forward_kinematics(qpos))
+        for model, qpos in ((moving, moving_qpos), (still, still_qpos))
+    ]
+    radii = moving.capsules.radii, still.capsules.radii
+    return np.asarray(search_contact(segments[0], radii[0], segments[1], radii[1], axis))
 
 
 def close_fingers(
@@ -391,9 +388,12 @@ def path_between(
     rng: np.random.Generator,
 ) -> Passage | None:
     """Frames from one pose to another through a rest [s] with hands apart; None if not valid."""
-    apart = Passage(
-        *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
-    )
+    roll = rng.uniform(0.0, np.pi)  # from hands side by side to palms that face each other
+    rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
+    direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
+    position = rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)
+    angles = [sample_valid_angles(model, 1, rng=rng) for model in (right, left)]
+    apart = Passage(rotation.as_matrix()[None], position, *angles)
     rest = apart.at(np.zeros(int(rng.uniform(*pause) * RATE), dtype=int))
     path = join_passages([_straight(start, apart, rng), rest, _straight(apart, end, rng)])
     return path if valid_frames(right, left, path).all() else None
@@ -407,10 +407,9 @@ def valid_frames(right: HandModel, left: HandModel, passage: Passage) -> Bool[np
         left.capsules,
         left.forward_kinematics(placed_qpos(passage.left, passage.rotation, passage.position)),
     )
-    valid: NDArray[np.bool_] = (
+    return np.asarray(
         is_valid(right, passage.right) & is_valid(left, passage.left) & (overlap <= MAX_OVERLAP)
     )
-    return valid
 
 
 def placed_qpos(
@@ -441,11 +440,3 @@ def _straight(start: Passage, end: Passage, rng: np.random.Generator) -> Passage
         start.right + along * (end.right - start.right),
         start.left + along * (end.left - start.left),
     )
-
-
-def _place_apart(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Orientation (1, 3, 3) and position (1, 3) of the left wrist: from side by side to palm facing palm."""
-    roll = rng.uniform(0.0, np.pi)
-    rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
-    direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
-    return rotation.as_matrix()[None], rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)

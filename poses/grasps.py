@@ -280,7 +280,10 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
         at = np.mean([_landmark(model, bones, mark) for mark in placement["between"]], axis=0) @ mirror
         back = _landmark(model, bones, placement["through"]) @ mirror
         z = back - at
-        x = _perpendicular(z, rng.uniform(0.0, 2 * np.pi))
+        angle, axis = rng.uniform(0.0, 2 * np.pi), z / np.linalg.norm(z)
+        x = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])  # perpendicular to z, at a random angle
+        x /= np.linalg.norm(x)
+        x = np.cos(angle) * x + np.sin(angle) * np.cross(axis, x)
     else:
         length, breadth = model.shape.length, model.shape.breadth
         at = np.array([placement["under"][0] * length, placement["under"][1] * breadth, 0.0])
@@ -306,14 +309,6 @@ def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
     return rigid(np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2)
 
 
-def _perpendicular(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Unit vector (3,) perpendicular to an axis, at an angle [rad] about it."""
-    axis = axis / np.linalg.norm(axis)
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    first /= np.linalg.norm(first)
-    return np.asarray(np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
-
-
 def _landmark(
     model: HandModel, bones: NDArray[np.float64], mark: tuple[str, float, float, float]
 ) -> NDArray[np.float64]:
@@ -331,16 +326,13 @@ def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]
     palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
     data = scene.new_data(style.open, pose)
     lowest = data.qpos[NUM_JOINTS + 2]
-
-    def gap(height: float) -> float:
-        data.qpos[NUM_JOINTS + 2] = lowest + height
-        mujoco.mj_kinematics(scene.mj_model, data)
-        return float(scene.distances(data, palm).min())
-
-    low, high = -_SLIDE, 0.0  # free, too high
+    low, high = -_SLIDE, 0.0  # heights at which the object is free, and too high
     for _ in range(_SLIDE_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if gap(middle) > _GAP else (low, middle)
+        data.qpos[NUM_JOINTS + 2] = lowest + middle
+        mujoco.mj_kinematics(scene.mj_model, data)
+        is_free = scene.distances(data, palm).min() > _GAP
+        low, high = (middle, high) if is_free else (low, middle)
     pose[2, 3] += low
     return pose
 
@@ -422,19 +414,14 @@ def settle_hold(
     why = ""
     for attempt in range(_MAX_TRIES):
         style = hold_style(model, obj, names[rng.integers(len(names))])
-        settled = try_hold(scene, _varied(style, attempt, rng), rng=rng)
+        spread = _TRY_SPREADS[min(attempt, len(_TRY_SPREADS) - 1)]
+        change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
+        opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
+        settled = try_hold(scene, dataclasses.replace(style, open=opened, closed=closed), rng=rng)
         if isinstance(settled, Hold):
             return settled
         why = settled
     raise PoseError(f"this hand does not get hold of the {obj.name} in {_MAX_TRIES} tries: {why}")
-
-
-def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:
-    """The style with random changes of its angles, which grow with the number of failed tries."""
-    spread = _TRY_SPREADS[min(attempt, len(_TRY_SPREADS) - 1)]
-    change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
-    opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
-    return dataclasses.replace(style, open=opened, closed=closed)
 
 
 def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
@@ -445,9 +432,14 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     _shake(scene, data)  # so that the object settles
     before = scene.object_pose(data)
     _shake(scene, data)
-    if not _stayed(scene, data, before):
+    pose = scene.object_pose(data)
+    drift = np.linalg.norm(pose[:3, 3] - before[:3, 3])
+    rotation = np.arccos(np.clip((np.trace(pose[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
+    speed = np.abs(data.qvel[:NUM_JOINTS]).max()
+    is_still = drift < _MAX_DRIFT and rotation < _MAX_ROTATION and speed < _MAX_FINAL_SPEED
+    if not (is_still and np.isfinite(data.qpos).all()):
         return "it slips"
-    angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
+    angles = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH)
     if not is_valid(scene.hand, angles[None])[0]:
         return "the fingers penetrate each other"
     if scene.depth(angles[None], pose[None])[0] > _MAX_SETTLED_DEPTH:
@@ -508,15 +500,6 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
         mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
     data.xfrc_applied[body] = 0.0
     mujoco.mj_step(scene.mj_model, data, nstep=_REST)
-
-
-def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
-    """Whether the object stayed in place and the fingers are at rest."""
-    after = scene.object_pose(data)
-    drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
-    rotation = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
-    slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _MAX_FINAL_SPEED
-    return bool(drift < _MAX_DRIFT and rotation < _MAX_ROTATION and slow and np.isfinite(data.qpos).all())
 
 
 _MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame

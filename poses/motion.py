@@ -10,7 +10,7 @@ from itertools import chain, pairwise
 from typing import Annotated, Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -172,7 +172,8 @@ def free_wrist_path(
         steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
         shares.append(len(positions) - 2 + minimum_jerk(steps))
     rotated = Rotation.from_quat(np.array(orientations), scalar_first=True)
-    return _quaternions(along(np.array(positions), rotated, np.concatenate(shares)[:frames]))
+    path, turned = along(np.array(positions), rotated, np.concatenate(shares)[:frames])
+    return path, turned.as_quat(scalar_first=True)
 
 
 def wrist_path(
@@ -187,7 +188,8 @@ def wrist_path(
     positions = config.center + rng.uniform(-config.volume, config.volume, size=(count, 3))
     away = Rotation.from_rotvec(rng.normal(scale=config.turning, size=(count, 3)))
     orientations = away * Rotation.from_matrix(_FORWARD)
-    return _quaternions(along(positions, orientations, np.concatenate(shares)[:frames]))
+    path, turned = along(positions, orientations, np.concatenate(shares)[:frames])
+    return path, turned.as_quat(scalar_first=True)
 
 
 def along(
@@ -197,13 +199,6 @@ def along(
     keys = np.arange(len(positions))
     position = np.stack([np.interp(progress, keys, axis) for axis in positions.T], axis=1)
     return position, Slerp(keys, orientations)(progress)
-
-
-def _quaternions(
-    path: tuple[NDArray[np.float64], Rotation],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    position, orientations = path
-    return position, orientations.as_quat(scalar_first=True)
 
 
 def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -254,17 +249,8 @@ def motion_through(
     *,
     rng: np.random.Generator,
 ) -> HandMotion:
-    """Smooth motion of one hand from each of the given poses [rad] to the next, valid at every frame.
-
-    It begins in the first pose and rests for a moment at each later one; durations and the wrist's path are
-    random. A shape or the name of a size is a right hand.
-
-    Raises:
-        ArgumentError: There are fewer than two poses, or one is not valid on this hand.
-        PoseError: No path leads out of one.
-    """
-    model = load_model(model)
-    config = config or MotionConfig()
+    """Smooth motion of one hand from each valid pose [rad] to the next, with a rest at each later one."""
+    model, config = load_model(model), config or MotionConfig()
     poses = check_array("poses", poses, (None, NUM_JOINTS))
     if poses.ndim != 2 or len(poses) < 2:
         raise ArgumentError(f"poses has shape {poses.shape}, expected at least two poses, (K, {NUM_JOINTS})")
@@ -352,18 +338,9 @@ def scripted_motion(
     *,
     rng: np.random.Generator,
 ) -> HandMotion:
-    """Smooth motion of one hand that follows a named script, valid at every frame.
+    """Smooth motion of one hand that follows a named script for a duration [s], valid at every frame.
 
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        script: One of `script_names`.
-        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and positions; human ones by default. Except for "free",
-            `durations` and `hold` are those of the script.
-
-    Raises:
-        ArgumentError: There is no such script, or the duration is not positive or less than a step.
-        PoseError: This hand cannot do what the script asks for.
+    A script other than "free" brings its own `durations` and `hold`.
     """
     model = load_model(model)
     check_choice(script, _scripts(), noun="script")
@@ -378,7 +355,10 @@ def scripted_motion(
     at = int(rng.integers(len(poses)))
     parts, count = [poses[at : at + 1]], 1
     while count < frames:
-        indices = _next_indices(at, len(poses), entry["order"], rng)
+        steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
+        if entry["order"] != "in turn":
+            steps = rng.integers(1, len(poses), size=_POSES_AT_ONCE)
+        indices = (at + np.concatenate([[0], np.cumsum(steps)])) % len(poses)
         parts.append(angles_through(model, poses[indices], config, rng=rng))
         count, at = count + len(parts[-1]), int(indices[-1])
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
@@ -390,7 +370,11 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
         raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
     entry = _scripts()[script]
     if "touches" in entry:
-        poses = _touches(model, entry["touches"])
+        touches = []
+        for finger in entry["touches"]:
+            with contextlib.suppress(PoseError):  # other fingers remain
+                touches.append(touching_angles(model, finger))
+        poses = np.array(touches).reshape(-1, NUM_JOINTS)
     elif "library" in entry:
         poses = make_valid(model, gestures_of(entry["library"]))
     else:
@@ -399,20 +383,3 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     if len(poses) < 2:
         raise PoseError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
     return poses
-
-
-def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
-    poses: list[NDArray[np.float64]] = []
-    for finger in fingers:
-        with contextlib.suppress(PoseError):  # other fingers remain
-            poses.append(touching_angles(model, finger))
-    return np.array(poses).reshape(-1, NUM_JOINTS)
-
-
-def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
-    """Indices of the next poses, the present one first."""
-    if order == "in turn":
-        steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
-    else:
-        steps = rng.integers(1, count, size=_POSES_AT_ONCE)
-    return (at + np.concatenate([[0], np.cumsum(steps)])) % count

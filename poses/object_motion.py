@@ -156,7 +156,12 @@ def point_pen(
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(pose_matrices(motion.qpos[:, :7])) @ body.T_world_body
-    T_world_pen = path @ _rotated_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    # In the path's frame the tip is at the origin, and the pen is rotated so that the wrist is at +x.
+    wrist = np.linalg.inv(T_wrist_pen.mean(axis=0))[:3, 3]
+    rotation, shift = np.eye(4), np.eye(4)
+    rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), -np.arctan2(wrist[[1]], wrist[[0]]))[0]
+    shift[:3, 3] = -pen.markers[0]
+    T_world_pen = path @ (rotation @ shift)
     qpos = motion.qpos.copy()
     qpos[:, :7] = transform_poses(T_world_pen @ np.linalg.inv(T_wrist_pen))
     led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
@@ -191,19 +196,6 @@ def keep_apart(
         window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
     raise PoseError("the hands touch, however far one of them draws back")
-
-
-def _rotated_to_the_arm(
-    T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Pose of the pen in the path's frame: tip at the origin, rotated so that the wrist is at +x."""
-    wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
-    away = np.arctan2(wrist[1], wrist[0])
-    rotation = np.eye(4)
-    rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
-    shift = np.eye(4)
-    shift[:3, 3] = -tip
-    return rotation @ shift
 
 
 DISTANCE: Final = (0.006, 0.02)
@@ -305,9 +297,8 @@ def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[
     open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _MIN_FACING)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
     lean = _TILT * rng.standard_normal(3)
-    lean -= (lean @ outward[target]) * outward[
-        target
-    ]  # sideways, or a rotation of the target would swing the pen
+    # A pen that leans sideways does not swing when the target rotates.
+    lean -= (lean @ outward[target]) * outward[target]
     return target, lean * min(1.0, _MAX_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
 
 

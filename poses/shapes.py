@@ -157,12 +157,9 @@ def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]
     first, second = library[rng.integers(len(library), size=(2, count))]
     progress = rng.uniform(-0.1, 1.1, size=(count, 1)) + 0.12 * rng.standard_normal((count, 5))
     weight = np.repeat(np.clip(progress, 0.0, 1.0), 4, axis=1)
-    angles: NDArray[np.float64] = (1.0 - weight) * first + weight * second
     noise = np.stack([_shared_normals(count, rng, digits=5) for _ in range(4)], axis=2) * _FLEXION_NOISE
     noise[..., 0] *= _ABDUCTION_NOISE / _FLEXION_NOISE
-    flat: NDArray[np.float64] = noise.reshape(count, 20)
-    angles += flat
-    return angles
+    return np.asarray((1.0 - weight) * first + weight * second + noise.reshape(count, 20))
 
 
 def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -273,24 +270,17 @@ def make_valid(
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
     for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
-        target = result[todo]
-        end = np.where(moving, resting, target)
+        end = np.where(moving, resting, result[todo])
         helps = is_valid(model, end)
-        result[todo[helps]] = _nearest_valid(model, end[helps], target[helps])
+        end, target = end[helps], result[todo[helps]]
+        low, high = np.zeros(len(target)), np.ones(len(target))  # shares of the target: valid, invalid
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            valid = is_valid(model, end + middle[:, None] * (target - end))
+            low, high = np.where(valid, middle, low), np.where(valid, high, middle)
+        result[todo[helps]] = end + low[:, None] * (target - end)
         todo = todo[~helps]
     return result
-
-
-def _nearest_valid(
-    model: HandModel, valid_end: NDArray[np.float64], target: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Valid poses nearest to the target poses, found by bisection from valid ends."""
-    low, high = np.zeros(len(target)), np.ones(len(target))  # share of the target pose: valid, invalid
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        valid = is_valid(model, valid_end + middle[:, None] * (target - valid_end))
-        low, high = np.where(valid, middle, low), np.where(valid, high, middle)
-    return valid_end + low[:, None] * (target - valid_end)
 
 
 def sample_valid_angles(
@@ -376,13 +366,7 @@ def sample_poses(
 
 
 def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSampler:
-    """A user's sampler, or the one of a name, behind checks of what it returns; it is tried once.
-
-    Raises:
-        ArgumentError: There is none of that name, it does not take a sampler's arguments, or what it returns
-            for two poses of a hand of size M has another shape or is not finite.
-        HandSimError: It raised an error.
-    """
+    """A user's sampler, or the one of a name, behind checks of what it returns; two poses are a trial."""
     if not isinstance(sampler, str):
         names = ", ".join(SAMPLER.names())
         check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))
@@ -412,15 +396,12 @@ def _drawn(
     widest = np.abs(values[:, -NUM_JOINTS:]).max()
     if widest > _MAX_ANGLE:
         raise ArgumentError(f"{owner} holds an angle of {widest:.4g} rad; are these degrees?")
-    return values if values.shape[1] == NUM_JOINTS else _unit_wrists(owner, values)
-
-
-def _unit_wrists(owner: str, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Whole poses with normalized quaternions."""
-    lengths = np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    if values.shape[1] == NUM_JOINTS:
+        return values
+    lengths = np.linalg.norm(values[:, 3:7], axis=1, keepdims=True)
     if lengths.min() < 1e-6:
         raise ArgumentError(f"{owner} holds a quaternion of zeros (numbers 3 to 6, wxyz), expected length 1")
-    farthest = np.abs(qpos[:, :3]).max()
+    farthest = np.abs(values[:, :3]).max()
     if farthest > _MAX_WRIST_DISTANCE:
         raise ArgumentError(f"{owner} holds a wrist {farthest:.4g} m away; are these millimeters?")
-    return np.concatenate([qpos[:, :3], qpos[:, 3:7] / lengths, qpos[:, 7:]], axis=1)
+    return np.concatenate([values[:, :3], values[:, 3:7] / lengths, values[:, 7:]], axis=1)

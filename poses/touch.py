@@ -58,13 +58,7 @@ class ThumbContact:
 def thumb_contact(
     model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
 ) -> ThumbContact:
-    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not.
-
-    A shape or the name of a size is a right hand.
-
-    Raises:
-        ArgumentError: There is no such finger, or `angles` is not (T, 20).
-    """
+    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
     model = load_model(model)
     check_choice(finger, FINGERS, noun="finger")
     return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
@@ -90,20 +84,11 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
 def touching_angles(
     model: HandModel | HandShape | str, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
 ) -> Float[np.ndarray, "20"]:
-    """Joint angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
+    """Joint angles [rad] at which the pads of thumb and finger touch; only these two digits move.
 
-    Only the thumb and this finger move. The last bones overlap by 0 to `MAX_OVERLAP`, their pads face each
-    other, and nothing else penetrates deeper than `MAX_PENETRATION`.
-
-    Args:
-        model: The hand; a shape or the name of a size is a right one.
-        finger: "index", "middle", "ring" or "little".
-        start: Where to begin [rad], one pose or several that are tried in turn; the library's pinches of this
-            finger, made valid, when not given.
-
-    Raises:
-        ArgumentError: There is no such finger.
-        PoseError: This hand's thumb was not brought to it.
+    The last bones overlap by 0 to `MAX_OVERLAP`, their pads face each other, and nothing else penetrates
+    deeper than `MAX_PENETRATION`. The search begins at each pose of `start` [rad] in turn, by default at the
+    library's pinches of this finger.
     """
     model = load_model(model)
     check_choice(finger, FINGERS, noun="finger")
@@ -140,9 +125,6 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
     low, high = LOW[moving], HIGH[moving]
     residuals = _residuals(model, finger, start, moving)
 
-    def value(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(residuals(x[None])[0])
-
     def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.where(x + _STEP > high, -_STEP, _STEP)
         moved = residuals(np.vstack([x, x + np.diag(steps)]))
@@ -150,8 +132,9 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
 
     inside = np.clip(start[moving], low + 1e-4, high - 1e-4)
     solution = least_squares(
-        value, inside, jac=jacobian, bounds=(low, high), max_nfev=60, xtol=1e-6, ftol=1e-6
-    )
+        lambda x: residuals(x[None])[0], inside, jac=jacobian, bounds=(low, high), max_nfev=60, xtol=1e-6,
+        ftol=1e-6,
+    )  # fmt: skip
     angles: NDArray[np.float64] = start.copy()
     angles[moving] = solution.x
     return angles
@@ -163,7 +146,11 @@ def _residuals(
     """The residuals (T, R) as a function of the moving angles (T, 8) [rad]."""
     capsules = model.capsules
     bones = bones_of("thumb")[2], bones_of(finger)[2]
-    pads = [_pad(capsules, bone) for bone in bones]
+    pads = []  # the middle of each last bone's pad, in the bone's frame [m]
+    for bone in bones:
+        index = int(np.flatnonzero(capsules.bones == bone)[0])
+        pads.append(capsules.starts[index] + _PAD * (capsules.ends[index] - capsules.starts[index]))
+        pads[-1][2] -= capsules.radii[index]
     pairs = capsules.touching_pairs()
     pairs = pairs[~np.isin(capsules.bones[pairs], bones).all(axis=1)]
 
@@ -189,14 +176,6 @@ def _residuals(
         )
 
     return residuals
-
-
-def _pad(capsules: Capsules, bone: int) -> NDArray[np.float64]:
-    """The middle of a last bone's pad, in its frame [m]."""
-    index = int(np.flatnonzero(capsules.bones == bone)[0])
-    pad: NDArray[np.float64] = capsules.starts[index] + _PAD * (capsules.ends[index] - capsules.starts[index])
-    pad[2] -= capsules.radii[index]
-    return pad
 
 
 def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -138,7 +138,14 @@ def sketch_meeting(
         _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
     )
     targets = np.tile(variant["target"], (count, 1))
-    targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _offsets(variant, count, rng)
+    jitter, reach = noise.around(np.array(variant["jitter"]), 0.0), np.array(variant["place"])
+    if variant["pattern"] == "random":
+        offsets = reach * rng.uniform(-1.0, 1.0, size=(count, 2))
+    else:  # to one side and back
+        direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
+        side = (-1.0) ** np.arange(count)[:, None]
+        offsets = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
+    targets[:, :2] += jitter + offsets
     return Sketch(variant, still, moving, targets, noise.around(np.deg2rad(variant["tilt"]), 0.3))
 
 
@@ -183,16 +190,6 @@ class _Noise:
         return scale * (common * lasting + wander * new)
 
 
-def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Offsets (K, 2) of the beats' targets, in hand lengths."""
-    reach = np.array(variant["place"])
-    if variant["pattern"] == "random":
-        return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
-    side = (-1.0) ** np.arange(count)[:, None]
-    direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
-    return np.asarray(side * direction * rng.uniform(0.6, 1.0, size=(count, 1)))
-
-
 def _sketch_fingers(
     role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
 ) -> _FingerSketch:
@@ -207,10 +204,9 @@ def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Finge
     """Valid fingers of all sketches, one after another."""
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
     # poses with deep contact move towards rest, because fingers need room to wander
-    angles = make_valid(model, np.clip(opened, LOW, HIGH))
-    hard = ~is_valid(model, angles, max_penetration=_SNUG)
-    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
-    lasting = angles
+    lasting = make_valid(model, np.clip(opened, LOW, HIGH))
+    hard = ~is_valid(model, lasting, max_penetration=_SNUG)
+    lasting[hard] += 0.1 * (resting_angles(model) - lasting[hard])
     wandering = np.clip(lasting + wander, LOW, HIGH)
     valid = is_valid(model, wandering, max_penetration=_SNUG)
     return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
@@ -268,9 +264,10 @@ def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random
     if (distance <= NEAREST).any():
         return None
     passage = _close_contact(still, moving, meeting, course, distance=distance, rate=RATE)
-    if _too_fast(passage) or not valid_frames(right, left, passage).all():
+    speeds = np.diff(np.concatenate([passage.right, passage.left], axis=1), axis=0) * RATE
+    if np.abs(speeds).max() > MAX_SPEED or np.abs(np.diff(speeds, axis=0) * RATE).max() > MAX_ACCELERATION:
         return None
-    return passage
+    return passage if valid_frames(right, left, passage).all() else None
 
 
 def draw_poses(
@@ -286,7 +283,13 @@ def draw_poses(
             continue
         meeting = meet([draw.sketch for draw in drawn], still, moving)
         distance = _contact_distance(still, moving, meeting, np.arange(float(len(meeting.axis))))
-        best = _nearest_tries(drawn, distance)
+        best = np.empty(0, dtype=np.int64)  # the try of each pose whose hands come nearest to each other
+        begin = 0
+        for draw in drawn:
+            count, beats = len(draw.lift), len(draw.sketch.targets)
+            tries = distance[begin : begin + beats].reshape(count, -1)
+            nearest = begin + tries.shape[1] * np.arange(count) + tries.argmin(axis=1)
+            best, begin = np.concatenate([best, nearest]), begin + beats
         lift, grip = (
             np.concatenate(parts) for parts in zip(*((draw.lift, draw.grip) for draw in drawn), strict=True)
         )
@@ -318,17 +321,6 @@ def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
     lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
     grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
     return _Draw(left_still, sketch, lift, grip)
-
-
-def _nearest_tries(draws: Sequence[_Draw], distance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Beat of the try of each pose whose hands come nearest to each other."""
-    best, begin = [], 0
-    for draw in draws:
-        count, beats = len(draw.lift), len(draw.sketch.targets)
-        tries = distance[begin : begin + beats].reshape(count, -1)
-        best.append(begin + tries.shape[1] * np.arange(count) + tries.argmin(axis=1))
-        begin += beats
-    return np.concatenate(best)
 
 
 def _contact_distance(
@@ -408,14 +400,6 @@ def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _C
     return _Course(np.concatenate(beats), np.concatenate(lift), grip)
 
 
-def _too_fast(passage: Passage) -> bool:
-    """Whether a joint exceeds the limits of speed or acceleration."""
-    angles = np.concatenate([passage.right, passage.left], axis=1)
-    speeds = np.diff(angles, axis=0) * RATE
-    accelerations = np.diff(speeds, axis=0) * RATE
-    return bool(np.abs(speeds).max() > MAX_SPEED or np.abs(accelerations).max() > MAX_ACCELERATION)
-
-
 PAUSE: Final = (0.0, 0.6)
 """Shortest and longest rest between two meetings [s]."""
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
@@ -431,13 +415,8 @@ def two_hands_penetration(
     left_qpos: Float[np.ndarray, "T 27"],
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap of any capsule of one hand with any of the other [m]; 0 where they do not touch."""
-    overlap = overlap_between(
-        right.capsules,
-        right.forward_kinematics(right_qpos),
-        left.capsules,
-        left.forward_kinematics(left_qpos),
-    )
-    return np.asarray(np.maximum(overlap, 0.0))
+    bones = right.forward_kinematics(right_qpos), left.forward_kinematics(left_qpos)
+    return np.asarray(np.maximum(overlap_between(right.capsules, bones[0], left.capsules, bones[1]), 0.0))
 
 
 def sample_two_hand_motion(

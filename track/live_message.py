@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -157,9 +158,8 @@ class MessageEncoder:
         positions = np.full((len(KEYPOINT_NAMES), 3), np.nan)
         if hand.has_pose:
             positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
-        wrist, angles = (hand.qpos[:3], hand.qpos[3:7]), hand.qpos[7:]
-        spreads = hand.angle_spread, hand.keypoint_spread
-        return LiveHand(hand.side, hand.status, *wrist, angles, positions, *spreads)
+        pose = hand.qpos[:3], hand.qpos[3:7], hand.qpos[7:], positions
+        return LiveHand(hand.side, hand.status, *pose, hand.angle_spread, hand.keypoint_spread)
 
 
 class MessageFormat(NamedTuple):
@@ -172,10 +172,15 @@ class MessageFormat(NamedTuple):
 
 def document_format(name: str, *, points: bool = False) -> MessageFormat:
     """Messages as documents in one of `FORMATS`, with all points and their labels if `points`."""
-    encode: Callable[[dict[str, Any]], bytes] = _encode_json
+    encode: Callable[[dict[str, Any]], bytes]
     if name == "msgpack":
-        packer: Callable[[], Any] = import_extra("msgpack", f"format={name}", "send").Packer
-        encode = packer().pack
+        encode = import_extra("msgpack", f"format={name}", "send").Packer().pack
+    else:
+        as_text = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+        def encode(document: dict[str, Any]) -> bytes:
+            return as_text(document).encode()
+
     return MessageFormat(
         lambda header: encode(header_document(header)),
         lambda message: encode(frame_document(message, points=points)),
@@ -190,11 +195,7 @@ def header_document(header: LiveHeader) -> dict[str, Any]:
         "schema": SCHEMA,
         "source": f"handsim {__version__}",
         "units": {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"},
-        "sides": list(header.sides),
-        "angles": list(header.angles),
-        "positions": list(header.positions),
-        "bodies": list(header.bodies),
-        "markers": list(header.markers),
+        **{name: list(values) for name, values in dataclasses.asdict(header).items()},
     }
 
 
@@ -217,26 +218,21 @@ def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, A
     return document
 
 
-def _encode_json(document: dict[str, Any]) -> bytes:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-
-
 def _hand_document(hand: LiveHand) -> dict[str, Any]:
+    spreads = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
     return {
         "side": hand.side,
         "status": str(hand.status),
         "wrist": _pose(hand),
         "angles": _rounded(hand.angles) if hand.has_pose else None,
         "positions": _rounded(hand.positions) if hand.has_pose else None,
-        "angle_spread": None if np.isnan(hand.angle_spread).any() else _rounded(hand.angle_spread),
-        "position_spread": None if np.isnan(hand.position_spread).any() else _rounded(hand.position_spread),
+        **{name: None if np.isnan(spread).any() else _rounded(spread) for name, spread in spreads.items()},
     }
 
 
 def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
-    if not thing.has_pose:
-        return None
-    return {"position": _rounded(thing.position), "quaternion": _rounded(thing.quaternion)}
+    pose = {"position": _rounded(thing.position), "quaternion": _rounded(thing.quaternion)}
+    return pose if thing.has_pose else None
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> Any:

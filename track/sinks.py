@@ -15,10 +15,9 @@ import socket
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -51,6 +50,7 @@ GROUP: Final = "handsim.sinks"
 """Entry points of packages that bring sinks."""
 STATUSES: Final = tuple(reversed(Status))
 """Values of a status channel of LSL are indices of these."""
+_METHODS: Final = (("send", "close"), "the methods send and close of a sink")
 _DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # options of an address
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # of OSC
@@ -108,9 +108,9 @@ class SinkGroup(Closing):
 
     def notes(self) -> tuple[str, ...]:
         """What to print at the end, one line each."""
-        told = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
-        told += [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
-        return tuple(told)
+        sent = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
+        dropped = [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
+        return (*sent, *dropped)
 
     def close(self) -> None:
         """Close all sinks."""
@@ -138,7 +138,7 @@ def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGrou
     Raises:
         ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
     """
-    chosen = [addresses] if isinstance(addresses, str) or hasattr(addresses, "send") else addresses
+    chosen: Any = [addresses] if isinstance(addresses, str) or hasattr(addresses, "send") else addresses
     check_type("addresses", chosen, Sequence, f"a list of {', '.join(VALID)}, or of sinks")
     sinks: dict[str, LiveSink] = {}
     with ExitStack() as stack:
@@ -146,7 +146,9 @@ def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGrou
             address = given if isinstance(given, str) else type(given).__name__
             if address in sinks:
                 raise ArgumentError(f"--send {address} is given twice, expected once")
-            sinks[address] = open_sink(given) if isinstance(given, str) else _checked_sink(given, address)
+            if not isinstance(given, str):
+                check_methods(address, given, *_METHODS)
+            sinks[address] = open_sink(given) if isinstance(given, str) else given
             stack.callback(sinks[address].close)
         stack.pop_all()
     return SinkGroup(sinks)
@@ -167,14 +169,9 @@ def open_sink(address: str) -> LiveSink:
     name = address.partition("?")[0]
     if not (is_plugin(name) or name in list_plugins(GROUP)):
         raise ArgumentError(f"'{address}' is not an address to send to, expected {', '.join(VALID)}")
-    return _checked_sink(make_plugin(address, group=GROUP, noun="sink"), address)
-
-
-def _checked_sink(sink: Any, name: str) -> LiveSink:
-    """A sink of the user's own, if it has the methods of one."""
-    check_methods(name, sink, ("send", "close"), "the methods send and close of a sink")
-    made: LiveSink = sink
-    return made
+    sink: LiveSink = make_plugin(address, group=GROUP, noun="sink")
+    check_methods(address, sink, *_METHODS)
+    return sink
 
 
 class DatagramSink:
@@ -272,12 +269,8 @@ def _strings(address: str, values: Sequence[str]) -> _Content:
     return address, "s" * len(values), values
 
 
-class Channel(NamedTuple):
-    """One number of a sample of LSL."""
-
-    label: str
-    unit: str
-    kind: str
+_Channel = tuple[str, str, str]
+"""Label, unit and kind of one number of a sample of LSL."""
 
 
 class LabStreamingSink:
@@ -320,29 +313,29 @@ class LabStreamingSink:
         return self._lsl.StreamOutlet(info)
 
 
-def channels_of(header: LiveHeader) -> Iterator[Channel]:
+def channels_of(header: LiveHeader) -> Iterator[_Channel]:
     """The channels of a stream, in the order of `sample_of`."""
-    yield Channel("frame", "", "FrameNumber")
-    yield Channel("time", "seconds", "Time")
+    yield ("frame", "", "FrameNumber")
+    yield ("time", "seconds", "Time")
     for side in header.sides:
         yield from _pose_channels(f"{side}_status", f"{side}_wrist")
         for joint in header.angles:
-            yield Channel(f"{side}_{joint}", "radians", "JointAngle")
+            yield (f"{side}_{joint}", "radians", "JointAngle")
         for place in header.positions:
             for axis in _AXES:
-                yield Channel(f"{side}_{place}_{axis}", "meters", f"Position{axis.upper()}")
+                yield (f"{side}_{place}_{axis}", "meters", f"Position{axis.upper()}")
     for body in header.bodies:
         yield from _pose_channels(f"{body}_status", body)
-    yield Channel("lag", "seconds", "Lag")
+    yield ("lag", "seconds", "Lag")
 
 
-def _pose_channels(status: str, name: str) -> Iterator[Channel]:
+def _pose_channels(status: str, name: str) -> Iterator[_Channel]:
     """Status, position and orientation, with the kinds of XDF's motion capture such as PositionX."""
-    yield Channel(status, "", "Status")
+    yield (status, "", "Status")
     for label, unit in _POSE:
         what, _, axis = label.partition("_")
         kind = ("Position" if what == "position" else "Orientation") + axis.upper()
-        yield Channel(f"{name}_{label}", unit, kind)
+        yield (f"{name}_{label}", unit, kind)
 
 
 def sample_of(message: LiveMessage) -> np.ndarray:
@@ -374,7 +367,7 @@ class WebSocketSink:
         self.dropped = 0
         """Number of frames that were dropped for slow clients."""
         self._header = b""
-        self._clients: set[_Client] = set()
+        self._clients: dict[ServerConnection, asyncio.Queue[bytes]] = {}  # frames that wait for each
         self._loop = asyncio.new_event_loop()
         self._ending, self._ready = asyncio.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="websocket server", daemon=True)
@@ -399,11 +392,15 @@ class WebSocketSink:
             self._thread.join()
 
     def _spread(self, frame: bytes) -> None:
-        for client in self._clients:
-            self.dropped += client.put(frame)
+        """Queue a frame for every client; the oldest of a full queue is dropped."""
+        for queue in self._clients.values():
+            if queue.full():
+                queue.get_nowait()
+                queue.task_done()
+                self.dropped += 1
+            queue.put_nowait(frame)
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._listen_until_the_end())
         finally:
@@ -424,65 +421,36 @@ class WebSocketSink:
         )
         self._ready.set()
         await self._ending.wait()
-        waiting = {asyncio.ensure_future(client.empty.wait()): client for client in self._clients}
+        waiting = {asyncio.ensure_future(queue.join()): client for client, queue in self._clients.items()}
         if waiting:
             _, late = await asyncio.wait(waiting, timeout=_FLUSH)
             for one in late:
                 one.cancel()
-                waiting[one].connection.transport.abort()  # a closing handshake would wait, too
+                waiting[one].transport.abort()  # a closing handshake would wait, too
         server.close()
         await server.wait_closed()
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Send messages to a client until it leaves."""
-        client = _Client(connection)
-        self._clients.add(client)
-        sending = asyncio.ensure_future(self._deliver(client))
+        queue = self._clients[connection] = asyncio.Queue(_WAITING)
+        sending = asyncio.ensure_future(self._deliver(connection, queue))
         try:
             with suppress(self._closed_error):
                 while True:
                     await connection.recv()  # this notices pongs and the end of the connection
         finally:
-            self._clients.discard(client)
-            client.empty.set()
+            del self._clients[connection]
             sending.cancel()
 
-    async def _deliver(self, client: _Client) -> None:
+    async def _deliver(self, client: ServerConnection, queue: asyncio.Queue[bytes]) -> None:
         """Send a client the header, then frame after frame."""
         with suppress(self._closed_error):
-            frame = await client.next()
-            await client.connection.send(self._header, text=self._format.is_text)
+            frame = await queue.get()
+            await client.send(self._header, text=self._format.is_text)
             while True:
-                await client.connection.send(frame, text=self._format.is_text)
-                if not client.frames:
-                    client.empty.set()
-                frame = await client.next()
-
-
-class _Client:
-    """The frames that wait for a client; the oldest is dropped for a new one."""
-
-    def __init__(self, connection: ServerConnection) -> None:
-        self.connection = connection
-        self.frames: deque[bytes] = deque(maxlen=_WAITING)
-        self._came, self.empty = asyncio.Event(), asyncio.Event()
-        self.empty.set()
-
-    def put(self, frame: bytes) -> bool:
-        """Add a frame; returns whether the oldest one was dropped."""
-        full = len(self.frames) == _WAITING
-        self.frames.append(frame)
-        self._came.set()
-        self.empty.clear()
-        return full
-
-    async def next(self) -> bytes:
-        """Wait for the next frame."""
-        await self._came.wait()
-        frame = self.frames.popleft()
-        if not self.frames:
-            self._came.clear()
-        return frame
+                await client.send(frame, text=self._format.is_text)
+                queue.task_done()
+                frame = await queue.get()
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -66,7 +66,11 @@ class Parameters:
         try:
             groups, found = _walk(data, start + 4, processor, tell)
             read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
-            if sum(_num_bytes(raw) for _, _, raw in read) > _MAX_BYTES:
+            sizes = (
+                64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
+                for _, _, raw in read
+            )
+            if sum(sizes) > _MAX_BYTES:
                 raise CaptureError(f"damaged: the parameters hold more than {_MAX_BYTES} bytes")
             values = {(group, name): _read_values(bytes(raw), processor) for group, name, raw in read}
         except (ValueError, IndexError) as error:
@@ -124,11 +128,6 @@ def _walk(
             tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
             break
     return groups, found
-
-
-def _num_bytes(raw: memoryview) -> int:
-    """Upper bound of the bytes that the values of a parameter record need."""
-    return 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
 
 
 def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
@@ -233,8 +232,11 @@ def read_points(
     words = 4 * num_points + analog
     count = _num_frames(data, header, extent, words, size, num_points == header.num_points, tell)
     frames = np.frombuffer(data, dtype, count=count * words, offset=header.start).reshape(-1, words)
-    if extent.stated is None:
-        frames = _without_padding(frames)
+    if extent.stated is None:  # zeros may pad the last block
+        end, most = len(frames), BLOCK // frames[:1].nbytes
+        while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
+            end -= 1
+        frames = frames[:end]
     points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
     if scale < 0.0:
         return to_native(points, processor)
@@ -328,15 +330,6 @@ def _num_frames(
             raise CaptureError(f"damaged: {text}")
         tell(f"{text}; what follows them is not read")
     return stated
-
-
-def _without_padding(frames: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Frames without the zeros that pad the last block."""
-    most = BLOCK // frames[:1].nbytes
-    end = len(frames)
-    while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
-        end -= 1
-    return frames[:end]
 
 
 _MOST_LABEL_BYTES: Final = 255

@@ -125,11 +125,11 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
 def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarray, "T M 3"]]:
     """The named markers of every hand of a labeled capture, in their order.
 
-    A capture of one hand has one column per marker, as `select_markers` takes it. One of two hands, as
-    `handsim track` and `handsim label` write it, has a set of columns for each: "right:ThumbTip" and so on.
-    Of such a set, the frames without a marker are left out: the hand was not there.
+    A capture of two hands, as `handsim track` and `handsim label` write it, has a set of columns for each,
+    "right:ThumbTip" and so on. Frames without any marker of a set are left out: the hand was not there.
     """
-    columns = [_split_name(column) for column in capture.names]
+    parts = [column.rpartition(":") for column in capture.names]
+    columns = [(prefix.strip(), name.strip()) for prefix, _, name in parts]
     sets = list(dict.fromkeys(prefix for prefix, name in columns if name in names))
     held = [name for _, name in columns if name in names]
     if len(sets) < 2 or len(held) == len(set(held)):
@@ -144,12 +144,6 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
             raise CaptureError(f"columns '{prefix}:...': {error}") from error
         hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
     return hands
-
-
-def _split_name(column: str) -> tuple[str, str]:
-    """What is before the last colon of a column's name, and what is behind it."""
-    prefix, _, name = column.rpartition(":")
-    return prefix.strip(), name.strip()
 
 
 def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
@@ -264,7 +258,9 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
     positions = capture.positions
     zero = (positions == 0.0).all(axis=-1)
     count = int(zero.sum())
-    if count < 2 or not _moves(positions, np.isfinite(positions[..., 0]) & ~zero):
+    there = np.isfinite(positions[..., 0]) & ~zero
+    tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
+    if count < 2 or not any((track != track[:1]).any() for track in tracks):  # nothing moves
         return capture, 0
     return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
 
@@ -285,12 +281,3 @@ def check_place(capture: Capture, farthest: float) -> None:
             HandSimWarning,
             stacklevel=2,
         )
-
-
-def _moves(positions: Float[np.ndarray, "T N 3"], there: Bool[np.ndarray, "T N"]) -> bool:
-    """Whether any trajectory takes more than one position."""
-    for column in range(positions.shape[1]):
-        track = positions[there[:, column], column]
-        if len(track) and (track != track[0]).any():
-            return True
-    return False

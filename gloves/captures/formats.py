@@ -24,7 +24,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -65,16 +65,7 @@ _BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
-_KEYS: Final = (
-    "DataRate",
-    "CameraRate",
-    "NumFrames",
-    "NumMarkers",
-    "Units",
-    "OrigDataRate",
-    "OrigDataStartFrame",
-    "OrigNumFrames",
-)
+_KEYS: Final = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
 
 
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
@@ -90,7 +81,9 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     keys, values, titles, axes = (
         header_cells(line, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
     )
-    stated = _stated(keys, values)
+    if sum(map(bool, keys)) == sum(map(bool, values)):  # some writers put two tabs between values
+        keys, values = list(filter(None, keys)), list(filter(None, values))
+    stated = {key.lower(): value for key, value in zip(keys, values, strict=False)}
     if not stated.get("units"):
         raise CaptureError("the header (lines 2 and 3) states no Units")
     scale = meters_per(stated["units"])
@@ -123,24 +116,21 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     values = (rate, rate, str(num_frames), str(num_markers), "mm", rate, "1", str(num_frames))
     header = (
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
-        "\t".join(_KEYS),
+        _KEYS.replace(" ", "\t"),
         "\t".join(values),
         "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", "")), ""]),
         "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
     )
-    row_format = "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers)
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(header) + "\n\n")
-        for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
-            text = row_format % (frame + 1, frame / capture.rate, *row.tolist())
-            file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
+        _write_rows(file, capture, "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers), first=1)
 
 
-def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
-    """Values of line 3 by the lower-case keys of line 2; some writers put two tabs between values."""
-    if sum(map(bool, keys)) == sum(map(bool, values)):
-        keys, values = list(filter(None, keys)), list(filter(None, values))
-    return {key.lower(): value for key, value in zip(keys, values, strict=False)}
+def _write_rows(file: TextIO, capture: Capture, row_format: str, *, first: int) -> None:
+    """Write number, time and positions [mm] of each frame; a missing marker gets three blank cells."""
+    for frame, row in enumerate(capture.positions.reshape(capture.num_frames, -1) * 1e3):
+        text = row_format % (first + frame, frame / capture.rate, *row.tolist())
+        file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
 
 
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
@@ -258,10 +248,7 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
             writer.writerow(["", label, *(value for value in values for _ in _AXES)])
         writer.writerow(["", "", *["Position"] * (3 * num_markers)])
         writer.writerow(["Frame", "Time (Seconds)", *_AXES * num_markers])
-        row_format = "%d,%.6f" + ",%.6f" * (3 * num_markers)
-        for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
-            text = row_format % (frame, frame / capture.rate, *row.tolist())
-            file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
+        _write_rows(file, capture, "%d,%.6f" + ",%.6f" * (3 * num_markers), first=0)
 
 
 def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
@@ -328,29 +315,25 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     separator = max(b",", b";", b"\t", key=lines[at + 3].count)
     lines = [*lines[:at], *plain_lines(lines[at:end], separator, first=at + 1), *lines[end:]]
     rates, names, axes = (header_cells(lines[row], row + 1) for row in range(at + 1, at + 4))
-    columns = _vicon_columns(axes, at + 4)
+    if axes[0].lower() not in _FIRST_CELLS:
+        raise CaptureError(f"line {at + 4} begins with '{shortened(axes[0])}', expected 'Frame'")
+    columns = np.array([index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES])
+    if not len(columns):
+        raise CaptureError(f"no markers: line {at + 4} has no axes X, Y, Z")
     start, scales = _scales(lines[:end], at + 4, columns, tell)
     names += [""] * (len(axes) - len(names))
+    # A name stands above the first of its three columns.
+    above = [next(filter(None, names[max(0, n - 2) : n + 1][::-1]), "") for n in range(len(axes))]
     table = parse_table(
         lines[:end],
         start=start,
         ended=ended or end < len(lines),
-        titles=[f"{_name_of(names, column)} {axis}".strip() for column, axis in enumerate(axes)],
+        titles=[f"{name} {axis}".strip() for name, axis in zip(above, axes, strict=False)],
     )
     positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
     times = StatedTimes(rates[0], "the rate of the trajectories", numbers=table[:, 0])
     return Capture(labels, *timed_positions(positions, times, tell))
-
-
-def _vicon_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
-    """First column of the position of each trajectory, from the row of axes."""
-    if axes[0].lower() not in _FIRST_CELLS:
-        raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
-    columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]
-    if not columns:
-        raise CaptureError(f"no markers: line {number} has no axes X, Y, Z")
-    return np.array(columns)
 
 
 def _scales(
@@ -364,11 +347,6 @@ def _scales(
     units = [cells[column] if column < len(cells) else "" for column in columns]
     scales = {unit: meters_per(unit) for unit in set(units)}
     return row + 1, np.array([scales[unit] for unit in units])
-
-
-def _name_of(names: list[str], column: int) -> str:
-    """The name above a column, or above one of the two columns before it."""
-    return next((name for name in reversed(names[max(0, column - 2) : column + 1]) if name), "")
 
 
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
@@ -460,7 +438,7 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
 
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
-    """Read a CSV of Motive or of Vicon, which differ in their content only."""
+    """Read a CSV of Motive or of Vicon, told apart by their content."""
     if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
         return read_motive_csv(data, tell)
     if vicon_sections(split_lines(data)[0]):
@@ -597,14 +575,13 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
     """The named markers of each hand in labeled captures [m], without frames in which all are missing."""
-    markers = np.concatenate([_markers_of(file, names) for file in files])
+    hands = []
+    for file in files:
+        try:
+            hands += select_hands(read_capture(file), names)
+        except CaptureError as error:
+            text = str(error)
+            raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error
+    markers = np.concatenate(hands)
     shown: Float[np.ndarray, "T M 3"] = markers[np.isfinite(markers).any(axis=(1, 2))]
     return shown
-
-
-def _markers_of(file: Path, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    try:
-        return np.concatenate(select_hands(read_capture(file), names))
-    except CaptureError as error:
-        text = str(error)
-        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error

@@ -26,12 +26,9 @@ from handsim.errors import CaptureError, HandSimWarning, shortened
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _WORDS: Final = {
-    "millimeters": 1e-3,
-    "millimetres": 1e-3,
-    "centimeters": 1e-2,
-    "centimetres": 1e-2,
-    "meters": 1.0,
-    "metres": 1.0,
+    f"{prefix}{word}": METERS[unit]
+    for prefix, unit in (("milli", "mm"), ("centi", "cm"), ("", "m"))
+    for word in ("meters", "metres")
 }
 _MIN_WORD: Final = 4  # letters of a unit that is cut off; 'mil' may also be a thousandth of an inch
 MOST_CELLS: Final = 400_000
@@ -115,22 +112,18 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         return lines
     if separator == b",":
         _check_decimals(lines, first, wider)
-    return [
-        _unquoted(line, separator, number)
-        if b'"' in line
-        else line.replace(TAB, b" ").replace(separator, TAB)
-        for number, line in enumerate(lines, first)
-    ]
-
-
-def _unquoted(line: bytes, separator: bytes, number: int) -> bytes:
-    """A line with tabs between its cells, some of which are quoted."""
-    check_width(line.count(separator) + 1, number)
-    try:
-        row = next(csv.reader([line.decode("latin-1")], delimiter=separator.decode()), [])
-    except csv.Error as error:
-        raise CaptureError(f"line {number} cannot be read: {error}") from error
-    return TAB.join(" ".join(cell.split("\t")).encode("latin-1") for cell in row)
+    plain = []
+    for number, line in enumerate(lines, first):
+        if b'"' not in line:
+            plain.append(line.replace(TAB, b" ").replace(separator, TAB))
+            continue
+        check_width(line.count(separator) + 1, number)
+        try:
+            row = next(csv.reader([line.decode("latin-1")], delimiter=separator.decode()), [])
+        except csv.Error as error:
+            raise CaptureError(f"line {number} cannot be read: {error}") from error
+        plain.append(TAB.join(cell.replace("\t", " ").encode("latin-1") for cell in row))
+    return plain
 
 
 def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
@@ -176,9 +169,7 @@ def parse_table(
     """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
 
     Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its
-    end, because some writers omit missing markers, or have blank cells too many. A last line without a line
-    end is refused as cut if it has fewer cells than `titles` or than the first row, or if only its last
-    number has fewer decimals than the others.
+    end, because some writers omit missing markers, or have blank cells too many.
     """
     num_columns = len(titles)
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
@@ -187,8 +178,7 @@ def parse_table(
     if _decimal_commas((lines[index] for index in rows), text_columns):
         lines = [line.replace(b",", b".") for line in lines]
     if not ended and rows[-1] == len(lines) - 1:
-        _check_whole(lines[rows[0]], lines[-1], len(lines), num_columns)
-        _check_last_number([lines[index] for index in rows], len(lines))
+        _check_last_line([lines[index] for index in rows], len(lines), num_columns)
     written = sum(map(len, lines))  # a cell takes at least one byte, its separator
     if len(rows) * num_columns > written + _MOST_BLANKS:  # before the table is allocated
         raise CaptureError(
@@ -232,23 +222,18 @@ def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool
     return found
 
 
-def _check_whole(first: bytes, line: bytes, number: int, num_columns: int) -> None:
-    """Refuse a last line without a line end that has fewer cells than the first row of the table."""
-    # a separator may end a row, so one blank cell beyond the table counts
-    usual = min(first.count(TAB) + 1, num_columns + 1)
-    expected, got = max(usual, num_columns), line.count(TAB) + 1
+def _check_last_line(rows: list[bytes], number: int, num_columns: int) -> None:
+    """Refuse a last line without a line end that lacks cells, or decimals of its last number."""
+    *others, last = rows[-1].split(TAB)
+    # A separator may end a row, so one blank cell beyond the table counts.
+    usual = min(rows[0].count(TAB) + 1, num_columns + 1)
+    expected, got = max(usual, num_columns), len(others) + 1
     if got < expected:
         raise CaptureError(
             f"truncated: line {number}, the last, has {got} of {expected} cells and no line end"
         )
-
-
-def _check_last_number(lines: list[bytes], number: int) -> None:
-    """Refuse a last number without a line end that has fewer decimals than all others."""
-    *others, last = lines[-1].split(TAB)
-    cells = [cell for line in lines[:-1][:_SAMPLED_ROWS] for cell in line.split(TAB)[_LEADING:]]
-    cells += others[_LEADING:]
-    numbers = [cell.strip() for cell in cells if cell.strip()]
+    cells = [cell for row in rows[:-1][:_SAMPLED_ROWS] for cell in row.split(TAB)[_LEADING:]]
+    numbers = [cell.strip() for cell in (*cells, *others[_LEADING:]) if cell.strip()]
     decimals = {len(cell.partition(b".")[2]) for cell in numbers}
     # numbers of a writer that drops zeros at the end may agree in length by chance
     fixed = any(cell.endswith(b"0") for cell in numbers) or len(numbers) >= _MANY_NUMBERS
@@ -338,8 +323,11 @@ def timed_positions(
         steps = np.diff(numbers)
         stride = int(np.gcd.reduce(steps))  # some programs number every n-th frame of the cameras
         steps //= stride
-    rate = _stated_rate(stated.rate)
-    if rate is None:
+    try:
+        rate = cell_number(stated.rate)
+    except ValueError:
+        rate = math.nan
+    if not 0.0 < rate < np.inf:
         rate = _rate_of_times(stated, steps, times, tell)
     check_rate(rate, stated.rate_name)
     if times is not None and len(times) > 1:
@@ -355,11 +343,26 @@ def timed_positions(
     frames = np.concatenate([[0], np.cumsum(steps)])
     num_frames = int(frames[-1]) + 1
     first = 0 if numbers is None else int(numbers[0])
-    _check_missing(num_frames, steps, first + stride * frames, times)
-    _check_count(stated, len(positions), num_frames, tell)
-    if num_frames == len(positions):
+    places, there = first + stride * frames, len(positions)
+    if num_frames - there > _MAX_MISSING * there:
+        row = int(np.argmax(steps))
+        at = "" if times is None else f", from {times[row]:g} s to {times[row + 1]:g} s"
+        raise CaptureError(
+            f"{steps[row] - 1} frames are missing behind frame {places[row]}{at}, and {there} are there; "
+            "correct the numbers or the times, or cut the capture there"
+        )
+    if stated.count.strip().isdecimal():
+        count = int(stated.count.strip()[:_MAX_DIGITS])
+        if count > num_frames and stated.count_is_reliable:
+            raise CaptureError(
+                f"truncated: {stated.count_name} is {count}, and {num_frames} frames are there; export the "
+                "file again, or correct that number if they are all"
+            )
+        if count < there or count > num_frames:
+            tell(f"{stated.count_name} is {count}, and {there} frames are there; all are read")
+    if num_frames == there:
         return positions, rate
-    tell(_missing_sentence(steps, first + stride * frames, stride, num_frames))
+    tell(_missing_sentence(steps, places, stride, num_frames))
     filled = np.full((num_frames, *positions.shape[1:]), np.nan)
     filled[frames] = positions
     return filled, rate
@@ -399,15 +402,6 @@ class _Ticks:
         tolerance = _RATE_TOLERANCE + self.rounding * self.stated / self.window
         rate = self.rate(steps)
         return rate < np.inf and abs(self.stated / rate - 1.0) <= tolerance
-
-
-def _stated_rate(text: str) -> float | None:
-    """The rate in a header [Hz]; None if it is not a positive number."""
-    try:
-        rate = cell_number(text)
-    except ValueError:
-        return None
-    return rate if 0.0 < rate < np.inf else None
 
 
 def _increasing_numbers(numbers: Float[np.ndarray, "T"] | None) -> Int[np.ndarray, "T"] | None:
@@ -481,39 +475,6 @@ def _with_gaps_in_time(steps: Int[np.ndarray, "T-1"], ticks: _Ticks) -> Int[np.n
         )
     gaps = np.where(excess > 0.0, np.maximum(np.round(excess + made_up - _JITTER), 0.0), 0.0)
     return steps + gaps.astype(np.int64)
-
-
-def _check_missing(
-    num_frames: int,
-    steps: Int[np.ndarray, "T-1"],
-    numbers: Int[np.ndarray, "T"],
-    times: Float[np.ndarray, "T"] | None,
-) -> None:
-    """Refuse a gap that is many times longer than the capture."""
-    there = len(numbers)
-    if num_frames - there <= _MAX_MISSING * there:
-        return
-    row = int(np.argmax(steps))
-    at = "" if times is None else f", from {times[row]:g} s to {times[row + 1]:g} s"
-    raise CaptureError(
-        f"{steps[row] - 1} frames are missing behind frame {numbers[row]}{at}, and {there} are there; "
-        "correct the numbers or the times, or cut the capture there"
-    )
-
-
-def _check_count(stated: StatedTimes, there: int, spanned: int, tell: Callable[[str], None]) -> None:
-    """Compare the stated number of frames with the frames that are present and the frames they span."""
-    text = stated.count.strip()
-    if not text.isdecimal():
-        return
-    count = int(text[:_MAX_DIGITS])
-    if count > spanned and stated.count_is_reliable:
-        raise CaptureError(
-            f"truncated: {stated.count_name} is {count}, and {spanned} frames are there; export the file "
-            "again, or correct that number if they are all"
-        )
-    if count < there or count > spanned:
-        tell(f"{stated.count_name} is {count}, and {there} frames are there; all are read")
 
 
 def _missing_sentence(

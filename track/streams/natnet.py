@@ -159,8 +159,7 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> StreamedFrame:
     """Read the observed markers of a frame, without those that the server filled in."""
-    reader, extra = _Reader(payload), 4 if version >= _SIZED else 0
-    size = _MARKER.itemsize
+    reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
     number = reader.integer()
     for _ in range(reader.count(5, extra)):  # marker sets: names, and markers once more
         reader.skip_text()
@@ -244,13 +243,15 @@ class _Reader:
         self._at = end + 1
 
 
-def open_stream(url: str, *, local: str | None = None) -> PointStream:
-    """Connect to the server at `natnet://host:port`; `local` is the address of the network card to use."""
+def open_stream(url: str) -> PointStream:
+    """Connect to the server at `natnet://host:port`."""
     host, port, _ = split_address(url, options={}, port=COMMAND_PORT)
     try:
         server = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
         address = (str(server[0]), port)
-        commands = _bind(local or _own_address(address), 0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(address)  # sends nothing, but chooses the network card that leads to the server
+            commands = _bind(probe.getsockname()[0], 0)
     except OSError as error:
         raise CaptureError(f"{url}: cannot be reached ({error.strerror or error})") from error
     try:
@@ -371,14 +372,6 @@ class PointStream(ArrivingFrames):
             return None
         self._heard = time.monotonic()
         return frame
-
-
-def _own_address(server: tuple[str, int]) -> str:
-    """Address of the network card that leads to the server; no packet is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(server)
-        own: str = probe.getsockname()[0]
-        return own
 
 
 def _bind(address: str, port: int) -> socket.socket:
@@ -516,7 +509,14 @@ class ReplayServer(Closing):
         **options: Any,
     ) -> None:
         settings = ReplaySettings.of(settings, options)
-        points, ids, own_rate = _point_frames(source)
+        if isinstance(source, str | Path):
+            source = read_points(source)
+        if isinstance(source, Capture):
+            points, ids = source.positions, number_runs(np.isfinite(source.positions[..., 0]))
+        else:
+            if not all(hasattr(source, name) for name in ("rate", "ids")):
+                check_type("source", source, Capture, "a Capture, a Take, or the path of a file")
+            points, ids = source.points, source.ids
         if points.ndim != 3 or points.shape != (*ids.shape, 3):
             raise CaptureError(
                 f"points have shape {points.shape} and IDs {ids.shape}, expected (T, N, 3) and (T, N)"
@@ -530,7 +530,7 @@ class ReplayServer(Closing):
             known = [f"{major}.{minor}" for major, minor in VERSIONS]
             raise ArgumentError(choices(".".join(map(str, version)), known, noun="NatNet version"))
         self._points, self._ids, self._version, self._loop = points, ids, version, settings.loop
-        self.rate = settings.rate or own_rate
+        self.rate = settings.rate or source.rate
         """Frames per second [Hz]."""
         self._ids_of_round = int(ids.max(initial=-1)) + 1
         self._host, self._socket = settings.host, _listen(settings.host, settings.port)
@@ -612,19 +612,6 @@ class ReplayServer(Closing):
             self._clients[client] = time.monotonic()
         elif kind == Kind.DISCONNECT:
             self._clients.pop(client, None)
-
-
-def _point_frames(
-    source: Capture | PointFrames | str | Path,
-) -> tuple[Float[np.ndarray, "T N 3"], Int[np.ndarray, "T N"], float]:
-    """Points [m], IDs and rate [Hz] of the source of a `ReplayServer`."""
-    if isinstance(source, str | Path):
-        source = read_points(source)
-    if not all(hasattr(source, name) for name in ("rate", "ids")):
-        check_type("source", source, Capture, "a Capture, a Take, or the path of a file")
-    if isinstance(source, Capture):
-        return source.positions, number_runs(np.isfinite(source.positions[..., 0])), source.rate
-    return source.points, source.ids, source.rate
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -17,11 +17,6 @@ from handsim.errors import ArgumentError, HandSimError
 if TYPE_CHECKING:
     from viser import ViserServer
 
-# The page at `/` forwards to viser's dark or light address, because only the browser knows its theme.
-_DARK_OR_LIGHT: Final = """<!doctype html><html><script>
-location.replace("/?" + (matchMedia("(prefers-color-scheme: dark)").matches ? "darkMode" : "light"))
-</script></html>
-"""
 _PORTS: Final = range(8080, 8100)  # tried in this order when --port is not given
 
 
@@ -54,10 +49,8 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
 
 def address_of(server: ViserServer) -> str:
     """The address of the page, for a browser on this machine."""
-    host = server.get_host()
-    if host in ("0.0.0.0", "::"):
-        host = "localhost"
-    return f"http://[{host}]:{server.get_port()}" if ":" in host else f"http://{host}:{server.get_port()}"
+    host = "localhost" if server.get_host() in ("0.0.0.0", "::") else server.get_host()
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
@@ -75,10 +68,8 @@ def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
@@ -97,11 +88,6 @@ def _guarded(host: str) -> Iterator[None]:
             headers = request.headers
             if not is_own_page(headers.get("Origin"), headers.get("Host"), host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "another page's connection is refused\n")
-            if request.path == "/" and headers.get("Upgrade") != "websocket":
-                page = connection.respond(HTTPStatus.OK, _DARK_OR_LIGHT)
-                del page.headers["Content-Type"]  # plain text; assigning would add a second one
-                page.headers["Content-Type"] = "text/html; charset=utf-8"
-                return page
             answer: Response | None = process_request(connection, request)
             return answer
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -27,12 +26,12 @@ from handsim.space.rig import CameraRig, list_rigs, load_rig
 from track.user import load_user
 from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
-from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume
+from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume, switch
 from track.viewer.timeline import StatusPanel, Timeline
 from train.data.shards import Dataset
 
 if TYPE_CHECKING:
-    from viser import FrameHandle, GuiCheckboxHandle, GuiEvent, ViserServer
+    from viser import ViserServer
 
 ACCEPTED: Final = (
     "a marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture "
@@ -68,76 +67,73 @@ def open_content(
     time: float | None = None,
 ) -> Content:
     """Read a file, folder or shipped layout or rig; parameters are those of `handsim view`."""
-    content = _open(name, out, size, rig, time)
-    if time is not None and content.recording is None:
+    path, given, keys = Path(name), cast("str | Path", name), set[str]()
+    suffix = path.suffix.lower()
+    if not path.exists() and name in (*list_layouts(), *list_rigs()):
+        keys = {"radius_mm" if name in list_layouts() else "camera"}
+    elif not path.exists() and not suffix and not is_growing(path):
+        raise ArgumentError(f"{name}: no such file, folder or shipped name, expected {ACCEPTED}")
+    elif suffix == ".toml" and not path.is_dir():
+        given, keys = path, set(read_toml(path, error=FileError))
+        if not keys & {"camera", "field_of_view", "radius_mm"}:
+            raise ArgumentError(f"{path}: a TOML file of another kind, expected {ACCEPTED}")
+    if keys & {"camera", "field_of_view"}:
+        content = _rig(load_rig(given))
+    elif keys:
+        content = _layout(given, out, size)
+    elif out is not None:
+        raise ArgumentError(f"--out is {out}, but {name} is no marker layout: nothing would be saved")
+    elif suffix == ".json":
+        hands = load_user(path)
+        content = Content("user", lambda server: _show_user(server, hands))
+    else:
+        return _moving(path, name, None if rig is None else load_rig(rig), time)
+    if time is not None:
         raise ArgumentError(f"--time is {time:g}, but {name} is a {content.kind}: nothing in it moves")
     return content
 
 
-def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, time: float | None) -> Content:
-    path = Path(name)
-    if not path.exists() and name in list_layouts():
-        return _layout(name, None, out, size)
-    if not path.exists() and name in list_rigs():
-        return _rig(name)
-    if not path.exists() and not is_growing(path) and not path.suffix:
-        raise ArgumentError(f"{name}: no such file, folder or shipped name, expected {ACCEPTED}")
-    suffix = path.suffix.lower()
-    if suffix == ".toml" and not path.is_dir():
-        keys = read_toml(path, error=FileError).keys()
-        if keys & {"camera", "field_of_view"}:
-            return _rig(path)
-        if "radius_mm" in keys:
-            return _layout(path, path, out, size)
-        raise ArgumentError(f"{path}: a TOML file of another kind, expected {ACCEPTED}")
-    if out is not None:
-        raise ArgumentError(f"--out is {out}, but {name} is no marker layout: nothing would be saved")
-    if suffix == ".json":
-        hands = load_user(path)
-        return Content("user", lambda server: _still(UserView(server, hands)))
-    recording, corrector = _recording(path, None if rig is None else load_rig(rig))
-    kind = type(recording).__name__.removesuffix("Recording").lower()
+def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None) -> Content:
+    """The frames of a file or folder, with the corrector of a tracked take."""
+    recording: Recording
+    corrector: Corrector | None = None
+    if path.is_dir():
+        recording = DatasetRecording(Dataset(path), rig)
+    elif path.suffix.lower() in READABLE:
+        recording = CaptureRecording(read_capture(path), rig)
+    elif path.suffix.lower() == ".npz" or is_growing(path):
+        take = load_take(path)
+        if take.made_by_tracker and not is_growing(path):
+            corrector = Corrector(path, take)
+            for sentence in told(corrections_path(path), corrector.unfitting):
+                warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        recording = TakeRecording(corrector.take if corrector else take, rig)
+    else:
+        raise ArgumentError(f"{path}: a file of another kind, expected {ACCEPTED}")
     first = 0
     if time is not None:
         begin, end = float(recording.times[0]), float(recording.times[-1])
         if not begin - _ROUNDED <= time <= end + _ROUNDED:
             raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
         first = int(np.argmin(np.abs(recording.times - time)))
+    kind = type(recording).__name__.removesuffix("Recording").lower()
     return Content(kind, lambda server: show_recording(server, recording, corrector, first), recording)
 
 
-def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector | None]:
-    """The frames of a file or folder, and the corrector of a tracked take."""
-    if path.is_dir():
-        return DatasetRecording(Dataset(path), rig), None
-    if path.suffix.lower() in READABLE:
-        return CaptureRecording(read_capture(path), rig), None
-    if path.suffix.lower() == ".npz" or is_growing(path):
-        take = load_take(path)
-        if is_growing(path) or not take.made_by_tracker:
-            return TakeRecording(take, rig), None
-        corrector = Corrector(path, take)
-        for sentence in told(corrections_path(path), corrector.unfitting):
-            warnings.warn(sentence, HandSimWarning, stacklevel=2)
-        return TakeRecording(corrector.take, rig), corrector
-    raise ArgumentError(f"{path}: a file of another kind, expected {ACCEPTED}")
-
-
-def _layout(name: str | Path, path: Path | None, out: Path | None, size: str) -> Content:
-    layout = load_layout(name)
+def _layout(given: str | Path, out: Path | None, size: str) -> Content:
+    layout = load_layout(given)
     model = HandModel.named(size, side=layout.sides[-1])
-    given = Path(gloves.layout.__file__).parent / "layouts" / f"{name}.toml" if path is None else path
+    shipped = Path(gloves.layout.__file__).parent / "layouts" / f"{given}.toml"
+    path = shipped if isinstance(given, str) else given
     if out is not None:
-        check_outputs((given,), (out,))
+        check_outputs((path,), (out,))
         if out.exists():
             raise ArgumentError(f"--out is {out}, which exists already, expected a new name")
-    target = out or edited_path(Path(f"{layout.name}.toml") if path is None else path)
-    return Content("layout", lambda server: _still(LayoutEditor(server, given, layout, model, target)))
+    target = out or edited_path(Path(f"{layout.name}.toml") if isinstance(given, str) else given)
+    return Content("layout", lambda server: _still(LayoutEditor(server, path, layout, model, target)))
 
 
-def _rig(name: str | Path) -> Content:
-    rig = load_rig(name)
-
+def _rig(rig: CameraRig) -> Content:
     def show(server: ViserServer) -> Run:
         show_rig(server, rig)
         show_volume(server, rig)
@@ -147,7 +143,7 @@ def _rig(name: str | Path) -> Content:
             "training sets."
         )
         set_stage(server, rig.positions, ground=0.0)
-        return _still(rig)
+        return _still()
 
     return Content("rig", show)
 
@@ -202,7 +198,7 @@ def first_look(recording: Recording) -> np.ndarray:
     return np.concatenate([frame.points for frame in frames])
 
 
-def _still(_shown: object) -> Run:
+def _still(_shown: object = None) -> Run:
     """Serve a page that only reacts; the page's handlers live as long as `_shown`."""
 
     def run(ended: Callable[[], bool]) -> None:
@@ -212,69 +208,45 @@ def _still(_shown: object) -> Run:
     return run
 
 
-class UserView:
-    """Hands of a user's file, flat, side by side; lines lead from the designed markers to the real ones."""
-
-    def __init__(self, server: ViserServer, hands: Sequence[GloveFit]) -> None:
-        self.before = [nominal_hand(hand) for hand in hands]
-        """The hands of the nearest named sizes, in gloves as designed."""
-        self.skins: list[HandSkin] = []
-        """Skins of the first hand after and before calibration, then those of the second one."""
-        gui, scene = server.gui, server.scene
-        for node, words in (("/after", "calibrated hands"), ("/before", "hands of the nearest size")):
-            root = scene.add_frame(node, show_axes=False)
-            gui.add_checkbox(words, True).on_update(partial(_switch, root))
-        corners = []
-        for number, (hand, before) in enumerate(zip(hands, self.before, strict=True)):
-            shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
-            self._add_hand(server, f"/after/{hand.side}", hand, shift, None)
-            self._add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR)
-            ends = np.stack([before.attachment.points, hand.attachment.points], axis=1) + shift
-            scene.add_line_segments(
-                f"/moved/{hand.side}",
-                points=ends,
-                colors=(200, 60, 50),
-                thickness=2.0,
-                thickness_units="screen",
-            )
-            corners.append(hand.model.surface.vertices + shift)
-            gui.add_markdown(describe(hand, before))
-        set_stage(server, np.concatenate(corners), ground=0.0)
-
-    def _add_hand(
-        self,
-        server: ViserServer,
-        node: str,
-        hand: GloveFit,
-        shift: np.ndarray,
-        color: tuple[int, int, int] | None,
-    ) -> None:
-        qpos = np.zeros(NUM_QPOS)
-        qpos[:3], qpos[3] = shift, 1.0
-        skin = HandSkin(server, f"{node}/skin", color=color, opacity=None if color is None else 0.35)
-        skin.show(hand.model, qpos)
-        self.skins.append(skin)
-        count = hand.layout.num_markers
-        radius = hand.layout.radius * (1.0 if color is None else 0.5)
-        balls = PointBalls(server, f"{node}/markers", hand.layout.names, most=count, radius=radius)
-        balls.show(hand.attachment.points + shift, np.arange(count), np.ones(count, dtype=np.bool_))
+def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
+    """Show a user's hands, flat, side by side; lines lead from the designed markers to the real ones."""
+    for node, words in (("/after", "calibrated hands"), ("/before", "hands of the nearest size")):
+        switch(server, words, server.scene.add_frame(node, show_axes=False))
+    corners = []
+    for number, hand in enumerate(hands):
+        nominal = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
+        before = min(nominal, key=lambda fit: abs(fit.shape.length - hand.shape.length))
+        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
+        _add_hand(server, f"/after/{hand.side}", hand, shift)
+        _add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR, 0.35, 0.5)
+        points = np.stack([before.attachment.points, hand.attachment.points], axis=1)
+        server.scene.add_line_segments(
+            f"/moved/{hand.side}", points + shift, (200, 60, 50), thickness=2.0, thickness_units="screen"
+        )
+        corners.append(hand.model.surface.vertices + shift)
+        moved = 1e3 * np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+        server.gui.add_markdown(
+            f"**{hand.side}**: {1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm, "
+            f"nearest size {1e3 * before.shape.length:.0f} x {1e3 * before.shape.breadth:.0f} mm; "
+            f"markers differ by {np.median(moved):.1f} mm (median), {moved.max():.1f} mm at most"
+        )
+    set_stage(server, np.concatenate(corners), ground=0.0)
+    return _still()
 
 
-def _switch(node: FrameHandle, event: GuiEvent[GuiCheckboxHandle]) -> None:
-    node.visible = event.target.value
-
-
-def nominal_hand(hand: GloveFit) -> GloveFit:
-    """The hand of the named size with the nearest length, in the same glove as designed."""
-    fits = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
-    return min(fits, key=lambda fit: abs(fit.shape.length - hand.shape.length))
-
-
-def describe(hand: GloveFit, before: GloveFit) -> str:
-    """A sentence on a hand's measures and those of the nearest size."""
-    moved = np.linalg.norm(hand.attachment.points - before.attachment.points, axis=1)
-    return (
-        f"**{hand.side}**: {1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm, "
-        f"nearest size {1e3 * before.shape.length:.0f} x {1e3 * before.shape.breadth:.0f} mm; "
-        f"markers differ by {1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} mm at most"
-    )
+def _add_hand(
+    server: ViserServer,
+    node: str,
+    hand: GloveFit,
+    shift: np.ndarray,
+    color: tuple[int, int, int] | None = None,
+    opacity: float | None = None,
+    size: float = 1.0,
+) -> None:
+    """Show a flat hand with markers of `size` times their radius."""
+    qpos = np.zeros(NUM_QPOS)
+    qpos[:3], qpos[3] = shift, 1.0
+    HandSkin(server, f"{node}/skin", color=color, opacity=opacity).show(hand.model, qpos)
+    count, radius = hand.layout.num_markers, size * hand.layout.radius
+    balls = PointBalls(server, f"{node}/markers", hand.layout.names, most=count, radius=radius)
+    balls.show(hand.attachment.points + shift, np.arange(count), np.ones(count, dtype=np.bool_))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import threading
@@ -85,7 +86,21 @@ class Corrector:
     def add(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
         """Give a point its right label, a marker's name or `NO_MARKER`, in the frames of a span."""
         with self._lock:
-            correction = self._meant(frame, column, span, label)
+            points, (first, last) = self.take.point_list, sorted(span)
+            point, start = points.at(frame, column), frame
+            if points.ids[point] >= 0:
+                within = (points.frames >= first) & (points.frames <= last)
+                same = np.flatnonzero((points.ids == points.ids[point]) & within)
+                if not len(same):
+                    raise CaptureError(
+                        f"the point is not there in frames {first} to {last}, expected a frame with it"
+                    )
+                point = int(same[0])
+                start, last = points.frames[same[[0, -1]]].tolist()
+            x, y, z = points.points[point].tolist()
+            correction = Correction(start, max(start, last), (x, y, z), label)
+            followed = points.frames[follow_point(points, correction)]
+            correction = dataclasses.replace(correction, last=int(followed[-1]))
             self._make((*self.added, correction))
         return correction
 
@@ -113,26 +128,6 @@ class Corrector:
                 raise CaptureError(f"{self.path}: cannot be written: {words}") from error
             self._base, self._state, self._stale = self.take, _state_of(self.path), False
         return f"saved {self.path} and {beside}"
-
-    def _meant(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
-        """A point's correction, from its first to its last frame within a span."""
-        points = self.take.point_list
-        first, last = min(span), max(span)
-        point = points.at(frame, column)
-        start = frame
-        if points.ids[point] >= 0:
-            same = np.flatnonzero(points.ids == points.ids[point])
-            same = same[(points.frames[same] >= first) & (points.frames[same] <= last)]
-            if not len(same):
-                raise CaptureError(
-                    f"the point is not there in frames {first} to {last}, expected a frame with it"
-                )
-            point = int(same[0])
-            start, last = int(points.frames[point]), int(points.frames[same[-1]])
-        place: list[float] = points.points[point].tolist()
-        correction = Correction(start, max(start, last), (place[0], place[1], place[2]), label)
-        followed = points.frames[follow_point(points, correction)]
-        return Correction(start, int(followed[-1]), correction.place, label)
 
     def _make(self, added: Sequence[Correction]) -> None:
         """Make the take with the saved and these corrections; `CaptureError` if they contradict."""
@@ -244,8 +239,17 @@ class LabelEditor:
             saves = gui.add_button("Save take", color="gray", hint=f"Writes {self._corrector.path}")
             saves.on_click(lambda _: self.save())
             self.list = gui.add_markdown("")
-        self.points.on_update(self._pick_row)
-        ends.on_click(lambda event: self._set_end(event.target.value))
+
+        @self.points.on_update
+        def _(event: Any) -> None:
+            if event.client is not None and self.points.value in self._rows:
+                self.choose(self._frame, self._rows[self.points.value])
+
+        @ends.on_click
+        def _(event: Any) -> None:
+            (first, last), frame = self.span.value, self._frame
+            is_first = event.target.value == "first"
+            _set(self.span, (frame, max(frame, last)) if is_first else (min(first, frame), frame))
 
     def _undo(self) -> None:
         self._corrector.undo()
@@ -258,15 +262,6 @@ class LabelEditor:
         self._list()
         self._changed()
 
-    def _pick_row(self, event: Any) -> None:
-        if event.client is not None and self.points.value in self._rows:
-            self.choose(self._frame, self._rows[self.points.value])
-
-    def _set_end(self, end: str) -> None:
-        first, last = self.span.value
-        frame = self._frame
-        _set(self.span, (frame, max(frame, last)) if end == "first" else (min(first, frame), frame))
-
     def _columns(self) -> np.ndarray:
         """Columns of the points of the shown frame."""
         points = self._corrector.take.point_list
@@ -275,20 +270,16 @@ class LabelEditor:
     def _name(self, frame: int, column: int) -> str:
         take = self._corrector.take
         number = int(take.point_list.ids[take.point_list.at(frame, column)])
-        return f"{'ID ' if number >= 0 else 'column '}{number if number >= 0 else column}: " + label_of(
-            take, frame, column
-        )
+        name = f"ID {number}" if number >= 0 else f"column {column}"
+        return f"{name}: {label_of(take, frame, column)}"
 
     def _show_points(self) -> None:
         """List the points of the shown frame, with the chosen one selected."""
         self._rows = {self._name(self._frame, int(column)): int(column) for column in self._columns()}
-        rows = (_NOTHING, *self._rows)
-        if rows != self.points.options:
+        if (rows := (_NOTHING, *self._rows)) != self.points.options:
             self.points.options = rows
         column = self._chosen_column()
-        value = _NOTHING if column is None else self._name(self._frame, column)
-        if self.points.value != value:
-            _set(self.points, value)
+        _set(self.points, _NOTHING if column is None else self._name(self._frame, column))
 
     def _chosen_column(self) -> int | None:
         """The column of the chosen point in the shown frame."""
@@ -307,8 +298,7 @@ class LabelEditor:
         if column is not None:
             points = self._corrector.take.point_list
             self.halo.position = points.points[points.at(self._frame, column)]
-        if self.halo.visible != (column is not None):
-            self.halo.visible = column is not None
+        self.halo.visible = column is not None
 
     def _list(self) -> None:
         corrector = self._corrector
@@ -330,7 +320,7 @@ class LayoutEditor:
     def __init__(
         self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
     ) -> None:
-        self._server, self._path, self._out, self._lock = server, path, out, threading.Lock()
+        self._path, self._out, self._lock = path, out, threading.Lock()
         self.shift = np.array([0.0, 0.0, _HEIGHT])
         """Wrist position in the page [m]."""
         self.fit: GloveFit = attach(layout, model)
@@ -347,16 +337,18 @@ class LayoutEditor:
         self.gizmo = server.scene.add_transform_controls(
             "/move", scale=_GIZMO, disable_rotations=True, depth_test=False, visible=False, line_width=3.0
         )
-        self._add_controls(layout)
+        gui = server.gui
+        self.state = gui.add_markdown(f"**{layout.name}**: click a marker, then drag its arrows.")
+        self.names = gui.add_dropdown("marker", layout.names)
+        every = gui.add_checkbox("names", False)
+        labels = frozenset(range(count))
+        every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
+        gui.add_button("Save layout", hint=f"Writes {out}").on_click(lambda _: self._save())
+        self.names.on_update(self._pick)
         self.balls.balls.on_click(self._click)
         self.gizmo.on_update(self._drag)
         self._show()
-        set_stage(server, self.skin_points(), ground=0.0)
-
-    def skin_points(self) -> np.ndarray:
-        """The vertices of the skin in the page [m]."""
-        points: np.ndarray = self.fit.model.surface.vertices + self.shift
-        return points
+        set_stage(server, model.surface.vertices + self.shift, ground=0.0)
 
     def choose(self, index: int) -> None:
         """Choose the marker that the gizmo moves."""
@@ -392,16 +384,6 @@ class LayoutEditor:
                 raise LayoutError(f"{self._out}: cannot be written: {error.strerror or error}") from error
         self.changed = False
         return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
-
-    def _add_controls(self, layout: MarkerLayout) -> None:
-        gui = self._server.gui
-        self.state = gui.add_markdown(f"**{layout.name}**: click a marker, then drag its arrows.")
-        self.names = gui.add_dropdown("marker", layout.names)
-        self.names.on_update(self._pick)
-        every = gui.add_checkbox("names", False)
-        labels = frozenset(range(layout.num_markers))
-        every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
-        gui.add_button("Save layout", hint=f"Writes {self._out}").on_click(lambda _: self._save())
 
     def _save(self) -> None:
         try:

@@ -6,10 +6,10 @@ import colorsys
 import itertools
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8, UInt32
@@ -58,13 +58,6 @@ class ShownFrame:
     """Lines of sight from markers to the cameras that see them [m]."""
 
 
-class Curve(NamedTuple):
-    """A quantity over time."""
-
-    name: str
-    values: Float[np.ndarray, "T"]
-
-
 class Recording(ABC):
     """T frames, computed on request."""
 
@@ -77,7 +70,8 @@ class Recording(ABC):
     """Marker radius [m]."""
     bodies: tuple[RigidBody, ...] = ()
     rig: CameraRig | None = None
-    curves: tuple[Curve, ...] = ()
+    curves: Mapping[str, Float[np.ndarray, "T"]] = {}
+    """Quantities over time by name."""
     suspects: tuple[SuspectSpan, ...] = ()
     """Doubtful spans of frames, the most doubtful first."""
     has_hands = has_filled = True
@@ -144,12 +138,12 @@ def _words_of(name: str, status: object, rms: float, filled: int = 0) -> str:
     return f"**{name}** {status}{rms_words}" + (f", {filled} filled in" if filled else "")
 
 
-def _curves(take: Take) -> tuple[Curve, ...]:
+def _curves(take: Take) -> dict[str, Float[np.ndarray, "T"]]:
     """RMS of each hand, and doubt; empty if no pose was fitted, as in a simulation's truth."""
     if not np.isfinite(take.rms).any():
-        return ()
-    curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
-    return (*curves, Curve("doubt, 0 to 1", 1.0 - frame_confidence(take)))
+        return {}
+    curves = {f"{side} RMS [mm]": 1e3 * take.rms[:, hand] for hand, side in enumerate(take.sides)}
+    return curves | {"doubt, 0 to 1": 1.0 - frame_confidence(take)}
 
 
 def rig_of_settings(rig: object) -> CameraRig | None:

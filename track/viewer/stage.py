@@ -23,9 +23,9 @@ if TYPE_CHECKING:
         BatchedMeshHandle,
         FrameHandle,
         LabelHandle,
-        LineSegmentsHandle,
         MeshHandle,
         MeshSkinnedHandle,
+        SceneNodeHandle,
         SceneNodePointerEvent,
         ViserServer,
     )
@@ -52,9 +52,17 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     height = float(low[2]) - 0.02 - 0.1 * size if ground is None else ground
     cell = 0.01 if size < 0.5 else 0.1
-    server.scene.set_up_direction("+z")
-    _set_light(server)
-    server.scene.add_grid(
+    scene = server.scene
+    scene.set_up_direction("+z")
+    # The light is soft, so that labels keep their colors.
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map("studio", environment_intensity=0.12)
+    scene.add_light_hemisphere(
+        "/light/sky", sky_color=(255, 255, 255), ground_color=(150, 140, 130), intensity=0.55
+    )
+    scene.add_light_directional("/light/key", intensity=1.3, position=(1.5, -1.0, 2.5))
+    scene.add_light_directional("/light/fill", intensity=0.3, position=(-2.0, 1.5, 1.0))
+    scene.add_grid(
         "/ground",
         width=200 * cell,
         height=200 * cell,
@@ -74,18 +82,6 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
     camera.look_at = middle
     camera.up = np.array([0.0, 0.0, 1.0])
     camera.near, camera.far = 0.005, 100.0
-
-
-def _set_light(server: ViserServer) -> None:
-    """Light the scene from above and from one side, softly, so that labels keep their colors."""
-    scene = server.scene
-    scene.configure_default_lights(enabled=False)
-    scene.configure_environment_map("studio", environment_intensity=0.12)
-    scene.add_light_hemisphere(
-        "/light/sky", sky_color=(255, 255, 255), ground_color=(150, 140, 130), intensity=0.55
-    )
-    scene.add_light_directional("/light/key", intensity=1.3, position=(1.5, -1.0, 2.5))
-    scene.add_light_directional("/light/fill", intensity=0.3, position=(-2.0, 1.5, 1.0))
 
 
 def show_rig(server: ViserServer, rig: CameraRig) -> None:
@@ -110,10 +106,8 @@ def show_rig(server: ViserServer, rig: CameraRig) -> None:
 
 def show_volume(server: ViserServer, rig: CameraRig) -> None:
     """Show the cube that wrists move in, and dots colored by the number of cameras that see them."""
-    center = np.array(ROOM_CENTER)
-    server.scene.add_line_segments(
-        "/volume", points=box_edges(center - _HALF_SIDE, center + _HALF_SIDE), colors=(40, 120, 60)
-    )
+    side = 2 * _HALF_SIDE
+    server.scene.add_box("/volume", (40, 120, 60), (side, side, side), wireframe=True, position=ROOM_CENTER)
     places, counts = camera_counts(rig)
     share = (counts / len(rig.positions))[:, None]
     server.scene.add_point_cloud(
@@ -136,12 +130,10 @@ def camera_counts(rig: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.int64
     return grid[counts >= 2], counts[counts >= 2]
 
 
-def box_edges(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """The twelve edges (12, 2, 3) of a box."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
-    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
-    edges: NDArray[np.float64] = (low + corners * (high - low))[np.array(pairs)]
-    return edges
+def switch(server: ViserServer, words: str, node: SceneNodeHandle, *, visible: bool = True) -> None:
+    """Add a checkbox to the panel that shows and hides a node of the scene."""
+    box = server.gui.add_checkbox(words, node.visible, visible=visible)
+    box.on_update(lambda _: setattr(node, "visible", box.value))
 
 
 class HandSkin:
@@ -165,21 +157,18 @@ class HandSkin:
 
     def show(self, model: HandModel, qpos: Float[np.ndarray, "27"]) -> None:
         """Show a hand in a pose [m, rad]; hide it if the pose is NaN."""
-        if not np.isfinite(qpos).all():
-            if self.mesh is not None and self.mesh.visible:
-                self.mesh.visible = False
-            return
-        if self.mesh is None or model is not self._model:
-            self.mesh, self._model = self._send(model), model
-        local = np.zeros((1, NUM_QPOS))
-        local[0, 3], local[0, 7:] = 1.0, qpos[7:]
-        positions, quaternions = _poses(model.forward_kinematics(local)[0])
-        for bone, position, quaternion in zip(self.mesh.bones, positions, quaternions, strict=True):
-            bone.position, bone.wxyz = position, quaternion
-        self.mesh.position = qpos[:3]
-        self.mesh.wxyz = qpos[3:7] / np.linalg.norm(qpos[3:7])
-        if not self.mesh.visible:
-            self.mesh.visible = True
+        there = bool(np.isfinite(qpos).all())
+        if there:
+            if self.mesh is None or model is not self._model:
+                self.mesh, self._model = self._send(model), model
+            local = np.zeros((1, NUM_QPOS))
+            local[0, 3], local[0, 7:] = 1.0, qpos[7:]
+            positions, quaternions = _poses(model.forward_kinematics(local)[0])
+            for bone, position, quaternion in zip(self.mesh.bones, positions, quaternions, strict=True):
+                bone.position, bone.wxyz = position, quaternion
+            self.mesh.position, self.mesh.wxyz = qpos[:3], qpos[3:7] / np.linalg.norm(qpos[3:7])
+        if self.mesh is not None:
+            self.mesh.visible = there
 
     def _send(self, model: HandModel) -> MeshSkinnedHandle:
         surface = model.surface
@@ -216,19 +205,16 @@ class PointBalls:
         self._texts: dict[int, LabelHandle] = {}
         self._chosen: frozenset[int] = frozenset()
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        count = max(most, 1)
-        self._positions = np.zeros((count, 3), dtype=np.float32)
-        self._scales = np.zeros(count, dtype=np.float32)
-        self._colors = np.zeros((count, 3), dtype=np.uint8)
+        self._most = max(most, 1)
         self._points, self._labels = np.empty((0, 3)), np.empty(0, dtype=np.int64)
         self.balls = server.scene.add_batched_meshes_simple(
             name,
             np.asarray(ball.vertices),
             np.asarray(ball.faces),
-            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (count, 1)),
-            batched_positions=self._positions,
-            batched_scales=self._scales,
-            batched_colors=self._colors,
+            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (self._most, 1)),
+            batched_positions=np.zeros((self._most, 3), dtype=np.float32),
+            batched_scales=np.zeros(self._most, dtype=np.float32),
+            batched_colors=np.zeros((self._most, 3), dtype=np.uint8),
             lod="off",
             cast_shadow=False,
         )
@@ -238,18 +224,15 @@ class PointBalls:
         self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], seen: Bool[np.ndarray, "N"]
     ) -> None:
         """Show points [m]; those that were not seen are small."""
-        count = min(len(points), len(self._positions))
+        count = min(len(points), self._most)
         self._points, self._labels = points[:count], labels[:count]
-        positions, scales, colors = self._positions.copy(), np.zeros_like(self._scales), self._colors.copy()
+        positions, colors = self.balls.batched_positions.copy(), self.balls.batched_colors.copy()
+        scales = np.zeros(self._most, dtype=np.float32)
         positions[:count] = self._points
         scales[:count] = np.where(seen[:count], 1.0, _FILLED)
         colors[:count] = self._palette[self._labels]
-        if not np.array_equal(positions, self._positions):
-            self.balls.batched_positions = self._positions = positions
-        if not np.array_equal(scales, self._scales):
-            self.balls.batched_scales = self._scales = scales
-        if not np.array_equal(colors, self._colors):
-            self.balls.batched_colors = self._colors = colors
+        self.balls.batched_positions, self.balls.batched_scales = positions, scales
+        self.balls.batched_colors = colors
         self._show_names()
 
     def name(self, labels: frozenset[int]) -> None:
@@ -266,10 +249,6 @@ class PointBalls:
         away = np.linalg.norm(offsets - (offsets @ unit)[:, None] * unit, axis=1)
         return int(away.argmin())
 
-    def label_at(self, index: int) -> int:
-        """The label of a shown point."""
-        return int(self._labels[index])
-
     def _show_names(self) -> None:
         places = {int(label): point for label, point in zip(self._labels, self._points, strict=True)}
         for label in self._chosen & places.keys():
@@ -282,9 +261,7 @@ class PointBalls:
                 )
             self._texts[label].position = places[label]
         for label, text in self._texts.items():
-            shown = label in self._chosen and label in places
-            if text.visible != shown:
-                text.visible = shown
+            text.visible = label in self._chosen and label in places
 
 
 class FrameView:
@@ -292,8 +269,6 @@ class FrameView:
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording = server, recording
-        self._cameras_node = server.scene.add_frame("/cameras", show_axes=False)
-        self._hands_node = server.scene.add_frame("/hands", show_axes=False)
         self.skins: list[HandSkin] = []
         self.balls = PointBalls(
             server,
@@ -303,14 +278,13 @@ class FrameView:
             radius=recording.radius,
         )
         self.bodies = [_add_body(server, body) for body in recording.bodies]
-        self._rays: LineSegmentsHandle | None = None
         self._clicked: frozenset[int] = frozenset()
         self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points in the frame
         self.on_pick: Callable[[int], None] = lambda index: None
         """Called with the index of a clicked point of the frame."""
         self._frame: ShownFrame | None = None
         self._lock = threading.RLock()  # viser handles switches in other threads
-        self._add_switches()
+        self._add_switches(recording)
         if recording.rig is not None:
             show_rig(server, recording.rig)
         self.balls.balls.on_click(self._click)
@@ -323,32 +297,33 @@ class FrameView:
             for skin, model, qpos in zip(self.skins, frame.hands, frame.qpos, strict=True):
                 skin.show(model, qpos)
             for body, pose in zip(self.bodies, frame.bodies, strict=True):
-                there = bool(np.isfinite(pose).all())
-                if there:
+                body.visible = bool(np.isfinite(pose).all())
+                if body.visible:
                     body.position, body.wxyz = pose[:3], pose[3:]
-                if body.visible != there:
-                    body.visible = there
             self._frame = frame
-            self._update_points()
-            self._update_rays()
+            self._rays.points = frame.rays
+            self._show_points()
 
-    def _add_switches(self) -> None:
-        gui, recording = self._server.gui, self._recording
-        with gui.add_folder("Show"):
-            self._names = gui.add_checkbox("names", False, hint="A click on a point names it.")
-            self._ghosts = gui.add_checkbox("unlabeled points", True)
-            self._filled = gui.add_checkbox("filled-in markers", True, visible=recording.has_filled)
-            self._hands = gui.add_checkbox("skin", True, visible=recording.has_hands)
-            cameras = gui.add_checkbox("cameras", True, visible=recording.rig is not None)
-            center = gui.add_button("Look at the hands", color="gray", hint="C")
-            rays = recording.frame(0).rays if recording.num_frames else np.empty((0, 2, 3))
-            self._sight = gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
-        for switch in (self._names, self._ghosts, self._filled, self._sight):
-            switch.on_update(lambda _: self._refresh())
+    def _add_switches(self, recording: Recording) -> None:
+        server, first = self._server, recording.frame(0) if recording.num_frames else ShownFrame(0.0)
+        self._rays = server.scene.add_line_segments(
+            "/rays", first.rays, _RAY_COLOR, thickness=1.0, thickness_units="screen", visible=False
+        )
+        with server.gui.add_folder("Show"):
+            self._names = server.gui.add_checkbox("names", False, hint="A click on a point names it.")
+            self._ghosts = server.gui.add_checkbox("unlabeled points", True)
+            self._filled = server.gui.add_checkbox("filled-in markers", True, visible=recording.has_filled)
+            hands, cameras = (
+                server.scene.add_frame(name, show_axes=False) for name in ("/hands", "/cameras")
+            )
+            switch(server, "skin", hands, visible=recording.has_hands)
+            switch(server, "cameras", cameras, visible=recording.rig is not None)
+            center = server.gui.add_button("Look at the hands", color="gray", hint="C")
+            switch(server, "lines of sight", self._rays, visible=len(first.rays) > 0)
+        for box in (self._names, self._ghosts, self._filled):
+            box.on_update(lambda _: self._refresh())
         center.on_click(self._look)
-        gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
-        cameras.on_update(lambda _: setattr(self._cameras_node, "visible", cameras.value))
-        self._hands.on_update(lambda _: setattr(self._hands_node, "visible", self._hands.value))
+        server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
 
     def _look(self, event: Any) -> None:
         """Move the eye of the requesting page, without turning it, so that the hands are in the middle."""
@@ -364,37 +339,24 @@ class FrameView:
 
     def _refresh(self) -> None:
         with self._lock, self._server.atomic():
-            self._update_points()
-            self._update_rays()
+            self._show_points()
 
-    def _update_points(self) -> None:
-        if self._frame is None:
-            return
+    def _show_points(self) -> None:
         frame = self._frame
+        if frame is None:
+            return
         kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
         self._kept = np.flatnonzero(kept)
         self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
         every = frozenset(range(len(self._recording.label_names)))
         self.balls.name(every if self._names.value else self._clicked)
 
-    def _update_rays(self) -> None:
-        rays = self._frame.rays if self._frame is not None and self._sight.value else np.empty((0, 2, 3))
-        if self._rays is not None:
-            if np.array_equal(self._rays.points, rays.astype(np.float32)):
-                return
-            self._rays.remove()
-            self._rays = None
-        if len(rays):
-            self._rays = self._server.scene.add_line_segments(
-                "/rays", points=rays, colors=_RAY_COLOR, thickness=1.0, thickness_units="screen"
-            )
-
     def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
         """Show or hide the name of the clicked marker."""
         index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))
-        if index is None:
+        if index is None or self._frame is None:
             return
-        if (label := self.balls.label_at(index)) >= 0:
+        if (label := int(self._frame.labels[self._kept[index]])) >= 0:
             self._clicked ^= {label}
             self._refresh()
         self.on_pick(int(self._kept[index]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -45,7 +44,9 @@ class Timeline:
     ) -> None:
         self._times, self._show = times, show
         self._wake = threading.Event()
-        self._index, self._shown, self._playing = 0, -1, False
+        self.index, self.playing = 0, False
+        """The frame that was requested last, and whether the recording is being played."""
+        self._shown = -1
         self._anchor = (0.0, 0.0)  # clock and time of the recording when playing began [s]
         self._slider_due = 0.0
         last = max(len(times) - 1, 1)
@@ -55,96 +56,9 @@ class Timeline:
             self._button = gui.add_button("Play", hint="Space")
             self._step = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
             self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 x")
-        self._slider.on_update(self._slide)
         self._button.on_click(lambda _: self.toggle())
         self._step.on_click(lambda event: self.step(int(event.target.value)))
         self._speed.on_update(lambda _: self._set_anchor())
-        self._add_keys(server)
-
-    @property
-    def index(self) -> int:
-        """The frame that was requested last."""
-        return self._index
-
-    @property
-    def playing(self) -> bool:
-        """Whether the recording is being played."""
-        return self._playing
-
-    def go_to(self, index: int) -> None:
-        """Request a frame; indices beyond the ends mean the first or last frame."""
-        self._index = int(np.clip(index, 0, len(self._times) - 1))
-        self._set_anchor()
-        self._wake.set()
-
-    def jump(self, index: int) -> None:
-        """Stop playing and go to a frame."""
-        self.play(False)
-        self.go_to(index)
-
-    def step(self, frames: int) -> None:
-        """Stop playing and go some frames on, or back."""
-        self.play(False)
-        self.go_to(self._index + frames)
-
-    def toggle(self) -> None:
-        """Play, or stop playing."""
-        self.play(not self._playing)
-
-    def play(self, playing: bool) -> None:
-        """Play, or stop playing; after the end the recording begins anew."""
-        if playing != self._playing:
-            self._button.label = "Pause" if playing else "Play"
-        self._playing = playing and len(self._times) > 1
-        self._set_anchor()
-        self._wake.set()
-
-    def run(self, ended: Callable[[], bool]) -> None:
-        """Show the requested frames until `ended`."""
-        due = time.perf_counter()
-        while not ended():
-            if self._playing:
-                self._advance()
-            self.update()
-            now = time.perf_counter()
-            due = max(due + 1.0 / PICTURES, now)
-            self._wake.wait(due - now if self._playing else _IDLE)
-            self._wake.clear()
-
-    def refresh(self) -> None:
-        """Request the same frame again, because its content has changed."""
-        self._shown = -1
-        self._wake.set()
-
-    def update(self) -> None:
-        """Show the requested frame, unless it is shown."""
-        index = self._index
-        if index == self._shown:
-            return
-        self._shown = index
-        self._show(index)
-        now = time.perf_counter()
-        if not self._playing or now >= self._slider_due:
-            self._slider.value = index  # type: ignore[misc]  # viser sets it through __setattr__
-            self._slider_due = now + _SLIDER_PERIOD
-
-    def _advance(self) -> None:
-        clock, begin = self._anchor
-        now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
-        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame is shown for one interval
-            self._index = 0
-            self._set_anchor()
-            return
-        self._index = max(int(np.searchsorted(self._times, now, side="right")) - 1, 0)
-
-    def _set_anchor(self) -> None:
-        self._anchor = (time.perf_counter(), float(self._times[self._index]))
-
-    def _slide(self, event: Any) -> None:
-        if event.client is not None:  # moved by a person, not by `update`
-            self.go_to(self._slider.value)
-
-    def _add_keys(self, server: ViserServer) -> None:
         keys: dict[Key, tuple[str, Callable[[], None]]] = {
             "space": ("Play or pause", self.toggle),
             "arrowleft": ("One frame back", lambda: self.step(-1)),
@@ -155,12 +69,83 @@ class Timeline:
             "end": ("Last frame", lambda: self.go_to(len(self._times) - 1)),
         }
         for key, (label, action) in keys.items():
-            server.gui.add_command(label, hotkey=key).on_trigger(partial(_call, action))
 
+            @gui.add_command(label, hotkey=key).on_trigger
+            def _(_event: object, action: Callable[[], None] = action) -> None:
+                action()
 
-def _call(action: Callable[..., None], *arguments: Any) -> None:
-    """Call an action without the event, which viser gives as the last argument."""
-    action(*arguments[:-1])
+        @self._slider.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:  # moved by a person, not by `update`
+                self.go_to(self._slider.value)
+
+    def go_to(self, index: int) -> None:
+        """Request a frame; indices beyond the ends mean the first or last frame."""
+        self.index = int(np.clip(index, 0, len(self._times) - 1))
+        self._set_anchor()
+        self._wake.set()
+
+    def jump(self, index: int) -> None:
+        """Stop playing and go to a frame."""
+        self.play(False)
+        self.go_to(index)
+
+    def step(self, frames: int) -> None:
+        """Stop playing and go some frames on, or back."""
+        self.jump(self.index + frames)
+
+    def toggle(self) -> None:
+        """Play, or stop playing."""
+        self.play(not self.playing)
+
+    def play(self, playing: bool) -> None:
+        """Play, or stop playing; after the end the recording begins anew."""
+        if playing != self.playing:
+            self._button.label = "Pause" if playing else "Play"
+        self.playing = playing and len(self._times) > 1
+        self._set_anchor()
+        self._wake.set()
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Show the requested frames until `ended`."""
+        due = time.perf_counter()
+        while not ended():
+            if self.playing:
+                self._advance()
+            self.update()
+            now = time.perf_counter()
+            due = max(due + 1.0 / PICTURES, now)
+            self._wake.wait(due - now if self.playing else _IDLE)
+            self._wake.clear()
+
+    def refresh(self) -> None:
+        """Request the same frame again, because its content has changed."""
+        self._shown = -1
+        self._wake.set()
+
+    def update(self) -> None:
+        """Show the requested frame, unless it is shown."""
+        index = self.index
+        if index == self._shown:
+            return
+        self._shown = index
+        self._show(index)
+        now = time.perf_counter()
+        if not self.playing or now >= self._slider_due:
+            self._slider.value = index  # type: ignore[misc]  # viser sets it through __setattr__
+            self._slider_due = now + _SLIDER_PERIOD
+
+    def _advance(self) -> None:
+        clock, begin = self._anchor
+        now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
+        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame is shown for one interval
+            self.index = 0
+            self._set_anchor()
+            return
+        self.index = max(int(np.searchsorted(self._times, now, side="right")) - 1, 0)
+
+    def _set_anchor(self) -> None:
+        self._anchor = (time.perf_counter(), float(self._times[self.index]))
 
 
 class StatusPanel:
@@ -172,50 +157,53 @@ class StatusPanel:
         self._go_to: Callable[[int], None] = lambda frame: None
         self._rows: GuiFolderHandle | None = None
         self._buttons: list[GuiButtonHandle] = []
-        self._plots: list[tuple[GuiUplotHandle, list[int]]] = []
+        self._plots: list[tuple[GuiUplotHandle, list[str]]] = []
 
     def add_doubts(self, go_to: Callable[[int], None]) -> None:
         """Add buttons that call `go_to` with a doubtful frame, if there are such frames."""
         self._go_to = go_to
         if self._recording.suspects:
             self._rows = self._server.gui.add_folder("Doubtful frames")
-            self._add_rows(self._rows)
+            self._add_rows()
 
     def add_plots(self) -> None:
         """Add a plot of the curves with a unit and one of those without, if there are such curves."""
         gui, recording = self._server.gui, self._recording
         if not recording.curves or recording.num_frames < 2:
             return
-        groups: dict[bool, list[int]] = {}
-        for number, curve in enumerate(recording.curves):
-            groups.setdefault(curve.name.endswith("]"), []).append(number)
+        groups: dict[bool, list[str]] = {}
+        for name in recording.curves:
+            groups.setdefault(name.endswith("]"), []).append(name)
         with gui.add_folder("Over time", expand_by_default=True):
-            for numbers in groups.values():
+            for names in groups.values():
                 series: list[uplot.Series] = [{"label": "time [s]"}]
-                for number, stroke in zip(numbers, _STROKES, strict=False):
-                    name = recording.curves[number].name
+                for name, stroke in zip(names, _STROKES, strict=False):
                     series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
-                columns = _columns(recording, numbers)
+                columns = _columns(recording, names)
                 plot = gui.add_uplot(columns, tuple(series), scales={"x": {"time": False}}, aspect=2.2)
-                self._plots.append((plot, numbers))
+                self._plots.append((plot, names))
 
     def renew(self) -> None:
         """Renew buttons and plots of a recording that was changed."""
-        if self._rows is not None:
-            for row in self._buttons:
-                row.remove()
-            self._add_rows(self._rows)
-        for plot, numbers in self._plots:
-            plot.data = _columns(self._recording, numbers)
+        for row in self._buttons:
+            row.remove()
+        self._add_rows()
+        for plot, names in self._plots:
+            plot.data = _columns(self._recording, names)
 
-    def _add_rows(self, folder: GuiFolderHandle) -> None:
+    def _add_rows(self) -> None:
         self._buttons = []
-        with folder:
-            for doubt in self._recording.suspects:
-                span = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first}-{doubt.last}"
+        if self._rows is None:
+            return
+        for doubt in self._recording.suspects:
+            span = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first}-{doubt.last}"
+            with self._rows:
                 row = self._server.gui.add_button(f"{span}: {doubt.words}", color="gray")
-                row.on_click(partial(_call, self._go_to, doubt.worst))
-                self._buttons.append(row)
+            self._buttons.append(row)
+
+            @row.on_click
+            def _(_event: object, frame: int = doubt.worst) -> None:
+                self._go_to(frame)
 
     def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
         """Show the state of a frame; if `hurried`, at most ten times a second."""
@@ -227,9 +215,9 @@ class StatusPanel:
         self.text.content = "\n\n".join((head, *frame.words))
 
 
-def _columns(recording: Recording, numbers: list[int]) -> tuple[np.ndarray, ...]:
+def _columns(recording: Recording, names: list[str]) -> tuple[np.ndarray, ...]:
     """Thinned times, and the thinned values of some curves."""
-    columns = [thinned(recording.times, recording.curves[number].values) for number in numbers]
+    columns = [thinned(recording.times, recording.curves[name]) for name in names]
     return (columns[0][0], *(values for _, values in columns))
 
 

@@ -17,7 +17,7 @@ from tests.rigs import mixed_rig
 from track import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings import CaptureRecording, DatasetRecording, TakeRecording
-from track.viewer.stage import box_edges, camera_counts
+from track.viewer.stage import camera_counts
 from train import Dataset, generate_dataset
 
 
@@ -138,9 +138,6 @@ def test_places_are_counted_by_the_cameras_that_see_them():
     places, counts = camera_counts(rig)
     assert counts.min() == 2 and counts.max() <= 6 and len(places) > 50
     np.testing.assert_array_equal(rig.in_view(places).sum(axis=1), counts)
-    edges = box_edges(np.zeros(3), np.array([1.0, 2.0, 3.0]))
-    assert edges.shape == (12, 2, 3)
-    assert sorted(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
 
 
 def test_a_damaged_set_is_not_shown(training_set, tmp_path):
