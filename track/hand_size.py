@@ -29,7 +29,7 @@ from handsim.hand.shape import SIZES, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
-from track.calibration.energy import levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.energy import first_estimate, levenberg_marquardt, shared_covariance, user_hand
 from track.calibration.hand_parameters import LENGTH
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand

@@ -163,7 +163,7 @@ class BodyFrame:
 class _Match(NamedTuple):
     """Points that are a body's markers."""
 
-    count: int  # number of these points; 0 where there is no unique match
+    num_points: int  # 0 where there is no unique match
     rms: float  # their RMS distance from the markers [m]
     pose: NDArray[np.float64]  # of the body (7,)
     assignment: NDArray[np.int64]  # index of each marker's point, -1 for none
@@ -214,12 +214,12 @@ class BodyTracker:
         match = _Match(count, rms, pose, assignment)
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
             match = self._match(points, self._predict(elapsed), self._search_radius(elapsed))
-        if match.count < FEWEST:
+        if match.num_points < FEWEST:
             return None
-        if max(self._most_markers, match.count) <= FEWEST < len(self._positions):
+        if max(self._most_markers, match.num_points) <= FEWEST < len(self._positions):
             # Three points may match three markers by chance: a larger match elsewhere is the body.
             other = self._match(points)
-            if other.count > FEWEST:
+            if other.num_points > FEWEST:
                 return self._accept(Status.INITIALIZED, other, ids, time)
         return self._accept(Status.TRACKED, match, ids, time)
 
@@ -250,16 +250,16 @@ class BodyTracker:
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius = self._search_radius(elapsed)
             match = self._match(points, self._predict(elapsed), radius)
-            if match.count > FEWEST or (match.count == FEWEST and radius <= _CONFIDENT_RADIUS):
+            if match.num_points > FEWEST or (match.num_points == FEWEST and radius <= _CONFIDENT_RADIUS):
                 return self._accept(Status.INITIALIZED, match, ids, time)
         match = self._match(points)
-        if match.count >= FEWEST:
+        if match.num_points >= FEWEST:
             there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
             moved = np.linalg.norm(there - before, axis=1).max()
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
             self._candidate = match.pose
-            if self._confirmed >= _frames_to_confirm(match.count, len(self._positions)):
+            if self._confirmed >= _frames_to_confirm(match.num_points, len(self._positions)):
                 return self._accept(Status.INITIALIZED, match, ids, time)
         else:
             self._confirmed = 0

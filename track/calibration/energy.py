@@ -581,7 +581,7 @@ def _damped_step(
     """The step of the poses (F, 26) and that of the shared unknowns (S,)."""
     reduced, solved = eliminate_poses(equations, damping)
     system = reduced[:, :-1] + np.diag(damping * equations.shared.diagonal())
-    shared = -np.linalg.solve(system, reduced[:, -1])
+    shared: NDArray[np.float64] = -np.linalg.solve(system, reduced[:, -1])
     return -solved[..., -1] - solved[..., :-1] @ shared, shared
 
 
