@@ -116,6 +116,7 @@ class HandInitializer:
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
+        self._points: NDArray[np.float64] = np.empty((0, 3))  # those of the frame
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
@@ -123,7 +124,7 @@ class HandInitializer:
 
     def initialize(self, points: Float[np.ndarray, "N 3"], hands: Sequence[int]) -> list[InitializedHand]:
         """Look for some of the hands."""
-        search = self._searches.pop(tuple(hands), _Search())
+        search, self._points = self._searches.pop(tuple(hands), _Search()), points
         self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
         cut = False
@@ -135,17 +136,17 @@ class HandInitializer:
             rest, missing = group, [index for index in hands if index not in done]
             here: list[InitializedHand] = []
             while missing:
-                cuts = self._cuts_of(points[rest], missing)
+                cuts = self._cuts_of(rest, missing)
                 cut |= len(cuts) > 0
-                hand = self._best(points, rest, missing, cuts, search)
+                hand = self._best(rest, missing, cuts, search)
                 if hand is None:
                     break
                 here.append(hand)
                 rest = rest[hand.labels[rest] < 0]
                 missing.remove(hand.index)
             self._attempts[missing] += 1
-            initialized += self._uncrossed(self._divided(here, points, group), points)
-        initialized = self._sides_checked(initialized, points)
+            initialized += self._uncrossed(self._divided(here, group))
+        initialized = self._sides_checked(initialized)
         for hand in initialized:
             self._attempts[hand.index] = 0
         if cut and not initialized and search.turn < _LAST_TURN and not self._at_once:
@@ -159,19 +160,17 @@ class HandInitializer:
         """Whether the last call for some hands left directions for the next one."""
         return tuple(hands) in self._searches
 
-    def _sides_checked(
-        self, hands: list[InitializedHand], points: Float[np.ndarray, "N 3"]
-    ) -> list[InitializedHand]:
+    def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
         """Two hands as they are, or the other way round where both together fit better so."""
         # One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
         # symmetric pattern, fit both hands nearly alike.
         if len(hands) != 2:
             return hands
         one, two = hands
-        first = self._fit(two.index, points, one.labels), self._fit(one.index, points, two.labels)
+        first = self._fit(two.index, one.labels), self._fit(one.index, two.labels)
         if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
             return hands
-        return _likelier([self._trim(fit, points) for fit in first], hands)
+        return _likelier([self._trim(fit) for fit in first], hands)
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
         """Log-odds of labeled points being a hand against strays, by the markers' `spread` [m] if known."""
@@ -191,19 +190,14 @@ class HandInitializer:
         return max(FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
-        self,
-        points: NDArray[np.float64],
-        group: NDArray[np.int64],
-        hands: Sequence[int],
-        cuts: NDArray[np.int64],
-        search: _Search,
+        self, group: NDArray[np.int64], hands: Sequence[int], cuts: NDArray[np.int64], search: _Search
     ) -> InitializedHand | None:
         """The first hand of a group that is certain, or the best one after the last of the cuts."""
         if not len(cuts):
-            return self._better(None, points, group, [group], hands)
+            return self._better(None, group, [group], hands)
         best: InitializedHand | None = None
         for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
-            best = self._better(best, points, group, self._clouds(points, group, cuts, turn), hands)
+            best = self._better(best, group, self._clouds(group, cuts, turn), hands)
             if best is not None and self._is_certain(best):
                 return best
         if self._at_once:
@@ -214,15 +208,13 @@ class HandInitializer:
             return None
         if search.best_turn == search.turn:
             return best
-        return self._better(best, points, group, self._clouds(points, group, cuts, search.best_turn), hands)
+        return self._better(best, group, self._clouds(group, cuts, search.best_turn), hands)
 
-    def _labeled(
-        self, points: NDArray[np.float64], clouds: Sequence[NDArray[np.int64]]
-    ) -> list[NDArray[np.int64]]:
+    def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
         """A label for every point by each cloud, the cloud of most confidence in all first."""
-        labelings = self._labeler.label_frames([points[cloud] for cloud in clouds])
+        labelings = self._labeler.label_frames([self._points[cloud] for cloud in clouds])
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
-        labeled = np.full((len(clouds), len(points)), -1)
+        labeled = np.full((len(clouds), len(self._points)), -1)
         for row, cloud, one in zip(labeled, clouds, labelings, strict=True):
             row[cloud] = one.labels
         return [labeled[number] for number in np.argsort(confidence)[::-1]]
@@ -230,18 +222,17 @@ class HandInitializer:
     def _better(
         self,
         best: InitializedHand | None,
-        points: NDArray[np.float64],
         group: NDArray[np.int64],
         clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
     ) -> InitializedHand | None:
         """The best hand so far, or one of these clouds of a group with a better score."""
-        for labels in self._labeled(points, clouds)[:_FITS_AT_A_TIME]:
-            fits = [self._fit(index, points, labels) for index in hands]
+        for labels in self._labeled(clouds)[:_FITS_AT_A_TIME]:
+            fits = [self._fit(index, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
-                hand = self._improve(first, points, group)
+                hand = self._improve(first, group)
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
             if best is not None and self._is_certain(best):
@@ -252,37 +243,29 @@ class HandInitializer:
         """Whether a hand fits so well that no other cloud need be tried."""
         return hand.score > _CERTAIN_SCORE * self._states[hand.index].num_markers
 
-    def _cuts_of(self, points: NDArray[np.float64], hands: Sequence[int]) -> NDArray[np.int64]:
+    def _cuts_of(self, group: NDArray[np.int64], hands: Sequence[int]) -> NDArray[np.int64]:
         """Directions along which a group is cut if it has points of more than one hand, the longest first."""
         most = max(self._states[index].num_markers for index in hands)
-        if len(points) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
+        if len(group) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
         count = _CUTS if self._at_once else _CUTS_OF_SEARCH
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
-        return numbers[np.argsort(-(points @ self._directions[numbers].T).std(axis=0))]
+        return numbers[np.argsort(-(self._points[group] @ self._directions[numbers].T).std(axis=0))]
 
     def _clouds(
-        self,
-        points: NDArray[np.float64],
-        group: NDArray[np.int64],
-        cuts: NDArray[np.int64],
-        turn: int,
+        self, group: NDArray[np.int64], cuts: NDArray[np.int64], turn: int
     ) -> list[NDArray[np.int64]]:
         """The clouds of a turn: the whole group and its halves along the first cuts, then one cut a turn."""
-        clouds = [group] if turn == 0 else []
-        for cut in (
-            cuts[:_CUTS_AT_FIRST] if turn == 0 else cuts[turn + _CUTS_AT_FIRST - 1 : turn + _CUTS_AT_FIRST]
-        ):
-            order = group[np.argsort(points[group] @ self._directions[cut])]
+        clouds, last = [group] if turn == 0 else [], turn + _CUTS_AT_FIRST
+        for cut in cuts[0 if turn == 0 else last - 1 : last]:
+            order = group[np.argsort(self._points[group] @ self._directions[cut])]
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
-    def _improve(
-        self, first: InitializedHand, points: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> InitializedHand | None:
+    def _improve(self, first: InitializedHand, group: NDArray[np.int64]) -> InitializedHand | None:
         """A hand without labels that do not fit, then fitted to the points of the group that do."""
         index, state = first.index, self._states[first.index]
-        hand = self._trim(first, points) or self._trim(self._without_outliers(first, points), points)
+        hand = self._trim(first) or self._trim(self._without_outliers(first))
         for _ in range(_REFINEMENTS):
             if hand is None:
                 return None
@@ -290,30 +273,28 @@ class HandInitializer:
             fitted = float(hand.fit.rms[0] / np.sqrt(3.0))
             spread = np.clip(_SEARCH_FACTOR * fitted, _SEARCH_LEAST, _SEARCH_MOST)
             covariances = np.tile(spread**2 * np.eye(3), (state.num_markers, 1, 1))
-            labels = np.full(len(points), -1)
-            log_odds = match_log_odds(points[group], positions, covariances, self._config.stray_density)
+            labels = np.full(len(self._points), -1)
+            log_odds = match_log_odds(self._points[group], positions, covariances, self._config.stray_density)
             labels[group], _ = match_points(log_odds)
             if (labels == hand.labels).all():
                 break
-            hand = self._trim(self._fit(index, points, labels, hand.fit), points)
+            hand = self._trim(self._fit(index, labels, hand.fit))
         return hand
 
-    def _divided(
-        self, hands: list[InitializedHand], points: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> list[InitializedHand]:
+    def _divided(self, hands: list[InitializedHand], group: NDArray[np.int64]) -> list[InitializedHand]:
         """Hands of one group, each labeled once more among the points that the others leave."""
         for number, hand in enumerate(hands if len(hands) > 1 else ()):
             others = [other.labels[group] >= 0 for other in hands if other is not hand]
-            again = self._better(hand, points, group, [group[~np.any(others, axis=0)]], (hand.index,))
+            again = self._better(hand, group, [group[~np.any(others, axis=0)]], (hand.index,))
             hands[number] = again or hand
         return hands
 
-    def _uncrossed(self, hands: list[InitializedHand], points: NDArray[np.float64]) -> list[InitializedHand]:
+    def _uncrossed(self, hands: list[InitializedHand]) -> list[InitializedHand]:
         """Two hands, with the points of a digit exchanged where both together fit better so."""
         # A thumb fits the other hand's palm nearly as well as its own where hands touch.
         if len(hands) != 2:
             return hands
-        digits = self._states[hands[0].index].solver.hand.digits
+        points, digits = self._points, self._states[hands[0].index].solver.hand.digits
         for digit in range(len(DIGITS)):
             one, two = hands
             ours, theirs = (
@@ -327,13 +308,13 @@ class HandInitializer:
             first[ours], second[theirs] = -1, -1
             first[theirs], second[ours] = two.labels[theirs], one.labels[ours]
             changed = [
-                self._trim(self._fit(hand.index, points, labels, hand.fit), points)
+                self._trim(self._fit(hand.index, labels, hand.fit))
                 for hand, labels in ((one, first), (two, second))
             ]
             hands = _likelier(changed, hands)
         return hands
 
-    def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
+    def _trim(self, hand: InitializedHand | None) -> InitializedHand | None:
         """Drop the worst label while that improves the score; None where it is no hand."""
         best: InitializedHand | None = None
         while hand is not None and (best is None or hand.score > best.score):
@@ -342,7 +323,7 @@ class HandInitializer:
             squares = (hand.fit.residuals[0, hand.labels[labeled]] ** 2).sum(axis=1)
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
-            hand = self._fit(hand.index, points, labels, hand.fit)
+            hand = self._fit(hand.index, labels, hand.fit)
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
@@ -351,29 +332,27 @@ class HandInitializer:
         )
         return best if accepted else None
 
-    def _without_outliers(
-        self, first: InitializedHand, points: NDArray[np.float64]
-    ) -> InitializedHand | None:
+    def _without_outliers(self, first: InitializedHand) -> InitializedHand | None:
         """The hand without labels that a robust fit leaves aside; None where these are many."""
         # One wrong label can bend a whole first fit.
         state = self._states[first.index]
-        targets = targets_of(points, first.labels, state.num_markers)
+        targets = targets_of(self._points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
         distances = np.linalg.norm(fit.residuals[0], axis=-1)
         kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
         if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
-        return self._fit(first.index, points, np.where(kept, first.labels, -1), fit)
+        return self._fit(first.index, np.where(kept, first.labels, -1), fit)
 
     def _fit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit | None = None
+        self, index: int, labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
         """A hand fitted to labeled points, from a near pose if there is one; None where they are too few."""
         # An unusual pose costs score, and a hand that was seen lately must fit as well as then.
         count, state = int((labels >= 0).sum()), self._states[index]
         if count < self._least(index):
             return None
-        targets = targets_of(points, labels, state.num_markers)[None]
+        targets = targets_of(self._points, labels, state.num_markers)[None]
         start, steps = (None, _FIRST_FIT_STEPS) if near is None else (near.qpos, _REFIT_STEPS)
         fit = state.solver.solve(targets, start, iterations=steps)
         spread = self._spreads[index] if self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS else None

@@ -395,10 +395,8 @@ def standard_errors(
     count = len(bones)
     jacobian = np.zeros((count, 3, len(covariance)))
     jacobian[..., :NUM_PARAMETERS] = shape_jacobian(problem.shape, estimate.parameters, on_bones)
-    rotations = fit.model.rest_transforms[bones][:, :3, :3].swapaxes(1, 2)
-    for marker in range(count):
-        first = NUM_PARAMETERS + 3 * marker
-        jacobian[marker, :, first : first + 3] = rotations[marker]
+    by_place = jacobian[..., NUM_PARAMETERS:].reshape(count, 3, count, 3)
+    by_place[range(count), :, range(count)] = fit.model.rest_transforms[bones, :3, :3].swapaxes(1, 2)
     positions = np.sqrt(np.einsum("mis,st,mit->m", jacobian, covariance, jacobian, optimize=True))
     own = covariance[BONE_LENGTHS, BONE_LENGTHS].diagonal()
     logs = own + covariance[LENGTH, LENGTH] + 2.0 * covariance[BONE_LENGTHS, LENGTH]

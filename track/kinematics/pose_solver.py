@@ -103,13 +103,6 @@ class PoseFit:
     """Steps tried, over all starts of a frame."""
 
 
-class AnglePrior(NamedTuple):
-    """Independent normal priors of the hinges, for digits that lack a marker or have under three."""
-
-    angles: Float[np.ndarray, "T 20"]  # mean angles [rad]
-    spread: float  # their standard deviation [rad]
-
-
 class PoseSolver:
     """Solves poses of one hand in one glove; precomputes what does not depend on the frame.
 
@@ -136,17 +129,18 @@ class PoseSolver:
         targets: Float[np.ndarray, "T M 3"],
         initial: Float[np.ndarray, "T 27"] | None = None,
         *,
-        prior: AnglePrior | None = None,
+        prior: tuple[Float[np.ndarray, "T 20"], float] | None = None,
         iterations: int = _MOST_STEPS,
     ) -> PoseFit:
         """Solve the poses of frames with four markers or more, each by itself; see `solve_pose`."""
+        # The prior is that of digits that lack a marker or have under three: mean angles, their spread [rad].
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
         starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
         known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST)
         if prior is not None:
-            precision = np.full(prior.angles.shape, np.asarray(prior.spread) ** -2)
-            known = _PosePrior(np.array(prior.angles, order="C"), precision, _NO_WRIST)
+            precision = np.full(prior[0].shape, np.asarray(prior[1]) ** -2)
+            known = _PosePrior(np.array(prior[0], order="C"), precision, _NO_WRIST)
         return self._run(targets, starts, known, iterations, _CONVERGED)
 
     def solve_frame(
