@@ -242,7 +242,7 @@ def _keep_better(search: _Search, trial: Ints) -> None:
 def _extend_triangle(
     positions: Floats, points: Floats, slack: float, assignment: Ints, a: int, b: int, c: int
 ) -> int:
-    """Assign to other markers the free points where a triangle predicts them; how many have one, 0 if flat."""
+    """Assign to other markers the free points where a triangle predicts them; how many, 0 if it is flat."""
     model, seen = np.empty((3, 3)), np.empty((3, 3))
     if not _triangle_axes(positions[a], positions[b], positions[c], model):
         return 0
