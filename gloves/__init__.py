@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gloves.layout import MarkerPlace as MarkerPlace
     from gloves.layout import load_layout as load_layout
     from gloves.optics.ghosts import GhostConfig as GhostConfig
+    from gloves.optics.reconstruction import FrameOptics as FrameOptics
     from gloves.optics.reconstruction import OpticsConfig as OpticsConfig
     from gloves.takes.points import PointList as PointList
     from gloves.takes.points import Status as Status

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal, get_args
 
 from handsim.errors import ArgumentError
@@ -29,7 +29,7 @@ _MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 class SetLabelerConfig(Settings):
     """Size of the set labeler; a network beyond the limits would not fit into memory."""
 
-    num_labels: Annotated[int, Limits(1, 1000)] = 19
+    num_labels: Annotated[int, Limits(1, 1000)] = field(default=19, metadata={"follows": "the training set"})
     width: Annotated[int, Limits(1, 4096)] = 64
     """Channels of a point."""
     gates: Annotated[int, Limits(1, 4096)] = 16
@@ -51,7 +51,7 @@ class SetLabelerConfig(Settings):
 class CNNConfig(Settings):
     """How the paper's network sees a cloud, and how labels follow from the positions that it predicts."""
 
-    num_labels: Annotated[int, Limits(1, 1000)] = 19
+    num_labels: Annotated[int, Limits(1, 1000)] = field(default=19, metadata={"follows": "the training set"})
     views: Views = "aligned"
     reject: Annotated[float | None, Limits(0.0, above=True)] = None
     """Cost of a point without a label [m]: no point is matched over a larger distance. Chosen on held-out

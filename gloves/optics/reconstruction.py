@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import heapq
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -338,20 +338,43 @@ MAX_FALSE_POINTS: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class OpticsConfig(Settings):
-    """Properties of cameras and solver; the defaults are those of a well-kept optical system."""
+class FrameOptics(Settings):
+    """What blobs and rays do in a single frame; the defaults are those of a well-kept optical system."""
 
     noise: Annotated[float, Limits(0.0)] = 0.12
     """Standard deviation of a blob's center per axis in the camera's own pixels [px], for a sphere of 3.2 mm
     radius; it falls with the root of the radius."""
-    partial: Annotated[float, Limits(0.0)] = 0.5
-    """Each line of sight goes to a random point of the marker within this share of its radius, so markers
-    behind an edge flicker."""
     marker_radius: Annotated[float, Limits(0.0, above=True)] | None = None
     """Radius of the glove's spheres [m]; the layout's when not given."""
     roundness: Annotated[float, Limits(0.0)] = 0.5
     """Two blobs that touch merge: they count as a marker while their centers are nearer than this share of
     the sum of their radii, and are discarded as not round beyond it."""
+    max_residual: Annotated[float, Limits(0.0)] = 0.003
+    """Largest distance of a ray from its point [m]; the worst ray is dropped first."""
+    min_angle: Annotated[float, Limits(0.0, 90.0)] = 10.0
+    """Two rays alone must cross at this angle at least [deg]."""
+    min_distance: Annotated[float, Limits(0.0)] = 0.004
+    """Points nearer to each other than this are one: the one with more rays [m]."""
+
+    def worn(self, radius: float) -> Self:
+        """The same for a glove whose spheres have this radius [m], unless `marker_radius` is given."""
+        return dataclasses.replace(self, marker_radius=self.radius_of(radius))
+
+    def radius_of(self, radius: float) -> float:
+        """`marker_radius`, or in its absence a layout's [m]."""
+        return radius if self.marker_radius is None else self.marker_radius
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsConfig(FrameOptics):
+    """Properties of cameras and solver over time, beside those of a single frame such as `noise` [px].
+
+    The defaults are those of a well-kept optical system.
+    """
+
+    partial: Annotated[float, Limits(0.0)] = 0.5
+    """Each line of sight goes to a random point of the marker within this share of its radius, so markers
+    behind an edge flicker."""
     blob_loss: Annotated[float, Limits(0.0, 1.0)] = 0.002
     """Chance that a camera misses a blob it should see."""
     dropout: Annotated[float, Limits(0.0, 1.0)] = 0.0002
@@ -364,12 +387,6 @@ class OpticsConfig(Settings):
     """Rays that must meet for a point to exist."""
     min_rays_to_start: Annotated[int, Limits(2)] = 3
     """Rays that must meet for a point that did not exist in the frame before."""
-    max_residual: Annotated[float, Limits(0.0)] = 0.003
-    """Largest distance of a ray from its point [m]; the worst ray is dropped first."""
-    min_angle: Annotated[float, Limits(0.0, 90.0)] = 10.0
-    """Two rays alone must cross at this angle at least [deg]."""
-    min_distance: Annotated[float, Limits(0.0)] = 0.004
-    """Points nearer to each other than this are one: the one with more rays [m]."""
 
     def check(self) -> None:
         """Refuse points that begin with fewer rays than they need to go on."""
@@ -378,14 +395,6 @@ class OpticsConfig(Settings):
                 f"min_rays is {self.min_rays} and min_rays_to_start {self.min_rays_to_start}, "
                 "expected 2 <= min_rays <= min_rays_to_start"
             )
-
-    def worn(self, radius: float) -> OpticsConfig:
-        """The same for a glove whose spheres have this radius [m], unless `marker_radius` is given."""
-        return dataclasses.replace(self, marker_radius=self.radius_of(radius))
-
-    def radius_of(self, radius: float) -> float:
-        """`marker_radius`, or in its absence a layout's [m]."""
-        return radius if self.marker_radius is None else self.marker_radius
 
 
 class Reconstruction(NamedTuple):

@@ -29,12 +29,13 @@ _PRINTED: Final = 10.0  # [s] between two lines elsewhere, as in the log of a ba
 _WIDTH: Final = 80  # columns of a terminal that does not tell
 
 
-def print_line(line: str) -> None:
-    """Print a line as it is: no markup in brackets, no colors, no breaks; odd bytes of names as escapes."""
+def print_line(*lines: str) -> None:
+    """Print lines as they are: no markup in brackets, no colors, no breaks; odd bytes of names as escapes."""
     from rich.console import Console
 
-    printable = line.encode("utf-8", "backslashreplace").decode("utf-8")
-    Console().print(printable, highlight=False, soft_wrap=True, markup=False)
+    for line in lines:
+        printable = line.encode("utf-8", "backslashreplace").decode("utf-8")
+        Console().print(printable, highlight=False, soft_wrap=True, markup=False)
 
 
 def print_table(

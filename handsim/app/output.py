@@ -86,22 +86,18 @@ class Output:
         result: str | None = None,
     ) -> None:
         """Claim the folder by a settings file of this name, see `handsim.files.outputs.claim`."""
-        path = self.folder / name
-        if self.is_here:
-            old = None if result is None else self.folder / result
-            claim(path, settings, noun=noun, error=error, grows=grows, result=old)
-        else:
-            found = self.sizes()
-            if found and name not in found:
-                raise error(f"{self} is not empty and holds no {noun}; name another folder")
-            self.fetch(name)
-            before = path.read_bytes() if path.is_file() else b""
-            claim(path, settings, noun=noun, error=error, grows=grows, shown=str(self))
-            if path.read_bytes() != before:
-                if result in found:
-                    with _one_sentence(self.place, "removing"):
-                        (self.place / str(result)).unlink()
-                _put(self.place, self.folder, [name])
+        path, old = self.folder / name, None if result is None else self.folder / result
+        found = {} if self.is_here else self.sizes()
+        if found and name not in found:
+            raise error(f"{self} is not empty and holds no {noun}; name another folder")
+        self.fetch(name)
+        before = path.read_bytes() if path.is_file() else b""
+        claim(path, settings, noun=noun, error=error, grows=grows, result=old, shown=str(self))
+        if not self.is_here and path.read_bytes() != before:
+            if result in found:
+                with _one_sentence(self.place, "removing"):
+                    (self.place / str(result)).unlink()
+            _put(self.place, self.folder, [name])
         self._claimed.append(name)
         self._fetched.add(name)
 
@@ -117,11 +113,11 @@ class Output:
         """Names and sizes [bytes] of all files in the output."""
         if self.is_here:
             return {name: (self.folder / name).stat().st_size for name in _files_in(self.folder)}
-        with _one_sentence(self.place, "listing"):
-            system, start = self.place.fs, self.place.path.rstrip("/") + "/"  # type: ignore[union-attr]
-            system.invalidate_cache()  # other machines write there too
+        start = self.place.path.rstrip("/") + "/"  # type: ignore[union-attr]
+        with _one_sentence(self.place, "listing") as files:
+            files.invalidate_cache()  # other machines write there too
             try:
-                found = system.find(start, detail=True)
+                found = files.find(start, detail=True)
             except FileNotFoundError:
                 return {}
         names = {path.removeprefix(start): int(about["size"]) for path, about in found.items()}
@@ -139,7 +135,9 @@ class Output:
                 (self.folder / name).touch()
                 self._fetched.add(name)
         self._fetched.update(wanted)
-        _transfer("get", self.place, {str(self.place / name): str(self.folder / name) for name in wanted})
+        if wanted:
+            with _one_sentence(self.place, "reading") as files:
+                files.get(*([str(side / name) for name in wanted] for side in (self.place, self.folder)))
 
     def checksum(self, name: str) -> str:
         """SHA-256 of a file in the output."""
@@ -209,7 +207,7 @@ def _check_store(store: UPath) -> None:
     """Import the packages that a store needs."""
     try:
         with _one_sentence(store, "opening"):
-            store.fs  # noqa: B018
+            pass
     except ImportError as error:
         raise ArgumentError(
             f"{store} needs a package that cannot be imported ({' '.join(str(error).split())}); "
@@ -221,21 +219,16 @@ def _put(store: Place, folder: Path, names: Collection[str], last: Sequence[str]
     """Put files of a folder into a store, those that match `last` after the others."""
     for late in (False, True):
         chosen = [name for name in names if _matches(name, last) == late]
-        _transfer("put", store, {str(folder / name): str(store / name) for name in chosen})
-
-
-def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
-    """Get files from a store or put them, several at a time."""
-    if pairs:
-        with _one_sentence(store, "writing" if method == "put" else "reading"):
-            getattr(store.fs, method)(list(pairs), list(pairs.values()))  # type: ignore[union-attr]
+        if chosen:
+            with _one_sentence(store, "writing") as files:
+                files.put(*([str(side / name) for name in chosen] for side in (folder, store)))
 
 
 @contextmanager
-def _one_sentence(place: Place, doing: str) -> Iterator[None]:
-    """Turn any error of a store into one sentence, since each protocol has its own errors."""
+def _one_sentence(place: Place, doing: str) -> Iterator[Any]:
+    """The file system of a store, any error of which ends in one sentence: each protocol has its own."""
     try:
-        yield
+        yield None if isinstance(place, Path) else place.fs
     except ImportError:
         raise
     except Exception as error:

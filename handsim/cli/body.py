@@ -10,7 +10,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
-from handsim.files.outputs import as_text, check_ending, check_outputs
+from handsim.files.outputs import as_text, check_outputs
 from handsim.space.objects import named_object
 
 
@@ -29,8 +29,7 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     from track.rigid_body import SUFFIX as TOML
     from track.rigid_body import RigidTemplate, learn_body, save_body
 
-    check_ending(out, TOML)
-    check_outputs([source], [out])
+    check_outputs([source], [out], TOML)
     if source.name.endswith(SUFFIX):
         bodies = load_take(source).bodies
         if not bodies:

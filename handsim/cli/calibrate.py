@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from handsim.app.messages import print_line, progress_bar
-from handsim.files.outputs import check_ending, check_outputs
+from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
@@ -43,8 +43,7 @@ def calibrate(
     from track import captures
     from track.settings import CalibrateSettings
 
-    check_ending(out, ".json")
-    check_outputs((capture, glove, labeler), [out])
+    check_outputs((capture, glove, labeler), [out], ".json")
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
         user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)
@@ -52,8 +51,8 @@ def calibrate(
     print_line(f"{out}: {len(user)} hands in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}
     for side in hands:
-        for line in found.get(side, ["it is not in the capture and was left out"]):
-            print_line(f"{side} hand: {line}")
+        told = found.get(side, ["it is not in the capture and was left out"])
+        print_line(*(f"{side} hand: {line}" for line in told))
 
 
 def _report(done: Calibration) -> list[str]:

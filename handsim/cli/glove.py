@@ -19,7 +19,7 @@ from gloves.layout import (
 )
 from handsim.app.messages import named_steps, print_line, print_table
 from handsim.errors import LayoutError
-from handsim.files.outputs import as_text, check_ending, check_outputs, write_starter
+from handsim.files.outputs import as_text, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
 
@@ -152,8 +152,7 @@ def score_glove(
         out: The page, an .html file; named after the glove when not given.
     """
     page = Path(glove).with_suffix(".html") if out is None else out
-    check_ending(page, ".html")
-    check_outputs([glove, settings.rig, settings.motion], [page])
+    check_outputs([glove, settings.rig, settings.motion], [page], ".html")
     from track import glove_score
     from track.glove_page import trial_rows, write_glove_page
     from train.evaluation import percent
@@ -176,8 +175,7 @@ def score_glove(
     if score.trials:
         print_line("captures, hands not calibrated; slots and whole frames that are right:")
         print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
-    for number, sentence in enumerate(score.advice, 1):
-        print_line(f"{number}. {sentence}")
+    print_line(*(f"{number}. {sentence}" for number, sentence in enumerate(score.advice, 1)))
     write_glove_page(page, score)
     print_line(f"{page}: the hand with its confusions, markers and joints")
 
@@ -196,8 +194,7 @@ def improve_glove(
         out: The new layout, a .toml file.
         settings: How to search.
     """
-    check_ending(out, ".toml")
-    check_outputs([glove, settings.rig], [out])
+    check_outputs([glove, settings.rig], [out], ".toml")
     from track import glove_improvement
     from track.glove_page import trial_rows
 
@@ -212,15 +209,13 @@ def improve_glove(
         print_table(trial_rows(trials, layout if name == "before" else found), left=6, wraps=True)
     if improved.verdict is not None:
         print_line(improved.verdict)
-    for fewer_count, worth in improved.fewer:
-        print_line(f"        {fewer_count} markers, {worth}")
+    print_line(*(f"        {fewer} markers, {worth}" for fewer, worth in improved.fewer))
     old = {marker.name: marker for marker in layout.markers}
     for marker in found.markers:
         if old.get(marker.name) != marker:
             verb = "move" if marker.name in old else "add"
             print_line(f"{verb} {marker.name}: {_place_line(marker)}")
-    for name in sorted(set(old) - set(found.names)):
-        print_line(f"drop {name}")
+    print_line(*(f"drop {name}" for name in sorted(set(old) - set(found.names))))
     print_line(f"{out}: run `handsim glove check {out}` and `handsim glove score {out}`")
 
 

@@ -14,7 +14,7 @@ from handsim.hand.shape import Side
 from track.config import BOTH, Size
 
 if TYPE_CHECKING:
-    from track.settings import TrackSettings
+    from track.settings import AnyHands, TrackSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +48,11 @@ class TrackerOptions:
 
         if self.shape is not None and self.size is not None:
             raise ArgumentError(f"given --size {self.size} and --shape {self.shape}, expected one of them")
-        settings = TrackSettings(
-            glove=self.glove, labeler=self.labeler, bodies=self.body, calibrate=calibrate
-        )
-        if self.shape is None:
-            return dataclasses.replace(settings, hands=self.hands or BOTH, size=self.size or "auto")
-        if self.hands is None:
-            return dataclasses.replace(settings, hands=self.shape)
-        user = load_user(self.shape).of_sides(self.hands)
-        return dataclasses.replace(settings, hands=dataclasses.replace(user, notes=self.shape.name))
+        hands: AnyHands = self.shape or self.hands or BOTH
+        if self.shape is not None and self.hands is not None:
+            hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
+        size = self.size or "auto"
+        return TrackSettings(self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate)
 
 
 def check_source(noun: str, file: object, live: str | None) -> None:

@@ -147,7 +147,10 @@ def _name_or_nothing(
 
 
 def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Parse a dataclass of settings by its fields, with their docstrings as help."""
+    """Parse a dataclass of settings by its fields, with their docstrings as help.
+
+    A field whose metadata say what it `follows` is no option.
+    """
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
     hints, told = get_type_hints(info.type, include_extras=True), dict[str, str]()
@@ -155,7 +158,7 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
         told |= _field_docstrings(kind)
     fields = []
     for one in dataclasses.fields(info.type):
-        if not one.init:
+        if not one.init or "follows" in one.metadata:
             continue
         default: Any = tyro.MISSING
         if dataclasses.is_dataclass(info.default):

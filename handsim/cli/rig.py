@@ -72,17 +72,14 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
         f"The cameras look at ({coordinates(point, ', ')}) m; {covered:.0f} % of the cube of "
         f"{side:g} m around it is in view of two or more."
     )
-    if not _tell_faults(cameras):
-        print_line(f"Nothing is suspicious. What it sees of hands at work: handsim rig score {rig}")
+    fine = f"Nothing is suspicious. What it sees of hands at work: handsim rig score {rig}"
+    print_line(*(_suspicions(cameras) or [fine]))
 
 
-def _tell_faults(rig: CameraRig) -> list[str]:
+def _suspicions(rig: CameraRig) -> list[str]:
     from train.forecast.rig_score import faults
 
-    found = faults(rig)
-    for sentence in found:
-        print_line(f"Suspicious: {sentence}.")
-    return found
+    return [f"Suspicious: {sentence}." for sentence in faults(rig)]
 
 
 def import_rig(
@@ -97,8 +94,7 @@ def import_rig(
         up: The axis that points up in the calibration; y for Motive and z for the others when not given.
             The rig's is z.
     """
-    check_ending(out, ".toml")
-    check_outputs([file], [out])
+    check_outputs([file], [out], ".toml")
     try:
         rig = CameraRig(as_text(file.stem), import_cameras(file, up))
     except RigError as error:
@@ -143,8 +139,7 @@ def score_rig(
     print_line(rig_score.COLUMNS_TOLD)
     axes = " x ".join(f"{1e3 * axis:.3f}" for axis in score.whole.error.axes)
     print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
-    for number, sentence in enumerate(score.advice, 1):
-        print_line(f"{number}. {sentence}")
+    print_line(*(f"{number}. {sentence}" for number, sentence in enumerate(score.advice, 1)))
     with written_together():
         if json is not None:
             save_json(json, score.record())
@@ -167,8 +162,7 @@ def plan_rig(
             middle below that of the volume.
         settings: Where hands work, and what cameras can hang on.
     """
-    check_ending(out, ".toml")
-    check_outputs([settings.keep, settings.glove], [out])
+    check_outputs([settings.keep, settings.glove], [out], ".toml")
     from train.forecast import rig_plan
 
     with named_steps("getting ready") as step:
@@ -180,7 +174,7 @@ def plan_rig(
     if planned.before is not None:
         print_line(f"before: {_forecast_line(planned.before)}")
     print_line(f"after:  {_forecast_line(planned.after)}")
-    _tell_faults(planned.rig)
+    print_line(*_suspicions(planned.rig))
     planned.rig.save(out)
     print_line(f"{out}: run `handsim rig score {out}`")
 

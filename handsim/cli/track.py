@@ -137,8 +137,7 @@ def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], mill
     if user.startswith("calibrated on"):
         lines = user.split("; ")
     lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*lines, *notes, *summarize(take), f"{milliseconds:.2f} ms per frame"):
-        print_line(line)
+    print_line(*lines, *notes, *summarize(take), f"{milliseconds:.2f} ms per frame")
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
 

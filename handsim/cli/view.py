@@ -103,7 +103,4 @@ def _view_live(
     with opened_server(host, port, "handsim view") as server, LiveView(server, cameras) as view:
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
         tracked = track_live(url, setup, [view], out=out)
-    for line in view.notes():
-        print_line(line)
-    if out is not None:
-        print_line(f"{out}: {tracked.num_frames} frames")
+    print_line(*view.notes(), *([] if out is None else [f"{out}: {tracked.num_frames} frames"]))

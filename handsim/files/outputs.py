@@ -14,11 +14,11 @@ import platform
 import shutil
 import tempfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, shortened
@@ -256,8 +256,13 @@ def _flush(path: Path) -> None:
 _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
-def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
-    """Refuse an output that names an input or another one, in whatever spelling, or has no place."""
+def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *endings: str) -> None:
+    """Refuse an output that names an input or another one, in whatever spelling, or has no place.
+
+    If `endings` are given, the first output is --out, whose name must have one of them.
+    """
+    if endings:
+        check_ending(cast("Path", outputs[0]), *endings)
     read, written = [Path(name) for name in inputs if isinstance(name, str | Path)], set()
     for output in (path for path in outputs if path is not None):
         _check_links(output)

@@ -178,13 +178,11 @@ class Dataset:
         for name, expected in self.manifest.files.items():
             file = path / name
             if not file.is_file():
-                raise DatasetError(
-                    f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
-                )
+                raise DatasetError(f"{file} is missing; run handsim generate again, which makes it anew")
             if checksum(file) != expected:
                 raise DatasetError(
-                    f"{file} is damaged (its checksum is not the manifest's); delete it together with "
-                    f"{MANIFEST} and run handsim generate again"
+                    f"{file} is damaged (its checksum is not the manifest's); run handsim generate again, "
+                    "which makes such files anew"
                 )
         self.path = path
         self.shards = self._map_shards()

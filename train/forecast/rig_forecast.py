@@ -197,7 +197,7 @@ def _observe(
     """What the rig captures of each hand of unrelated frames."""
     config = GenerateSettings()
     # In single frames two rays are enough for a point, as for one that exists already in a capture.
-    optics = dataclasses.replace(config.optics, min_rays_to_start=config.min_cameras)
+    optics = OpticsConfig(min_rays_to_start=config.min_cameras)
     frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)
     for fit, qpos, seen in zip(fits, scene.qpos, frames, strict=True):
         yield ObservedHand(fit, qpos, seen)

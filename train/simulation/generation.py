@@ -35,6 +35,7 @@ from train.data.shards import (
     Manifest,
     array_bytes,
     hands_name,
+    load_manifest,
     load_redrawn,
     redrawn_name,
     row_dtype,
@@ -94,6 +95,7 @@ def make_dataset(
     if isinstance(place, Path):
         _check_space(source, place)
     with open_output(place) as output:
+        damaged = _damaged_files(output)
         output.claim(
             CONFIG,
             _record(source),
@@ -102,7 +104,7 @@ def make_dataset(
             grows="num_frames",
             result=MANIFEST,
         )
-        _make_shards(source, output, workers, progress)
+        _make_shards(source, output, damaged, workers, progress)
         return _complete(source, output)
 
 
@@ -152,9 +154,29 @@ def _record(source: FrameSource) -> dict[str, Any]:
     }
 
 
-def _make_shards(source: FrameSource, output: Output, workers: int | Executor, progress: Progress) -> None:
-    """Make the missing shards."""
-    there, total = output.sizes(), source.settings.num_frames
+def _damaged_files(output: Output) -> set[str]:
+    """Files of a finished set that are no longer what its manifest lists, which are told."""
+    if not output.is_here and MANIFEST in output.sizes():
+        (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
+    try:
+        listed = load_manifest(output.folder).files
+    except DatasetError:  # unfinished, or of another version
+        return set()
+    there = output.sizes()
+    damaged = {name for name, known in listed.items() if name in there and output.checksum(name) != known}
+    if damaged:
+        names = ", ".join(sorted(damaged))
+        told = f"{output}: {names} are not what {MANIFEST} lists (other checksums), and are made again"
+        warnings.warn(told, HandSimWarning, stacklevel=4)
+    return damaged
+
+
+def _make_shards(
+    source: FrameSource, output: Output, damaged: set[str], workers: int | Executor, progress: Progress
+) -> None:
+    """Make the shards that are missing or damaged."""
+    total = source.settings.num_frames
+    there = {name: size for name, size in output.sizes().items() if name not in damaged}
     todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
     done = total - sum(_shard_size(total, shard) for shard in todo)
     try:

@@ -63,12 +63,18 @@ class OpticsOptions(Settings):
 
     noise: float | None = None
     """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius."""
-    partial: float | None = None
-    """Share of a marker's radius within which its visible spot lies, another one for each camera."""
     marker_radius: float | None = None
     """Radius of the glove's spheres [m]; the layout's when not given."""
     roundness: float | None = None
     """Share of the sum of their radii within which two blobs that touch count as one marker."""
+    max_residual: float | None = None
+    """Largest distance of a ray from its point [m]."""
+    min_angle: float | None = None
+    """Two rays alone must cross at this angle at least [deg]."""
+    min_distance: float | None = None
+    """Points nearer to each other than this are one [m]."""
+    partial: float | None = None
+    """Share of a marker's radius within which its visible spot lies, another one for each camera."""
     blob_loss: float | None = None
     """Chance that a camera misses a blob it should see."""
     dropout: float | None = None
@@ -81,12 +87,6 @@ class OpticsOptions(Settings):
     """Rays that must meet for a point to exist."""
     min_rays_to_start: int | None = None
     """Rays that must meet for a point that did not exist in the frame before."""
-    max_residual: float | None = None
-    """Largest distance of a ray from its point [m]."""
-    min_angle: float | None = None
-    """Two rays alone must cross at this angle at least [deg]."""
-    min_distance: float | None = None
-    """Points nearer to each other than this are one [m]."""
 
     def applied(self, optics: OpticsConfig) -> OpticsConfig:
         """An optical system with these options in the place of its own, if they are in range."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit, wear
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
-from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.reconstruction import FrameOptics, OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
@@ -90,11 +90,19 @@ class GenerateSettings(Settings):
     at the origin, are put anywhere."""
     scenes: SceneMix = field(default_factory=SceneMix)
     ghosts: GhostConfig = field(default_factory=GhostConfig)
-    optics: OpticsConfig = field(default_factory=OpticsConfig)
+    optics: FrameOptics = field(default_factory=FrameOptics)
     blob_loss: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.15)
     """Least and greatest chance that a camera misses a blob; every person draws another."""
     dropout: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.4)
     """Least and greatest chance per frame that some cameras lose their pictures."""
+
+    def check(self) -> None:
+        """Refuse optics over time, whose chances are drawn for each person here."""
+        if isinstance(self.optics, OpticsConfig):
+            raise ArgumentError(
+                "optics is an OpticsConfig, expected FrameOptics; each person draws the losses of blobs and "
+                "pictures, as blob_loss and dropout of a training set say"
+            )
 
 
 class FrameSource(NamedTuple):
@@ -188,8 +196,8 @@ def simulate_frames(
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
     around = np.deg2rad(settings.slip_around)
     fits = wear_gloves(layout, scene.hands, along=settings.slip_along, around=around, rng=rng)
-    optics = dataclasses.replace(  # every person has another optical system
-        settings.optics,
+    optics = OpticsConfig(  # every person has another optical system
+        **dataclasses.asdict(settings.optics),
         blob_loss=rng.uniform(*settings.blob_loss),
         dropout=rng.uniform(*settings.dropout),
         dropout_length=1.0,

@@ -16,7 +16,7 @@ import pytest
 
 from gloves import load_layout
 from handsim import HandModel, Population, join_qpos
-from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
+from handsim.errors import ArgumentError, DatasetError, HandSimWarning, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
 from handsim.space.rig import load_rig
@@ -129,6 +129,22 @@ def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
         Dataset(out)
     make_dataset(CONFIG, out, workers=1)
     assert contents(out) == contents(finished)
+
+
+@pytest.mark.parametrize("name", [rows_name(1), hands_name(2)])
+@pytest.mark.parametrize("num_frames", [700, 900])
+def test_a_damaged_file_is_told_and_made_again(finished, tmp_path, name, num_frames):
+    out = tmp_path / "damaged"
+    shutil.copytree(finished, out)
+    content = bytearray((out / name).read_bytes())
+    content[-40:-36] = b"\x00\x01\x02\x03"
+    (out / name).write_bytes(content)
+    with pytest.raises(DatasetError, match=rf"{name} is damaged .* run handsim generate again"):
+        Dataset(out)
+    with pytest.warns(HandSimWarning, match=rf"{name} are not what manifest.json lists"):
+        make_dataset(dataclasses.replace(CONFIG, num_frames=num_frames), out, workers=1)
+    assert checksum(out / name) == checksum(finished / name)
+    assert len(Dataset(out)) == num_frames
 
 
 def test_another_seed_makes_other_rows(finished, tmp_path):
@@ -332,7 +348,7 @@ def test_a_manifest_of_wrong_types_is_told(finished, tmp_path, field):
         Dataset(tmp_path)
     del content[field]
     (tmp_path / MANIFEST).write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match=f"the field {field} is missing|is missing; delete"):
+    with pytest.raises(DatasetError, match=f"the field {field} is missing|is missing; run"):
         Dataset(tmp_path)
 
 
