@@ -87,15 +87,11 @@ class _Search:
 
 
 class HandInitializer:
-    """Initializes hands without any history.
+    """Initializes hands without any history, by a labeler that does not know left from right."""
 
-    Args:
-        labeler: Labels the points of a cloud of one hand; does not know left from right.
-        config: Largest RMS distance of a pose, and the density of strays.
-        at_once: Look at a group of points along all directions in one call. Otherwise a call looks along
-            three, and the next calls, a frame later each, along one more, until a hand is certain or all were
-            tried: no frame waits for a search.
-    """
+    # Unless it looks at a group of points along all directions at once, a call looks along three, and the
+    # next calls, a frame later each, along one more, until a hand is certain or all were tried: no frame
+    # waits for a search.
 
     def __init__(
         self,

@@ -127,28 +127,17 @@ class NormalEquations(NamedTuple):
 
 
 class Problem:
-    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change.
-
-    Args:
-        shape: Right hand that the parameters start from.
-        design: Skin coordinates of the markers by the glove's design.
-        heights: Heights of the marker centers above the skin, as designed [m].
-        targets: Labeled markers of the chosen frames [m]; NaN where missing.
-        noise: Standard deviation of a marker's coordinates [m].
-        robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
-            (Geman and McClure 1987).
-        relinearize: Change of a parameter that renews the skin's jacobian.
-    """
+    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change."""
 
     def __init__(
         self,
-        shape: HandShape,
-        design: SkinCoordinates,
-        heights: Float[np.ndarray, "M"],
-        targets: Float[np.ndarray, "F M 3"],
+        shape: HandShape,  # right hand that the parameters start from
+        design: SkinCoordinates,  # of the markers by the glove's design
+        heights: Float[np.ndarray, "M"],  # of the marker centers above the skin, as designed [m]
+        targets: Float[np.ndarray, "F M 3"],  # labeled markers of the chosen frames [m]; NaN where missing
         *,
-        noise: float,
-        robust_scale: float,
+        noise: float,  # standard deviation of a marker's coordinates [m]
+        robust_scale: float,  # where a residual costs half of a quadratic loss [m] (Geman and McClure 1987)
         relinearize: float = RELINEARIZE,
     ) -> None:
         self._relinearize = relinearize

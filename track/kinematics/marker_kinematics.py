@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import BONES, NUM_BONES, NUM_JOINTS
-from handsim.kernels import kernel, multiply_rotations, rotate_quaternion
+from handsim.kernels import kernel, multiply_rotations, quaternion_product, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
@@ -404,12 +404,9 @@ def wrist_offsets(
     step[NUM_JOINTS] = a + 2.0 * (w * i + j * z - k * y)
     step[NUM_JOINTS + 1] = b + 2.0 * (w * j + k * x - i * z)
     step[NUM_JOINTS + 2] = c + 2.0 * (w * k + i * y - j * x)
-    p, q, r, s = before[3], -before[4], -before[5], -before[6]
-    e = p * w - q * x - r * y - s * z
+    e, i, j, k = quaternion_product(before[3], -before[4], -before[5], -before[6], w, x, y, z)
     share = 2.0 if e >= 0.0 else -2.0
-    step[NUM_JOINTS + 3] = share * (p * x + q * w + r * z - s * y)
-    step[NUM_JOINTS + 4] = share * (p * y - q * z + r * w + s * x)
-    step[NUM_JOINTS + 5] = share * (p * z + q * y - r * x + s * w)
+    step[NUM_JOINTS + 3], step[NUM_JOINTS + 4], step[NUM_JOINTS + 5] = share * i, share * j, share * k
 
 
 @kernel

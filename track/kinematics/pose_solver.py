@@ -104,12 +104,10 @@ class PoseFit:
 
 
 class PoseSolver:
-    """Solves poses of one hand in one glove; precomputes what does not depend on the frame.
+    """Solves poses of one hand in one glove; precomputes what does not depend on the frame."""
 
-    Args:
-        outlier_distance: Scale [m] of a robust loss (Geman and McClure 1987), so that a wrong label does not
-            bend the hand; it needs a good start. Plain least squares when not given.
-    """
+    # The outlier distance [m] is the scale of a robust loss (Geman and McClure 1987), so that a wrong label
+    # does not bend the hand; it needs a good start. Without it a fit is plain least squares.
 
     def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
         self.hand: HandArrays = hand_arrays(fit)
@@ -173,9 +171,7 @@ class PoseSolver:
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
-        positions = np.empty((len(self.hand.digits), 3))
-        _write_world_markers(self.hand, np.array(qpos, dtype=np.float64), positions)
-        return positions
+        return _world_markers(self.hand, np.array(qpos, dtype=np.float64))
 
 
 def solve_pose(
@@ -231,12 +227,7 @@ def _fit_frames(
     robust_scale: float,
     iterations: int,
     small_gain: float,
-) -> tuple[
-    Float[np.ndarray, "T 27"],
-    Float[np.ndarray, "T"],
-    Float[np.ndarray, "T M 3"],
-    Int[np.ndarray, "T"],
-]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Solve frames one by one; the result has the fields of a `PoseFit`."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
@@ -328,15 +319,15 @@ def _write_residuals(
 
 
 @kernel
-def _write_world_markers(
-    hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
-) -> None:
-    """Write the positions of a pose's markers in the world [m]."""
-    work, wrist = workspace(len(positions)), np.empty((3, 3))
+def _world_markers(hand: HandArrays, pose: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+    """Positions of a pose's markers in the world [m]."""
+    positions, wrist = np.empty((len(hand.digits), 3)), np.empty((3, 3))
+    work = workspace(len(positions))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     compute_markers(hand, pose[7:], work)
     for marker in range(len(positions)):
         positions[marker] = pose[:3] + wrist @ work.markers[marker]
+    return positions
 
 
 @kernel
