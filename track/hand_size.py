@@ -150,18 +150,17 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """The hands that are found as hands of a length [m]."""
-    start = _hand(length, usual_breadth(length), layout)
-    markers = _label(frames, start, sides, labeler, config)
-    if not markers:
-        return None
-    search = _Search(markers, start)
-    found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    if abs(found - length) > _FAR:  # the labels are better with its own size
-        start = _hand(found, usual_breadth(found), layout)
+    markers: list[NDArray[np.float64]] = []
+    for _ in range(2):  # the labels are better with hands of about their own size
+        start = _hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
-        search = _Search(markers, start)
-        found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(found), layout))
+        if not markers:
+            return None
+        search, before = _Search(markers, start), length
+        length = search.length(usual_breadth, _SHORTEST, _LONGEST)
+        if abs(length - before) <= _FAR:
+            break
+    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:

@@ -69,15 +69,15 @@ class RigidTemplate(RigidBody):
     """A rigid body whose markers determine its pose: the markers in its own frame.
 
     Raises:
-        ArgumentError: `positions` have another shape, or `template_fault` finds a fault.
+        ArgumentError: `positions` have another shape, or do not tell the body's pose.
     """
 
     def __post_init__(self) -> None:
         positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")
         object.__setattr__(self, "positions", positions)
-        fault = template_fault(self.name, self.marker_names, positions)
+        fault = self._fault()
         if fault is not None:
-            raise ArgumentError(fault)
+            raise ArgumentError(f"{self.name}: {fault}")
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidTemplate:
@@ -91,41 +91,35 @@ class RigidTemplate(RigidBody):
     @property
     def distances(self) -> Float[np.ndarray, "Q Q"]:
         """Distances between markers [m]."""
-        return _distances_between(self.positions)
+        distances: NDArray[np.float64] = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
+        return distances
 
-
-def template_fault(
-    name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
-) -> str | None:
-    """Why these markers [m] are not a body that can be tracked, as a sentence; None if they are."""
-    if len(positions) < FEWEST:
-        return f"{name}: {len(positions)} markers, expected at least {FEWEST}, which determine a pose"
-    if len(set(marker_names)) < len(marker_names):
-        return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
-    distances = _distances_between(positions)
-    apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
-    if apart.min() < _LEAST_MARKER_DISTANCE:
-        first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
-        return (
-            f"{name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
-            f"{1e3 * _LEAST_MARKER_DISTANCE:.0f} mm"
-        )
-    off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
-    if off_line < _LEAST_WIDTH * np.sqrt(len(positions)):
-        return f"{name}: its markers lie on one line, expected three that do not"
-    order = _symmetry(positions, distances)
-    if order is not None:
-        moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
-        return (
-            f"{name}: its markers look the same from two sides ({', '.join(moved)}), expected positions "
-            "whose distances differ by some millimeters"
-        )
-    return None
-
-
-def _distances_between(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    distances: NDArray[np.float64] = np.linalg.norm(positions[:, None] - positions, axis=2)
-    return distances
+    def _fault(self) -> str | None:
+        """Why these markers are not a body that can be tracked; None if they are."""
+        positions, marker_names = self.positions, self.marker_names
+        if len(positions) < FEWEST:
+            return f"{len(positions)} markers, expected at least {FEWEST}, which determine a pose"
+        if len(set(marker_names)) < len(marker_names):
+            return f"a marker name is there twice: {', '.join(marker_names)}"
+        distances = self.distances
+        apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
+        if apart.min() < _LEAST_MARKER_DISTANCE:
+            first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
+            return (
+                f"{first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
+                f"{1e3 * _LEAST_MARKER_DISTANCE:.0f} mm"
+            )
+        off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
+        if off_line < _LEAST_WIDTH * np.sqrt(len(positions)):
+            return "its markers lie on one line, expected three that do not"
+        order = _symmetry(positions, distances)
+        if order is not None:
+            moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
+            return (
+                f"its markers look the same from two sides ({', '.join(moved)}), expected positions "
+                "whose distances differ by some millimeters"
+            )
+        return None
 
 
 def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
