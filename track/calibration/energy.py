@@ -566,11 +566,11 @@ def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[n
 
 def _damped_step(
     equations: NormalEquations, damping: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Float[np.ndarray, "F 26"], Float[np.ndarray, "S"]]:
     """The step of the poses (F, 26) and that of the shared unknowns (S,)."""
     reduced, solved = eliminate_poses(equations, damping)
     system = reduced[:, :-1] + np.diag(damping * equations.shared.diagonal())
-    shared: NDArray[np.float64] = -np.linalg.solve(system, reduced[:, -1])
+    shared = -np.linalg.solve(system, reduced[:, -1])
     return -solved[..., -1] - solved[..., :-1] @ shared, shared
 
 
