@@ -17,6 +17,7 @@ from handsim.files.outputs import atomic_write
 from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
 from handsim.hand.shape import BONES, DIGITS
 from handsim.hand.skin import vertex_normals
+from render.formats.png import encode_png
 from render.formats.records import CENTER, as_sensed
 from render.frames import Bytes, Doubles, HandTruth, RenderedFrame
 from render.painting.figures import Material, linear
@@ -79,10 +80,8 @@ def write_png(path: str | Path, picture: Picture) -> None:
     """Write a picture as PNG."""
     if Path(path).suffix.lower() != ".png":
         raise HandSimError(f"{path}: expected a file name that ends in .png")
-    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
-    assert done, "a PNG takes any 8-bit picture"
     with atomic_write(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+        temporary.write_bytes(encode_png(picture))
 
 
 def side_by_side(pictures: Sequence[Picture], *, gap: int = 0) -> Picture:

@@ -63,10 +63,9 @@ def _measure_disparity(
 ) -> Floats:
     """Depth (H, W) as the sensor has it [m], 0 where it has none; `focal` is horizontal [px]."""
     scale, height, width = np.float32(noise.baseline * focal), *depth.shape
-    with np.errstate(divide="ignore"):
-        ideal = np.where(depth > 0.0, scale / depth, np.float32(0.0))
-    kept = (depth >= noise.nearest) & (depth <= noise.farthest)
-    kept &= cosines >= np.cos(noise.steepest)
+    ideal, kept = np.zeros_like(depth), np.zeros(depth.shape, np.bool_)
+    nearest, farthest = np.float32(noise.nearest), np.float32(noise.farthest)
+    _write_ideal(depth, cosines, scale, nearest, farthest, float(np.cos(noise.steepest)), ideal, kept)
     if noise.support > 0.0:
         coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
         needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
@@ -83,6 +82,26 @@ def _measure_disparity(
 
 
 @kernel
+def _write_ideal(
+    depth: Floats,
+    cosines: Floats,
+    scale: np.float32,
+    nearest: np.float32,
+    farthest: np.float32,
+    flattest: float,
+    disparity: Floats,
+    kept: Flags,
+) -> None:
+    """Write disparities `scale / depth` (H, W) [px], and which surfaces are in range and not too steep."""
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            here = depth[row, column]
+            if here > 0.0:
+                disparity[row, column] = scale / here
+                kept[row, column] = nearest <= here <= farthest and cosines[row, column] >= flattest
+
+
+@kernel
 def keep_lit(disparity: Floats, kept: Flags) -> None:
     """Clear pixels of `kept` (H, W) that a nearer surface hides from the projector, to the right in the row.
 
@@ -91,16 +110,17 @@ def keep_lit(disparity: Floats, kept: Flags) -> None:
     """
     height, width = disparity.shape
     most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
-    first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int64)
+    first = np.empty(width + int(most) + 2, np.float32)
     for row in range(height):
         first[:] = 0.0
         for column in range(width):
             near = disparity[row, column]
-            cells[column] = 1 + int(np.rint(np.float32(column) - near + most))
-            first[cells[column]] = max(first[cells[column]], near)
+            if near > 0.0:
+                cell = 1 + int(np.rint(np.float32(column) - near + most))
+                first[cell] = max(first[cell], near)
         for column in range(width):
             if kept[row, column]:  # neighbors close what rounding left open
-                cell = cells[column]
+                cell = 1 + int(np.rint(np.float32(column) - disparity[row, column] + most))
                 nearest = max(first[cell - 1], first[cell], first[cell + 1])
                 kept[row, column] = nearest <= disparity[row, column] + np.float32(_SHADOW_SLACK)
 

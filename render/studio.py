@@ -38,7 +38,7 @@ from render.frames import (
     RenderedFrame,
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
-from render.painting.painter import Painter, paint, put_before
+from render.painting.painter import Painter, paint, put_before, whole_levels
 from render.painting.rasterizer import NEAR, faces_for, see, warp
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
@@ -347,11 +347,11 @@ class Studio:
         if choices.enclosure is not None:
             behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
             return put_before(whole, behind)
-        plain, light = _background(background, camera.size), None
+        (plain, bare), light = _background(background, camera.size), None
         if background.backdrop is not None and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, choices.lighting, background.backdrop)
         if light is None:
-            return put_before(whole, plain)
+            return put_before(whole, plain, bare)
         return put_before(
             whole, np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
         )
@@ -384,12 +384,8 @@ class Studio:
         )
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
-        noise = choices.depth_noise
-        kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
-        chosen = dataclasses.asdict(choices)
-        if choices.enclosure is None:
-            del chosen["enclosure"]
-        return {"people": self._looks, "body_colors": self._colors, **kind, **chosen}
+        record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
+        return {"people": self._looks, "body_colors": self._colors, **record}
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
@@ -409,7 +405,19 @@ def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
 
 
 @functools.lru_cache(maxsize=2)
-def _background(background: Background, size: tuple[int, int]) -> Floats:
-    """A background (H, W, 3) in sRGB, from 0 to 255."""
+def _background(background: Background, size: tuple[int, int]) -> tuple[Floats, Bytes]:
+    """A background (H, W, 3) in sRGB, from 0 to 255, and as bytes."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
-    return enlarged(np.multiply(display, np.float32(255.0), out=display), size)
+    whole = enlarged(np.multiply(display, np.float32(255.0), out=display), size)
+    return whole, whole_levels(whole)
+
+
+@functools.lru_cache(maxsize=64)
+def _as_record(choices: FrameChoices) -> dict[str, Any]:
+    """Choices as JSON; cached, because pictures of a shard have all but their seed in common."""
+    noise = choices.depth_noise
+    kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
+    record = kind | dataclasses.asdict(choices)
+    if choices.enclosure is None:
+        del record["enclosure"]
+    return record

@@ -152,7 +152,6 @@ def _transforms(positions: Doubles, rotations: Doubles) -> Doubles:
 
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
-PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
 _EYES: Final = (0.32, 0.38)  # position of a head's camera behind and above the hands [m]
 _HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # least angle between a head's line of sight and a forearm
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]

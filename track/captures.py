@@ -166,7 +166,12 @@ def track_capture(
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
-    return take if corrections is None else _corrected(take, Path(corrections), pins)
+    if corrections is None:
+        return take
+    corrected = correct_take(take, pins)
+    for sentence in told(Path(corrections), corrected.unfitting):
+        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+    return corrected.take
 
 
 def calibrate(
@@ -184,8 +189,7 @@ def calibrate(
     better than the hand before, the hand stays, with a warning. Otherwise it is solved on all frames.
 
     Args:
-        capture: Points [m], or the path of a marker file or a take; names of markers
-            are not used.
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
         settings: Which hands to begin with; as `CalibrateSettings()` when not given.
         progress: Called with what is done of a step, and all there is to do in it.
         on_step: Called with the name of each step, such as "frames".
@@ -316,11 +320,3 @@ def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tu
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
     return corrections
-
-
-def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Take:
-    """The take with its corrections, and warnings of those that do not fit."""
-    corrected = correct_take(take, corrections)
-    for sentence in told(path, corrected.unfitting):
-        warnings.warn(sentence, HandSimWarning, stacklevel=3)
-    return corrected.take

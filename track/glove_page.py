@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST: Final = 15.0  # end of the colors' scale [deg]
+_TRIALS: Final = (
+    "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
+    "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames that "
+    "are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints is about "
+    "calibrated ones."
+)
 _PAIRS: Final = 5  # pairs of near markers that are listed
 
 
@@ -28,7 +34,7 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
     layout, nothing = score.layout, "Nothing stands out: no marker is in anybody's way."
     sections = [
         Section("What to do", html_list(score.advice) if score.advice else nothing),
-        *([_trials_section(score)] if score.trials else []),
+        *([Section("Captures", _TRIALS, table=trial_rows(score.trials, layout))] if score.trials else []),
         _labels_section(score),
         _markers_section(score),
         _joints_section(score),
@@ -56,16 +62,6 @@ def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[s
         worst = f"{layout.names[trial.worst]} ({100 * trial.right[trial.worst]:.0f} %)"
         rows.append([work, *rights, worst, f"{trial.joint_error:.1f}", f"{1e3 * trial.size_error:.1f}"])
     return rows
-
-
-def _trials_section(score: LayoutScore) -> Section:
-    text = (
-        "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
-        "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames "
-        "that are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints "
-        "is about calibrated ones."
-    )
-    return Section("Captures", text, table=trial_rows(score.trials, score.layout))
 
 
 def _labels_section(score: LayoutScore) -> Section:
@@ -134,12 +130,10 @@ def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"
     colors = color_scale(_MOST, 0.0)
     for bone in sorted({joint.bone for joint in JOINTS}):
         worst = max(degrees[number] for number, joint in enumerate(JOINTS) if joint.bone == bone)
-        x, y = hand.bones[bone - 1][0]
-        color = colors.to_rgba(worst)
-        panel.plot(x, y, "o", markersize=15.0, color=color, markeredgecolor=Paint.INK, zorder=3)
+        place, color = hand.bones[bone - 1][0], colors.to_rgba(worst)
+        panel.plot(*place, "o", markersize=15.0, color=color, markeredgecolor=Paint.INK, zorder=3)
         panel.annotate(
-            f"{worst:.0f}", (x, y), fontsize=7.5, ha="center", va="center_baseline", color=Paint.INK, zorder=4
+            f"{worst:.0f}", place, fontsize=7.5, ha="center", va="center_baseline", color=Paint.INK, zorder=4
         )
-    color_bar(
-        figure, colors, "standard deviation of the worst joint [deg]", ax=panel, shrink=0.6, extend="max"
-    )
+    told = "standard deviation of the worst joint [deg]"
+    color_bar(figure, colors, told, ax=panel, shrink=0.6, extend="max")

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -141,12 +141,10 @@ class LayoutScore:
     def advice(self) -> tuple[str, ...]:
         """What to move, add or drop, in sentences, the most important first."""
         kinds = (_captures, _confusions, _joints, _hidden, _touching, _sides, _dispensable)
-        found = [
-            one
-            for kind in kinds
-            for one in sorted(kind(self), key=lambda item: -item.weight)[:_MOST_OF_A_KIND]
-        ]
-        return tuple(one.sentence for one in sorted(found, key=lambda item: -item.weight))
+        found: list[_Advice] = []
+        for kind in kinds:
+            found += sorted(kind(self), key=lambda advice: -advice[0])[:_MOST_OF_A_KIND]
+        return tuple(sentence for _, sentence in sorted(found, key=lambda advice: -advice[0]))
 
 
 def score_glove(
@@ -400,11 +398,8 @@ def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float
     return share, counts.frames_right / counts.frames
 
 
-class _Advice(NamedTuple):
-    """A sentence, and the share of points, frames or joints that it is about."""
-
-    weight: float
-    sentence: str
+_Advice = tuple[float, str]
+"""The share of points, frames or joints that a sentence is about, and the sentence."""
 
 
 def _captures(score: LayoutScore) -> Iterator[_Advice]:
@@ -413,7 +408,7 @@ def _captures(score: LayoutScore) -> Iterator[_Advice]:
         shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
         if min(shares.values()) < _WRONG:
             told = ", ".join(f"{100 * share:.0f} % with {method}" for method, share in shares.items())
-            yield _Advice(
+            yield (
                 1.0 - min(shares.values()),
                 f"With {work} {score.layout.names[trial.worst]} is labeled worst: right in {told}. Give it "
                 "a marker next to it on the same digit, or other distances to the markers of the palm.",
@@ -428,7 +423,7 @@ def _confusions(score: LayoutScore) -> Iterator[_Advice]:
             continue
         told.add(pair)
         first, second = names[mistake.truth], names[mistake.called]
-        yield _Advice(
+        yield (
             mistake.share,
             f"Move {first} or {second}, so that their distances to the others differ: "
             f"{100 * mistake.share:.0f} % of the points of {first} are taken for {second}.",
@@ -453,7 +448,7 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
             f"({np.rad2deg(score.joints[number]):.0f} deg)"
             for number in poor
         )
-        yield _Advice(
+        yield (
             float(share[poor].max()) * 0.1,
             f"Add a marker on {bone}: the markers tell little of the {name}'s {listed}.",
         )
@@ -462,7 +457,7 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
 def _hidden(score: LayoutScore) -> Iterator[_Advice]:
     for name, seen in zip(score.layout.names, score.seen, strict=True):
         if seen < _HIDDEN:
-            yield _Advice(
+            yield (
                 1.0 - float(seen),
                 f"Move {name} towards the back of the hand: it is a point in {100 * seen:.0f} % of the "
                 "frames only.",
@@ -475,7 +470,7 @@ def _touching(score: LayoutScore) -> Iterator[_Advice]:
     for first, second in zip(*np.nonzero(np.triu(score.near) > _TOUCHING), strict=True):
         share = float(score.near[first, second])
         if digits[first] == digits[second]:
-            yield _Advice(
+            yield (
                 share,
                 f"Move {names[first]} and {names[second]} apart: they touch, or nearly, in "
                 f"{100 * share:.0f} % of the frames, and their blobs merge.",
@@ -489,7 +484,7 @@ def digit_of(place: MarkerPlace) -> int:
 
 def _sides(score: LayoutScore) -> Iterator[_Advice]:
     if score.sides_right < _SIDES:
-        yield _Advice(
+        yield (
             1.0 - score.sides_right,
             f"Make the back of the hand less symmetric: left and right are mistaken in "
             f"{100 * (1.0 - score.sides_right):.0f} % of the frames.",
@@ -500,7 +495,7 @@ def _dispensable(score: LayoutScore) -> Iterator[_Advice]:
     grown: Float[np.ndarray, "M"] = (score.joints_without - score.joints).max(axis=1)
     for marker in np.argsort(grown):
         if grown[marker] < _DISPENSABLE:
-            yield _Advice(
+            yield (
                 0.0,
                 f"{score.layout.names[marker]} can be dropped as far as joints go: without it none is known "
                 f"worse by more than {np.rad2deg(grown[marker]):.1f} deg. It may still help to tell the "

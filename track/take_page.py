@@ -1,8 +1,7 @@
 """The page on a take and the tables beside it: what a biomechanics lab looks at before it uses the angles.
 
-Angles are in degrees and residuals in
-millimeters. In the tables (.csv) units stand in the names of columns, and an empty cell is a number that does
-not exist.
+Angles are in degrees and residuals in millimeters. In the tables (.csv) units stand in the names of columns,
+and an empty cell is a number that does not exist.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
@@ -39,12 +37,8 @@ _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "larges
 _CHUNK: Final = 4096  # frames whose bones are posed at once
 _MOST_SPANS: Final = 100  # rows; with more a take is not worth reading line by line
 _BINS: Final = 750  # of a long take; the curve has the least and the largest value of each
-_STROKES: Final = (
-    Paint.VIOLET,
-    Paint.BLUE,
-    Paint.WARM,
-    Paint.GREEN,
-)  # of a digit's joints, from the knuckle outwards
+_STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
+"""Colors of a digit's joints, from the knuckle outwards."""
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
@@ -66,17 +60,14 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
     """
     out = Path(out)
     check_ending(out, ".html")
-    hands, spans = hand_figures(take), find_suspect_spans(take, most=None)
-    sections = [_summary_section(take), _calibration_section(take)]
-    sections += [section for hand in hands for section in _hand_sections(take, hand)]
-    sections.append(_spans_section(take, spans, source))
-    tables = [
-        _frame_rows(take, hands),
-        _joint_rows(hands),
-        _marker_rows(take, hands),
-        _span_rows(take, spans),
+    hands, spans, paths = hand_figures(take), find_suspect_spans(take, most=None), table_paths(out)
+    sections = [
+        _summary_section(take),
+        _calibration_section(take),
+        *(section for hand in hands for section in _hand_sections(take, hand)),
+        _spans_section(take, spans, source),
     ]
-    paths = table_paths(out)
+    tables = _frame_rows(take, hands), _joint_rows(hands), _marker_rows(take, hands), _span_rows(take, spans)
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, rows in zip(paths, tables, strict=True):
@@ -110,8 +101,7 @@ class HandFigures:
     @property
     def seen(self) -> Bool[np.ndarray, "T M"]:
         """Which markers have a point."""
-        seen: NDArray[np.bool_] = np.isfinite(self.confidence)
-        return seen
+        return np.asarray(np.isfinite(self.confidence))
 
     @property
     def fitted(self) -> Bool[np.ndarray, "T"]:
@@ -123,9 +113,8 @@ class HandFigures:
         """3D RMS of the residuals of each frame [m], of a truth too; NaN where there is none."""
         known = np.isfinite(self.residuals)
         total = np.sum(np.square(self.residuals), axis=1, where=known)
-        square: NDArray[np.float64] = np.full(len(total), np.nan)
-        np.divide(total, known.sum(axis=1), out=square, where=known.any(axis=1))
-        return np.sqrt(square)
+        count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+        return np.asarray(np.sqrt(total / count))
 
     def joints(self) -> Float[np.ndarray, "20 6"]:
         """`_RANGE` of each angle over the fitted frames, and its median spread [deg]; NaN if unknown."""
@@ -144,17 +133,11 @@ class HandFigures:
             gaps = np.diff(frames) - 1  # frames between one in which it is seen and the next
             residuals = self.residuals[:, marker]
             known = residuals[np.isfinite(residuals)]
-            median, high = np.percentile(known, (50.0, 95.0)) if len(known) else (np.nan, np.nan)
+            median, high = np.percentile(known, (50.0, 95.0)).tolist() if len(known) else (np.nan, np.nan)
+            confidence = float(np.median(self.confidence[frames, marker])) if len(frames) else np.nan
+            num_gaps, longest = int((gaps > 0).sum()), int(gaps.max(initial=0))
             yield MarkerFigures(
-                name,
-                seen=float(seen[:, marker].mean()),
-                num_gaps=int((gaps > 0).sum()),
-                longest_gap=int(gaps.max(initial=0)),
-                median_residual=float(median),
-                high_residual=float(high),
-                median_confidence=float(np.median(self.confidence[frames, marker]))
-                if len(frames)
-                else np.nan,
+                name, float(seen[:, marker].mean()), num_gaps, longest, median, high, confidence
             )
 
 
@@ -201,21 +184,17 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
 def _lead(take: Take) -> str:
     """What the take is, and how long."""
     settings = take.settings
-    glove = settings.get("glove", take.hands[0].layout.name)
-    parts = [f"capture {settings['capture']}"] if "capture" in settings else []
-    parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", _user(take)]
-    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
-    first = ", ".join(part for part in parts if part)
-    return f"{first[0].upper()}{first[1:]}; {end}"
-
-
-def _user(take: Take) -> str:
-    """Whose hands they are, in words."""
-    notes = str(take.settings.get("user", ""))
-    _, is_measured, size = notes.partition(MEASURED)
+    glove, user = settings.get("glove", take.hands[0].layout.name), str(settings.get("user", ""))
+    _, is_measured, size = user.partition(MEASURED)
     if is_measured:
-        return f"size measured in the capture, {size}"
-    return f"size {notes}" if notes in get_args(Size) else notes
+        user = f"size measured in the capture, {size}"
+    elif user in get_args(Size):
+        user = f"size {user}"
+    parts = [f"capture {settings['capture']}"] if "capture" in settings else []
+    parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
+    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
+    first = ", ".join(parts)
+    return f"{first[0].upper()}{first[1:]}; {end}"
 
 
 def _summary_section(take: Take) -> Section:
@@ -239,9 +218,8 @@ def _calibration_section(take: Take) -> Section:
         text = "The hands are not calibrated: their size and proportions were measured in the capture. "
         text += _UNCALIBRATED + _CALIBRATE
     elif notes in get_args(Size):
-        text = (
-            f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
-        )
+        text = "The hands are not calibrated: "
+        text += f"they are the mean hands of size {notes}, in a glove as designed. "
         text += _UNCALIBRATED + _CALIBRATE
     elif notes:
         text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
@@ -255,22 +233,27 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
     side = hand.side.capitalize()
     if not hand.fitted.any():
         return [Section(f"{side} hand", "It has no pose in any frame.")]
-    return [
-        _angles_section(f"{side} hand: joint angles", take, hand),
-        _range_section(f"{side} hand: range of motion", hand),
-        _markers_section(f"{side} hand: markers", take, hand),
-        _residuals_section(f"{side} hand: residuals", take, hand),
-    ]
-
-
-def _angles_section(title: str, take: Take, hand: HandFigures) -> Section:
-    text = (
+    angles = (
         "Zero is the flat hand. Flexion counts positive towards the palm, extension negative. Abduction "
         "counts positive towards the thumb; for the thumb itself away from the palm."
     )
     if hand.angle_spread is not None:
-        text += " The band is one standard deviation to either side."
-    return Section(title, text, pictures=[(picture((9.6, 9.6), _draw_angles, take.times, hand), _SHADES)])
+        angles += " The band is one standard deviation to either side."
+    curves = picture((9.6, 9.6), _draw_angles, take.times, hand)
+    rms = hand.rms[np.isfinite(hand.rms)]
+    residuals, drawn = "None of its markers has a point.", []
+    if len(rms):
+        residuals = (
+            "RMS distance of the labeled points of each frame from the pose's markers: median "
+            f"{1e3 * np.median(rms):.2f} mm, 95th percentile {1e3 * np.percentile(rms, 95.0):.2f} mm."
+        )
+        drawn = [(picture((9.6, 2.2), _draw_residuals, take.times, hand), _SHADES)]
+    return [
+        Section(f"{side} hand: joint angles", angles, pictures=[(curves, _SHADES)]),
+        _range_section(f"{side} hand: range of motion", hand),
+        _markers_section(f"{side} hand: markers", take, hand),
+        Section(f"{side} hand: residuals", residuals, pictures=drawn),
+    ]
 
 
 def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
@@ -299,10 +282,9 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
 
 def _range_section(title: str, hand: HandFigures) -> Section:
     table = [["joint [deg]", *_RANGE, "range of the model", "usual spread"]]
-    for joint, (*row, spread) in zip(JOINTS, hand.joints(), strict=True):
-        cells = [f"{value:.1f}" for value in row]
-        usual = NOTHING if np.isnan(spread) else f"{spread:.1f}"
-        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}", usual])
+    for joint, row in zip(JOINTS, hand.joints(), strict=True):
+        *cells, spread = (NOTHING if np.isnan(value) else f"{value:.1f}" for value in row)
+        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}", spread])
     text = (
         f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points; 5th and 95th are "
         "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
@@ -315,17 +297,13 @@ def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
     header = ["marker", "seen [%]", "gaps", "longest [s]", "residual: median [mm]", "95th [mm]"]
     table = [[*header, "confidence: median [%]"]]
     for marker in hand.markers():
-        table.append(
-            [
-                marker.name,
-                percent(marker.seen),
-                f"{marker.num_gaps:,}",
-                f"{marker.longest_gap / take.rate:.3f}" if marker.num_gaps else NOTHING,
-                _millimeters(marker.median_residual),
-                _millimeters(marker.high_residual),
-                percent(marker.median_confidence),
-            ]
-        )
+        longest = f"{marker.longest_gap / take.rate:.3f}" if marker.num_gaps else NOTHING
+        residuals = [
+            NOTHING if np.isnan(one) else f"{1e3 * one:.2f}"
+            for one in (marker.median_residual, marker.high_residual)
+        ]
+        first = [marker.name, percent(marker.seen), f"{marker.num_gaps:,}", longest]
+        table.append([*first, *residuals, percent(marker.median_confidence)])
     drawn = picture((9.6, 1.0 + 0.17 * len(hand.marker_names)), _draw_presence, take.times, hand)
     text = (
         "Seen: the share of all frames in which a point has the marker's label. A gap is between two frames "
@@ -333,10 +311,6 @@ def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
     )
     caption = "Blue where the marker was seen; pale where it was seen in some of the frames of a column."
     return Section(title, text, pictures=[(drawn, caption)], table=table)
-
-
-def _millimeters(meters: float) -> str:
-    return NOTHING if np.isnan(meters) else f"{1e3 * meters:.2f}"
 
 
 def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
@@ -358,17 +332,6 @@ def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigu
     panel.set_xlabel("time [s]")
 
 
-def _residuals_section(title: str, take: Take, hand: HandFigures) -> Section:
-    rms = hand.rms[np.isfinite(hand.rms)]
-    if not len(rms):
-        return Section(title, "None of its markers has a point.")
-    text = (
-        "RMS distance of the labeled points of each frame from the pose's markers: median "
-        f"{1e3 * np.median(rms):.2f} mm, 95th percentile {1e3 * np.percentile(rms, 95.0):.2f} mm."
-    )
-    return Section(title, text, pictures=[(picture((9.6, 2.2), _draw_residuals, take.times, hand), _SHADES)])
-
-
 def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
     panel = figure.subplots()
     _prepare(panel, times, hand.status)
@@ -383,8 +346,7 @@ def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray,
     panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
     panel.set_xlim(times[0], _end(times))
     for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
-        spans: Sequence[tuple[float, float]] = shaded(times, status == state)
-        across = panel.get_xaxis_transform()
+        spans, across = shaded(times, status == state), panel.get_xaxis_transform()
         panel.broken_barh(spans, (0.0, 1.0), transform=across, facecolors=color, linewidth=0.0)
     panel.tick_params(labelcolor=Paint.SOFT)
 

@@ -52,14 +52,9 @@ class LabelCounts:
     frames_right: int = 0
     slots: int = 0
     slots_right: int = 0
-    points: int = 0
-    points_right: int = 0
     occluded: int = 0
     occluded_given: int = 0
     occluded_right: int = 0
-    ghosts: int = 0
-    ghosts_given: int = 0
-    ghosts_right: int = 0
     confusion: Int[np.ndarray, "M+1 M+1"] = field(
         default_factory=lambda: np.zeros((0, 0), dtype=np.int64), compare=False
     )
@@ -72,19 +67,13 @@ class LabelCounts:
         """Count one frame, given its labels and the true ones, -1 for a ghost. Returns the right slots."""
         given, true = _slots(labels, num_labels), _slots(truth, num_labels)
         right: np.ndarray = given == true
-        slots_right, points_right = int(right.sum()), int((labels == truth).sum())
         self.frames += 1
-        self.frames_right += slots_right == num_labels and points_right == len(truth)
+        self.frames_right += bool(right.all() and (labels == truth).all())
         self.slots += num_labels
-        self.slots_right += slots_right
-        self.points += len(truth)
-        self.points_right += points_right
+        self.slots_right += int(right.sum())
         self.occluded += int((true < 0).sum())
         self.occluded_given += int((given < 0).sum())
         self.occluded_right += int(((given < 0) & (true < 0)).sum())
-        self.ghosts += int((truth < 0).sum())
-        self.ghosts_given += int((labels < 0).sum())
-        self.ghosts_right += int(((labels < 0) & (truth < 0)).sum())
         if not self.confusion.size:
             self.confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
         np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
@@ -92,23 +81,35 @@ class LabelCounts:
 
     def figures(self) -> dict[str, float]:
         """All figures by name: shares in [0, 1], NaN where there was nothing to count."""
+        counts = self.numbers()
+        occluded, occluded_right = counts["occluded"], counts["occluded_right"]
+        ghosts, ghosts_right, nan = counts["ghosts"], counts["ghosts_right"], float("nan")
         return {
             "slot_accuracy": _share(self.slots_right, self.slots),
-            "point_accuracy": _share(self.points_right, self.points),
+            "point_accuracy": _share(int(np.trace(self.confusion)), counts["points"]),
             "frame_accuracy": _share(self.frames_right, self.frames),
-            "occlusion_ratio": _share(self.occluded, self.slots),
-            "occlusion_precision": _precision(self.occluded_right, self.occluded_given, self.occluded),
-            "occlusion_recall": _share(self.occluded_right, self.occluded),
-            "ghost_ratio": _share(self.ghosts, self.slots),
-            "ghost_precision": _precision(self.ghosts_right, self.ghosts_given, self.ghosts),
-            "ghost_recall": _share(self.ghosts_right, self.ghosts),
+            "occlusion_ratio": _share(occluded, self.slots),
+            "occlusion_precision": _share(occluded_right, counts["occluded_given"]) if occluded else nan,
+            "occlusion_recall": _share(occluded_right, occluded),
+            "ghost_ratio": _share(ghosts, self.slots),
+            "ghost_precision": _share(ghosts_right, counts["ghosts_given"]) if ghosts else nan,
+            "ghost_recall": _share(ghosts_right, ghosts),
             "macro_f1": macro_f1(self.confusion),
         }
 
     def numbers(self) -> dict[str, int]:
         """The counts behind the shares of occlusions and ghosts."""
-        names = ("occluded", "occluded_given", "occluded_right", "ghosts", "ghosts_given", "ghosts_right")
-        return {name: getattr(self, name) for name in ("slots", "points", *names)}
+        confusion = self.confusion if self.confusion.size else np.zeros((1, 1), dtype=np.int64)
+        return {
+            "slots": self.slots,
+            "points": int(confusion.sum()),
+            "occluded": self.occluded,
+            "occluded_given": self.occluded_given,
+            "occluded_right": self.occluded_right,
+            "ghosts": int(confusion[-1].sum()),
+            "ghosts_given": int(confusion[:, -1].sum()),
+            "ghosts_right": int(confusion[-1, -1]),
+        }
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
@@ -202,10 +203,6 @@ def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"
     labeled = np.flatnonzero(labels >= 0)
     slots[labels[labeled]] = labeled
     return slots
-
-
-def _precision(right: int, given: int, there: int) -> float:
-    return _share(right, given) if there else float("nan")
 
 
 def _share(part: int, whole: int) -> float:

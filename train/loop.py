@@ -19,6 +19,7 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
+from gloves.layout import stored_layout
 from handsim import __version__
 from handsim._checks import check_count, check_type
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
@@ -50,20 +51,17 @@ from train.labelers.networks import (
 )
 from train.labelers.pose_prior import learn_pose_prior
 from train.labelers.protocol import MOST_THREADS, Labeling, torch_threads
-from train.labelers.storage import save_network
+from train.labelers.storage import GLOVE, RUN_SETTINGS, save_network
 from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_page
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_SETTINGS: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
 _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
-_CARD_FRAMES: Final[dict[Kind, int]] = {
-    "set": _MAX_HELD_OUT,
-    "cnn": 1024,
-}  # held-out frames of the model card
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # those of the model card
+_FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # held-out frames at least; samples of a run for each of them
 _CURVE_POINTS: Final = 200  # entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
 _COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
@@ -160,7 +158,7 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
             check_corruption(settings.corruption, len(dataset.marker_names))
         # Older runs name their devices.
         claim(
-            out / _SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
+            out / RUN_SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
             error=WeightsError, grows="train.samples", free=("train.devices",),
         )  # fmt: skip
     seen = rows.span(0, len(rows) - held_out)
@@ -186,9 +184,20 @@ class _Run:
         A signal ends the run between two steps; several processes all end after the same step.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
-        recipe = batch_recipe(settings, len(self.manifest.marker_names))
-        saved = time.monotonic()
-        while self._is_unfinished(on_step):
+        recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
+        shown, saved = (
+            self._shown(_CURVE_FRAMES[settings.labeler]),
+            time.monotonic(),
+        )
+        evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
+        while True:
+            if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):
+                evaluated = state.done
+                if state.fabric.is_global_zero:
+                    on_step("held-out frames")
+                    state.evaluate(shown, names)
+            if state.done >= settings.samples:
+                break
             with interrupt_flag(flag, again=alone):
                 # One generator per step, so that a resumed run makes the same draws; the same one on
                 # each device.
@@ -205,16 +214,6 @@ class _Run:
                 saved = time.monotonic()
         on_step("checkpoint")
         state.save(self.out / CHECKPOINT)
-
-    def _is_unfinished(self, on_step: OnStep) -> bool:
-        """Evaluate the network if that is due, and return whether steps remain."""
-        state, settings = self.state, self.state.settings
-        evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
-        due = state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS)
-        if due and state.fabric.is_global_zero:
-            on_step("held-out frames")
-            state.evaluate(_few(self.held_out, _CURVE_FRAMES[settings.labeler]), self.manifest.marker_names)
-        return state.done < settings.samples
 
     @contextmanager
     def kept(self) -> Iterator[None]:
@@ -238,46 +237,46 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, _few(self.held_out, _COST_FRAMES))
+            choose_costs(network, names, self._shown(_COST_FRAMES))
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
             rng = np.random.default_rng(settings.seed)
             network.prior = learn_pose_prior(right_hands(self.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
         on_step("held-out frames")
-        card, report = self._card(network, _few(self.held_out, _CARD_FRAMES[settings.labeler]))
+        card, report = self._card(network, self._shown(_CARD_FRAMES[settings.labeler]))
         on_step("weights and report")
         with written_together():
             save_network(self.out, network, card)
             write_run_page(self.out, card, self.state.history, report)
             write_model_card(self.out, card)
+            stored_layout(card["dataset"]["layout"]).save(self.out / GLOVE)
         return card
+
+    def _shown(self, count: int) -> NDArray[np.void]:
+        """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
+        count = min(count, max(_FEWEST_SHOWN, self.state.settings.samples // _SAMPLES_A_FRAME))
+        return self.held_out[np.arange(0, len(self.held_out), -(-len(self.held_out) // count))]
 
     def _card(self, network: nn.Module, rows: NDArray[np.void]) -> tuple[dict[str, Any], LabelingReport]:
         """The model card, and the evaluation on held-out frames with the paper's corruption."""
-        labeler = labeler_of(network, self.manifest.marker_names)
+        settings, names = self.state.settings, self.manifest.marker_names
+        labeler, paper = labeler_of(network, names), paper_corruption(len(names))
         markers = rows["markers"].astype(np.float64)
         clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
-        paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
+        report = paper_report(labeler, rows)
+        recipe = f"occlude {paper.occlude}, ghosts {paper.ghosts}"
         card = {
-            "marker_names": list(self.manifest.marker_names),
+            "marker_names": list(names),
             "trained_on": "simulated frames only",
             "handsim": __version__,
             "license": UNKNOWN_LICENSE,
             "dataset": self.manifest.config,
-            "train": self.state.settings.record() | {"devices": self.state.fabric.world_size},
-            "held_out_simulated": {
-                "clean": clean.figures,
-                f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,
-            },
+            "train": settings.record() | {"devices": self.state.fabric.world_size},
+            "held_out_simulated": {"clean": clean.figures, recipe: report.figures},
             "curve": self.state.history.accuracies,
         }
         return card, report
-
-
-def _few(rows: MappedRows, count: int) -> NDArray[np.void]:
-    """Every nth of these rows, at most `count`."""
-    return rows[np.arange(0, len(rows), -(-len(rows) // count))]
 
 
 class TrainingState:
@@ -289,7 +288,13 @@ class TrainingState:
         self.part = Part(fabric.global_rank, fabric.world_size)
         network = new_network(settings.chosen)
         prepare_network(network, rows)
-        self.network, self.optimizer = fabric.setup(network, _optimizer(settings, network))
+        optimizer: torch.optim.Optimizer
+        weights, rate, decay = network.parameters(), settings.learning_rate, settings.weight_decay
+        if settings.optimizer == "sgd":
+            optimizer = torch.optim.SGD(weights, lr=rate, weight_decay=decay)
+        else:
+            optimizer = torch.optim.AdamW(weights, lr=rate, weight_decay=decay, fused=True)
+        self.network, self.optimizer = fabric.setup(network, optimizer)
         self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
         self.done = 0
         self.history = History()
@@ -321,7 +326,11 @@ class TrainingState:
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
         if _passed(self.done, self.settings, _CURVE_POINTS) or self.done >= self.settings.samples:
-            self._log(rate)
+            (since, done), self.began = self.began, (time.monotonic(), self.done)
+            speed = (self.done - done) / (self.began[0] - since)
+            mean = self.history.close(self.done, rate)
+            figures = {"loss": mean, "learning_rate": rate, "samples_per_second": speed}
+            self.fabric.log_dict(figures, step=self.done)
         return value
 
     def _average(self) -> None:
@@ -336,17 +345,6 @@ class TrainingState:
                     self.mean[name].lerp_(tensor, 1.0 - decay)
                 else:
                     self.mean[name].copy_(tensor)
-
-    def _log(self, rate: float) -> None:
-        """Add the last steps to the curves."""
-        loss = self.history.close(self.done, rate)
-        since, done = self.began
-        now = time.monotonic()
-        speed = (self.done - done) / (now - since)
-        self.began = now, self.done
-        self.fabric.log_dict(
-            {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
-        )
 
     def evaluate(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
         """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
@@ -417,14 +415,6 @@ class TrainingState:
                     raise ValueError(f"{name} is not finite")
 
 
-def _optimizer(settings: TrainSettings, network: nn.Module) -> torch.optim.Optimizer:
-    """The optimizer of the settings."""
-    weights, rate, decay = network.parameters(), settings.learning_rate, settings.weight_decay
-    if settings.optimizer == "sgd":
-        return torch.optim.SGD(weights, lr=rate, weight_decay=decay)
-    return torch.optim.AdamW(weights, lr=rate, weight_decay=decay, fused=True)
-
-
 def _rate(settings: TrainSettings, progress: float) -> float:
     """Learning rate at a share of the run, as a share of the peak rate."""
     if settings.schedule == "steps":
@@ -463,10 +453,11 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
         labeler.reject, labeler.spread = reject, spread
         return paper_report(labeler, rows)
 
+    def accuracy(reject: float) -> float:
+        return report(reject, _SPREADS[0]).figures["slot_accuracy"]
+
     config = network.config
-    reject = config.reject or max(
-        _REJECTS, key=lambda tried: report(tried, _SPREADS[0]).figures["slot_accuracy"]
-    )
+    reject = config.reject or max(_REJECTS, key=accuracy)
     spread = config.spread or min(
         _SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
     )

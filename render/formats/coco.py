@@ -54,7 +54,7 @@ from render.formats.shards import (
     save_text,
 )
 from render.frames import HandTruth, RenderedFrame
-from render.skin.look import SkinLook, tone_name
+from render.skin.look import tone_name, typology_angle
 
 INFO: Final[dict[str, Any]] = {  # without a date, so that the same frames give the same bytes
     "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
@@ -119,7 +119,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
     }
     looks = frame.choices.get("people", ())
     if number < len(looks):
-        angle = SkinLook(**looks[number]["skin"]).typology_angle
+        angle = typology_angle(looks[number]["skin"]["lightness"], looks[number]["skin"]["yellowness"])
         record["look"] = looks[number]
         record["skin_tone"] = {"class": tone_name(angle), "typology_angle": round(angle, 3)}
     if mask is not None:

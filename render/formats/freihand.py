@@ -41,16 +41,13 @@ from render.frames import RenderedFrame
 
 SET: Final = "training"
 LISTS: Final = ("K", "xyz", "scale", "mano", "info")
-"""The JSON files that every set has; `verts` is written on demand."""
+"""The JSON files of a set."""
 _NUMBERS: Final = "numbers.json"
 _KINDS: Final = {"rgb": ".jpg", "mask": ".jpg", "depth": ".png"}
 
 
-def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dict[str, Any]]]:
-    """The visible hands: their indices in the frame, and their entries in each of the lists.
-
-    The skin is added where `vertices`, some 150 kB a hand.
-    """
+def hand_entries(frame: RenderedFrame) -> list[tuple[int, dict[str, Any]]]:
+    """The visible hands: their indices in the frame, and their entries in each of the lists."""
     K = centered_K(frame.camera).tolist()
     entries = []
     for number, hand in enumerate(frame.hands):
@@ -65,8 +62,6 @@ def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dic
             "mano": None,
             "info": {"side": hand.shape.side, "frame": frame.number, "camera": frame.camera.name},
         }
-        if vertices:
-            entry["verts"] = rounded(frame.camera.local(hand.vertices), 6)
         entries.append((number, entry))
     return entries
 
@@ -79,10 +74,8 @@ class FreihandWriter:
     stay in `parts`.
     """
 
-    def __init__(self, folder: Path, *, vertices: bool = False) -> None:
-        self.folder = folder
-        self.parts = folder / "parts"
-        self.vertices = vertices
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.parts = folder, folder / "parts"
 
     def done(self) -> frozenset[int]:
         """Shards that are complete."""
@@ -98,7 +91,7 @@ class FreihandWriter:
             for kind in _KINDS:
                 (temporary / kind).mkdir()
             for frame in frames:
-                for hand, entry in hand_entries(frame, vertices=self.vertices):
+                for hand, entry in hand_entries(frame):
                     for kind, content in _pictures(frame, hand).items():
                         (temporary / kind / f"{len(entries):08d}{_KINDS[kind]}").write_bytes(content)
                     entries.append(entry)
@@ -111,8 +104,7 @@ class FreihandWriter:
             for shard, (first, count) in numbers.items():
                 self._move(int(shard), first, count)
             shards = sorted(numbers, key=lambda shard: numbers[shard])
-            names = (*LISTS, "verts") if self.vertices else LISTS
-            for name in names:
+            for name in LISTS:
                 folders = (self.parts / shard_name(int(shard)) for shard in shards)
                 entries = (entry[name] for folder in folders for entry in load_index(folder))
                 save_text(self.folder / f"{SET}_{name}.json", json_list(entries))

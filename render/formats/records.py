@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +25,7 @@ from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.color_sensor import linear_of
+from render.formats.png import encode_png
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
@@ -91,7 +90,7 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
 
 def run_lengths(mask: Flags) -> list[int]:
     """COCO's uncompressed run lengths of a mask (H, W): zeros and ones in turn, column by column."""
-    flat = mask.ravel(order="F")
+    flat = cv2.transpose(mask.view(np.uint8)).ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     ends = np.concatenate([[0], changes, [flat.size]])
     counts: list[int] = np.diff(ends).tolist()
@@ -159,78 +158,40 @@ def _plain(content: Any) -> Any:
     return content
 
 
-# Joint orders, in one table because a wrong permutation looks almost right:
-# - FreiHAND, MediaPipe and COCO-WholeBody: wrist, then thumb to little, base to tip. This is ours.
-# - MANO with its tips appended, as in HO-3D and H2O-3D: wrist, three joints each of index, middle, little,
-#   ring and thumb, then the tips from thumb to little.
-# - InterHand2.6M: thumb to little, tip to base, then the wrist; its files have a right hand and a left one.
-# - HANDS17 and BigHand2.2M: wrist, five first joints, then the other three per digit.
-# - OpenXR: palm, wrist, four of the thumb, five per finger from its metacarpal on; WebXR has no palm.
-# - UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger; with 21 landmarks
-#   the palm's center comes last.
-ABSENT: Final = -1
-"""Index of a joint that we lack."""
-_WRIST: Final = 0
-_OURS: Final = tuple(range(NUM_KEYPOINTS))
-_DIGITS: Final = tuple(_OURS[first : first + 4] for first in range(1, NUM_KEYPOINTS, 4))
-_TIPS: Final = _OURS[4::4]
-_MANO: Final = (_WRIST, *(joint for digit in (1, 2, 4, 3, 0) for joint in _DIGITS[digit][:3]), *_TIPS)
-_INTERHAND: Final = (*(joint for digit in _DIGITS for joint in digit[::-1]), _WRIST)
-_HANDS17: Final = (_WRIST, *_OURS[1::4], *(joint for digit in _DIGITS for joint in digit[1:]))
-_WEBXR: Final = (_WRIST, *_DIGITS[0], *(joint for digit in _DIGITS[1:] for joint in (ABSENT, *digit)))
-_UMETRACK: Final = (*_TIPS, _WRIST, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3]))
-
+_DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))
+# InterHand2.6M: thumb to little, tip to base, then the wrist; its files have a right hand and a left one.
+# UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger.
 JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
-    "handsim": _OURS,
-    "freihand": _OURS,
-    "mediapipe": _OURS,
-    "coco_wholebody_hand": _OURS,
-    "mano": _MANO,
-    "ho3d": _MANO,
-    "interhand": _INTERHAND,
-    "hands17": _HANDS17,
-    "bighand": _HANDS17,
-    "openxr": (ABSENT, *_WEBXR),
-    "webxr": _WEBXR,
-    "umetrack": _UMETRACK,
-    "hot3d": _UMETRACK,
-    "umetrack21": (*_UMETRACK, ABSENT),
+    "interhand": (*(joint for digit in _DIGITS for joint in digit[::-1]), 0),
+    "umetrack": (*(digit[3] for digit in _DIGITS), 0, 2, 3, *(j for digit in _DIGITS[1:] for j in digit[:3])),
 }
-"""Index in `KEYPOINT_NAMES` of every joint of an order."""
+"""Index in `KEYPOINT_NAMES` of every joint of another data set's order; ours is that of FreiHAND."""
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Rows of our keypoints in one of `JOINT_ORDERS`; NaN for joints that we lack."""
-    nowhere = np.full_like(points[..., :1, :], np.nan)
-    return np.concatenate([points, nowhere], axis=-2)[..., list(JOINT_ORDERS[name]), :]
+    """Rows of our keypoints in one of `JOINT_ORDERS`."""
+    return points[..., list(JOINT_ORDERS[name]), :]
 
 
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m]."""
-_KEYWORD: Final = b"metres_per_unit"
-_FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
+_KEYWORD: Final = "metres_per_unit"
 _LARGEST: Final = 65535  # largest depth in these units
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
 _JPEG_QUALITY: Final = 95
 
 
-def encode_png(picture: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """An sRGB picture as PNG."""
-    return _encode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-
-
 def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QUALITY) -> bytes:
     """An sRGB or gray picture as JPEG."""
     ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
-    return _encode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done, "JPEG holds any picture"
+    return data.tobytes()
 
 
 def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
     """Depth [m] as 16-bit gray PNG, whose text chunk `metres_per_unit` has the unit; 0 if it does not fit."""
-    data = _encode(".png", _depth_steps(np.ascontiguousarray(depth)))
-    text = _KEYWORD + b"\0" + repr(METERS_PER_UNIT).encode("ascii")
-    end = _FIRST_CHUNK.stop
-    return data[:end] + _chunk(b"tEXt", text) + data[end:]
+    return encode_png(_depth_steps(np.ascontiguousarray(depth)), text={_KEYWORD: repr(METERS_PER_UNIT)})
 
 
 @kernel
@@ -251,25 +212,25 @@ def encode_ids(pictures: Pictures) -> bytes | None:
     known = [layer for layer in layers if layer is not None]
     if not known:
         return None
-    return encode_png(np.stack([np.zeros_like(known[0]) if x is None else x for x in layers], axis=-1))
+    return encode_png(cv2.merge([np.zeros_like(known[0]) if layer is None else layer for layer in layers]))
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
     """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
-    return _encode(".png", _normal_levels(np.ascontiguousarray(normals)))
+    return encode_png(_normal_levels(np.ascontiguousarray(normals)))
 
 
 @kernel
 def _normal_levels(normals: Floats) -> Any:
-    """Normals (H, W, 3) as bytes, z first, because OpenCV has blue first."""
+    """Normals (H, W, 3) as bytes."""
     levels = np.zeros(normals.shape, np.uint8)
     for row in range(normals.shape[0]):
         for column in range(normals.shape[1]):
             x, y, z = normals[row, column]
             if x != 0.0 or y != 0.0 or z != 0.0:
-                levels[row, column, 2] = int(np.rint(x * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 0] = int(np.rint(x * _NORMAL_SCALE)) + _NORMAL_ZERO
                 levels[row, column, 1] = int(np.rint(y * _NORMAL_SCALE)) + _NORMAL_ZERO
-                levels[row, column, 0] = int(np.rint(z * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 2] = int(np.rint(z * _NORMAL_SCALE)) + _NORMAL_ZERO
     return levels
 
 
@@ -288,17 +249,6 @@ def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]
     if ids is not None:
         files[".ids.png"] = ids
     return files
-
-
-def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None) -> bytes:
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(picture), options or [])
-    assert done, "PNG and JPEG hold any picture"
-    return data.tobytes()
-
-
-def _chunk(name: bytes, content: bytes) -> bytes:
-    checksum = zlib.crc32(name + content)
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
 
 
 _RGB: Final = ("R", "G", "B")

@@ -75,8 +75,16 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     for mesh in meshes:
         _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
     painted = np.zeros((height, width, 4), dtype=np.uint8)
-    painted.reshape(-1, 4)[covered] = np.rint(np.float32(63.75) * sums)
+    _write_means(sums, covered, painted.reshape(-1, 4))
     return painted
+
+
+@kernel
+def _write_means(sums: Floats, covered: NDArray[np.int32], painted: Bytes) -> None:
+    """Write sums of colors in [0, 1] over four samples (N, 4) as bytes of the covered pixels."""
+    for n in range(len(covered)):
+        for channel in range(4):
+            painted[covered[n], channel] = np.int32(np.rint(np.float32(63.75) * sums[n, channel]))
 
 
 def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
@@ -306,20 +314,24 @@ def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
 
 
 def put_before(
-    painted: UInt8[np.ndarray, "H W 4"], background: Float32[np.ndarray, "H W 3"]
+    painted: UInt8[np.ndarray, "H W 4"],
+    background: Float32[np.ndarray, "H W 3"],
+    bare: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture of `paint` over a background."""
-    mixed = np.empty_like(background, dtype=np.uint8)
+    """A picture of `paint` over a background, whose `whole_levels` may be given."""
+    mixed = whole_levels(background) if bare is None else bare.copy()
     _mix(painted.reshape(-1, 4), background.reshape(-1, 3), mixed.reshape(-1, 3))
     return mixed
 
 
+def whole_levels(background: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A background as bytes."""
+    return np.asarray(np.minimum(background, _WHITE).astype(np.uint8))
+
+
 @kernel
 def _mix(painted: Bytes, background: Floats, mixed: Bytes) -> None:
-    """Write painted colors with coverage (P, 4) over a background; see `put_before`."""
-    behind, bare = background.reshape(-1), mixed.reshape(-1)
-    for n in range(len(bare)):
-        bare[n] = np.int32(behind[n] if behind[n] < _WHITE else _WHITE)
+    """Write painted colors with coverage (P, 4) over a background (P, 3), whose bytes `mixed` has."""
     for pixel in range(len(mixed)):
         if painted[pixel, 3]:
             clear = 1.0 - painted[pixel, 3] / 255.0

@@ -44,6 +44,11 @@ _YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of 
 _REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
 
 
+def typology_angle(lightness: float, yellowness: float) -> float:
+    """Individual typology angle [deg] of a color's L* and b*."""
+    return float(np.rad2deg(np.arctan2(lightness - 50.0, yellowness)))
+
+
 @dataclass(frozen=True, slots=True)
 class SkinLook(Settings):
     """One person's skin. Colors are CIELAB (D65); strengths are factors, 1 for an average adult.
@@ -84,7 +89,7 @@ class SkinLook(Settings):
     @property
     def typology_angle(self) -> float:
         """Individual typology angle of the back of the hand [deg]."""
-        return float(np.rad2deg(np.arctan2(self.lightness - 50.0, self.yellowness)))
+        return typology_angle(self.lightness, self.yellowness)
 
     @property
     def infrared(self) -> float:

@@ -16,7 +16,7 @@ from handsim.space.camera import pinhole
 from handsim.space.transforms import quaternion_matrix
 from render import ViewConfig
 from render.subject import subject_of_poses
-from render.viewpoints import PLACEMENTS, Framing, Viewpoints, check_hands_in_view
+from render.viewpoints import Framing, Placement, Viewpoints, check_hands_in_view
 from train import simulate_take
 from train.simulation.takes import SimulatedKind
 
@@ -26,7 +26,7 @@ def take() -> Take:
     return simulate_take(kind="hand-controller", num_frames=60)
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("placement", get_args(Placement))
 def test_every_placement_sees_the_hands(take, placement):
     config = ViewConfig(placement, "vga_wide", views=2)
     viewpoints = Viewpoints(config, take, rng=np.random.default_rng(1))
@@ -106,7 +106,7 @@ FRAMES, STEP = 480, 8
 WHOLE, SIDE = 0.95, 0.30  # of pictures with all hands; a hand's longer side, of the height
 APART = ("single-hand", "calibration", "free")  # kinds of takes with hands half a meter from each other
 LEAST = {"rig": 0.2, "orbit": 0.25}  # of those, where cameras cannot stay where both are large
-PLACED = [name for name in PLACEMENTS if name != "head"]
+PLACED = [name for name in get_args(Placement) if name != "head"]
 
 
 @functools.cache

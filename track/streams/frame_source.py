@@ -59,7 +59,7 @@ class ArrivingFrames(ABC):
     def __init__(self) -> None:
         self.lost = 0
         """Number of frames that were left out."""
-        self._arrived: deque[StreamedFrame] = deque()
+        self._arrived: deque[StreamedFrame] = deque(maxlen=_MOST_WAITING)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -84,13 +84,11 @@ class ArrivingFrames(ABC):
         """End the source; no frame is wanted any more."""
 
     def _add(self, frame: StreamedFrame) -> None:
+        self.lost += len(self._arrived) == _MOST_WAITING  # then the oldest one goes
         self._arrived.append(frame)
-        if len(self._arrived) > _MOST_WAITING:
-            self._arrived.popleft()
-            self.lost += 1
 
     def _take_all(self) -> list[StreamedFrame]:
-        arrived, self._arrived = list(self._arrived), deque()
+        arrived, self._arrived = list(self._arrived), deque[StreamedFrame](maxlen=_MOST_WAITING)
         return arrived
 
 

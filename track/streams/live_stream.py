@@ -79,13 +79,14 @@ class StreamSettings(Settings):
     """Time without a frame after which the stream yields a silent frame [s]."""
 
 
-def check_address(address: str) -> None:
-    """Raise an `ArgumentError` unless it is an address of a stream; no server is asked."""
+def check_address(address: str) -> str:
+    """The scheme of an address; an `ArgumentError` unless it is one of a stream. No server is asked."""
     check_type("address", address, str, f"one of {', '.join(VALID)}")
     scheme, _, rest = address.rpartition("://")
     name = rest.partition("?")[0]
     if scheme not in ("natnet", "qtm") and (scheme or not (is_plugin(name) or name in list_plugins(GROUP))):
         raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
+    return scheme
 
 
 def open_source(
@@ -114,28 +115,22 @@ def open_source(
     """
     settings = StreamSettings.of(settings, options)
     frames: ArrivingFrames
-    if isinstance(address, str):
-        check_address(address)
-        frames = _open_frames(address)
-    else:
+    if not isinstance(address, str):
         check_type("address", address, Iterable, f"one of {', '.join(VALID)}, or a frame source")
         frames = SourceStream(address, type(address).__name__)
-    return LiveStream(frames, silence=settings.silence, ended=ended)
-
-
-def _open_frames(address: str) -> ArrivingFrames:
-    """The frames of an address as they arrive."""
-    if address.startswith("natnet://"):
+    elif check_address(address) == "natnet":
         from track.streams.natnet import open_stream
 
-        return open_stream(address)
-    if address.startswith("qtm://"):
+        frames = open_stream(address)
+    elif address.startswith("qtm://"):
         from track.streams.qualisys import PORT, QualisysSource
 
         host, port, _ = split_address(address, options={}, port=PORT)
-        return SourceStream(QualisysSource(host, port), address, waits=False)
-    source = make_plugin(address, group=GROUP, noun="frame source")
-    return SourceStream(source, address.partition("?")[0])
+        frames = SourceStream(QualisysSource(host, port), address, waits=False)
+    else:
+        source = make_plugin(address, group=GROUP, noun="frame source")
+        frames = SourceStream(source, address.partition("?")[0])
+    return LiveStream(frames, silence=settings.silence, ended=ended)
 
 
 class LiveStream(Closing, Iterator[StreamedFrame]):
@@ -370,7 +365,7 @@ class FrameOrder:
         if not self.deadline <= now:
             return
         if self._last is None:
-            yield from self._begin(self._largest_group())
+            yield from self._begin(max(map(self._group_of, self._jumping), key=len))
             return
         while self._held and self.deadline <= now:
             yield self._pass(self._held.pop(0))
@@ -379,8 +374,8 @@ class FrameOrder:
     def end(self) -> Iterator[StreamedFrame]:
         """All frames that are held, without those of a short jump."""
         if self._last is None and self._jumping:
-            yield from self._begin(self._largest_group())
-        yield from self._flush()
+            yield from self._begin(max(map(self._group_of, self._jumping), key=len))
+        yield from self._release(every=True)
         self._leave_out_jumping(len(self._jumping))
 
     @property
@@ -403,14 +398,9 @@ class FrameOrder:
             self._disordered = frame.arrived
         bisect.insort(self._held, frame, key=lambda one: one.time)
 
-    def _release(self) -> Iterator[StreamedFrame]:
-        """Pass on held frames until one is behind a gap and no more than the window are held."""
-        while self._held and (len(self._held) > _WINDOW or not self._is_behind_gap()):
-            yield self._pass(self._held.pop(0))
-
-    def _flush(self) -> Iterator[StreamedFrame]:
-        """Pass on all held frames."""
-        while self._held:
+    def _release(self, *, every: bool = False) -> Iterator[StreamedFrame]:
+        """Pass on held frames while none is missing before them or too many are held, or `every` one."""
+        while self._held and (every or len(self._held) > _WINDOW or not self._is_behind_gap()):
             yield self._pass(self._held.pop(0))
 
     def _is_behind_gap(self) -> bool:
@@ -471,16 +461,13 @@ class FrameOrder:
         ordered = _increasing(sorted(group, key=lambda one: one.time))
         return [one for one in group if one in ordered]
 
-    def _largest_group(self) -> list[StreamedFrame]:
-        return max((self._group_of(one) for one in self._jumping), key=len)
-
     def _begin(self, group: list[StreamedFrame], *, restarted: bool | None = None) -> Iterator[StreamedFrame]:
         """Continue the stream with frames that jumped, of the same recording or of another one."""
         for one in group:
             self._jumping.pop(one, None)
         self._leave_out_jumping(len(self._jumping))
         self._in_a_row = 0
-        yield from self._flush()
+        yield from self._release(every=True)
         ordered = sorted(group, key=lambda one: one.time)
         last = self._last
         if restarted is None:

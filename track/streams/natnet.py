@@ -533,7 +533,18 @@ class ReplayServer(Closing):
         self.rate = settings.rate or source.rate
         """Frames per second [Hz]."""
         self._ids_of_round = int(ids.max(initial=-1)) + 1
-        self._host, self._socket = settings.host, _listen(settings.host, settings.port)
+        self._host, port = settings.host, settings.port
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((self._host, port))
+        except (OSError, OverflowError) as error:
+            self._socket.close()
+            what = (error.strerror if isinstance(error, OSError) else None) or str(error)
+            raise CaptureError(
+                f"port {port} cannot be listened at on {self._host} ({what}), expected a free port of this "
+                "machine"
+            ) from error
+        self._socket.setblocking(False)
         self._port: int = self._socket.getsockname()[1]
         self._clients: dict[tuple[str, int], float] = {}  # times of their last packets [s]
         self.sent = 0
@@ -612,17 +623,3 @@ class ReplayServer(Closing):
             self._clients[client] = time.monotonic()
         elif kind == Kind.DISCONNECT:
             self._clients.pop(client, None)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        one.bind((host, port))
-    except (OSError, OverflowError) as error:
-        one.close()
-        what = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise CaptureError(
-            f"port {port} cannot be listened at on {host} ({what}), expected a free port of this machine"
-        ) from error
-    one.setblocking(False)
-    return one

@@ -38,7 +38,6 @@ from train.simulation.scenes import (
     Kind,
     MovingObject,
     SceneMotion,
-    SimulatedKind,
     sample_real_like_scene,
 )
 from train.simulation.takes import sample_scene
@@ -241,18 +240,15 @@ def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
     """Cast the lines of sight for scenes by kind of work, each in the default room of its kind."""
-    return {
-        kind: [lit for scene in scenes for lit in light([scene], rig, _room(kind, scene), rng=rng)]
-        for kind, scenes in work.items()
-    }
-
-
-def _room(kind: str, scene: SceneMotion) -> RoomConfig:
-    """The room of simulated takes of this kind of work, or of the most similar kind."""
-    if kind not in SIMULATED_KINDS:
-        free = "hand-hand" if len(scene.hands) > 1 else "single-hand"
-        kind = free if scene.moving_object is None else "hand-pen"
-    return usual_room(cast("SimulatedKind", kind))
+    lit: dict[str, list[LitScene]] = {}
+    for kind, scenes in work.items():
+        lit[kind] = []
+        for scene in scenes:
+            similar = kind if kind in SIMULATED_KINDS else "hand-pen"
+            if similar != kind and scene.moving_object is None:
+                similar = "hand-hand" if len(scene.hands) > 1 else "single-hand"
+            lit[kind] += light([scene], rig, usual_room(similar), rng=rng)
+    return lit
 
 
 class ErrorEllipsoid(NamedTuple):
@@ -297,43 +293,34 @@ class CameraLoss(NamedTuple):
     """The forecast without it; None for a rig of two cameras."""
 
 
-class _Counts(NamedTuple):
-    """Counts that are added up over scenes."""
-
-    marker_frames: int
-    scene_frames: int
-    minutes: float
-    """Duration times number of markers [min]."""
-    seen_by_two: int
-    seen_by_three: int
-    missing: int
-    ghosts: int
-
-
 def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
     """The forecast of scenes before a rig, whose noise and losses come from a seed."""
     rng = np.random.default_rng(seed)
     counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
-    total = _Counts(*(sum(column) for column in zip(*counts, strict=True)))
+    frames, scene_frames, minutes, two, three, missing, ghosts = map(sum, zip(*counts, strict=True))
     lengths = np.concatenate(gaps)
     median, p95 = np.percentile(lengths, [50, 95]) if len(lengths) else (np.nan, np.nan)
     return Forecast(
-        total.marker_frames,
-        total.seen_by_two / total.marker_frames,
-        total.seen_by_three / total.marker_frames,
-        total.missing / total.marker_frames,
-        len(lengths) / total.minutes,
+        frames,
+        two / frames,
+        three / frames,
+        missing / frames,
+        len(lengths) / minutes,
         float(median),
         float(p95),
-        total.ghosts / total.scene_frames,
+        ghosts / scene_frames,
         ellipsoid(np.concatenate(spreads)),
     )
 
 
 def _count(
     one: LitScene, rig: CameraRig, rng: np.random.Generator
-) -> tuple[_Counts, Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
-    """Counts of a scene, the lengths of its gaps [s], and covariances of some points [m^2]."""
+) -> tuple[tuple[int, int, float, int, int, int, int], Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
+    """Counts of a scene, the lengths of its gaps [s], and covariances of some points [m^2].
+
+    The counts are of marker-frames, frames and minutes of markers, marker-frames that two cameras see, that
+    three see and that have no point, and ghosts.
+    """
     sources, optics, markers, rate = one.sources, one.optics, one.num_markers, one.scene.rate
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
@@ -349,7 +336,7 @@ def _count(
     step = max(1, len(rows) // _ERROR_SAMPLES)
     rows, columns = rows[::step], columns[::step]
     noise = optics.noise * np.sqrt(MARKER_RADIUS / sources.radii[columns])
-    counts = _Counts(
+    counts = (
         present.size,
         len(present),
         present.size / rate / 60.0,

@@ -49,7 +49,6 @@ from train.simulation.room import SceneSight, marker_radii
 from train.simulation.scenes import SceneMotion
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 GRID: Final = 5
@@ -244,9 +243,9 @@ def cube_points(
 
 
 def _figures(one: Forecast) -> dict[str, Any]:
+    axes, directions, mean = one.error
     figures = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
-    error = figures.pop("error")
-    figures |= {"error": error.mean, "error_axes": error.axes, "error_directions": error.directions}
+    figures |= {"error": mean, "error_axes": axes, "error_directions": directions}
     return {name: _numbers(value) for name, value in figures.items()}
 
 
@@ -408,14 +407,8 @@ def _place(point: Float[np.ndarray, "3"]) -> str:
 
 
 _COLUMNS: Final = (
-    "by 2 [%]",
-    "by 3 [%]",
-    "missing [%]",
-    "gaps [1/min]",
-    "median [ms]",
-    "p95 [ms]",
-    "ghosts",
-    "error [mm]",
+    *("by 2 [%]", "by 3 [%]", "missing [%]", "gaps [1/min]"),
+    *("median [ms]", "p95 [ms]", "ghosts", "error [mm]"),
 )
 COLUMNS_TOLD: Final = (
     "By 2, by 3: share of the marker-frames (every marker of every hand in every frame) that so many "
@@ -446,12 +439,15 @@ def write_rig_page(path: Path, score: RigScore) -> None:
         "and that it sees and fewer than two others."
     )
     caption = "Marker-frames that are missing without each camera, and with all."
+    volume = "Hands in poses of the work, set at each point of a grid in the volume, each alone."
+    disks = "Disks are cameras, numbered, with their directions. Colors are averages along the view."
+    map_drawn = picture((9.6, 4.6), _draw_map, score.volume, rig)
     losses = picture((8.4, 3.2), _draw_losses, score.losses, score.whole.missing)
     sections = [
         Section("What to do", html_list(score.advice)),
         Section("Hands at work", COLUMNS_TOLD, table=work_table(score), notes=[note]),
         Section("Cameras", without, table=camera_table(score), pictures=[(losses, caption)]),
-        _volume_section(score),
+        Section("The volume", volume, table=volume_table(score.volume), pictures=[(map_drawn, disks)]),
     ]
     write_sections(path, sections, title=f"Rig {rig.name}", lead=lead)
 
@@ -469,6 +465,20 @@ def camera_table(score: RigScore) -> list[list[str]]:
         left = [NOTHING] * len(_COLUMNS) if one.without is None else _cells(one.without)
         rows.append([str(number), f"{100 * one.seen:.1f}", f"{100 * one.needed:.1f}", *left])
     return [["without camera", "sees [%]", "needed [%]", *_COLUMNS], *rows]
+
+
+def volume_table(volume: VolumeMap) -> list[list[str]]:
+    """What is seen in the volume, the header first."""
+    rows = [["a hand's markers", "mean", "worst", "at [m]"]]
+    for title, shares in (("two", volume.seen_by_two), ("three", volume.seen_by_three)):
+        least, place = f"{100 * shares.min():.1f}", coordinates(volume.points[shares.argmin()])
+        rows.append([f"seen by {title} [%]", f"{100 * shares.mean():.1f}", least, place])
+    errors = 1e3 * volume.error
+    if np.isfinite(errors).any():
+        worst = int(np.nanargmax(errors))
+        place = coordinates(volume.points[worst])
+        rows.append(["error [mm]", f"{np.nanmean(errors):.2f}", f"{errors[worst]:.2f}", place])
+    return rows
 
 
 def _cells(one: Forecast) -> list[str]:
@@ -502,23 +512,6 @@ def _draw_losses(figure: Figure, losses: list[CameraLoss], missing: float) -> No
     panel.set_ylabel("marker-frames missing [%]")
 
 
-def _volume_section(score: RigScore) -> Section:
-    volume = score.volume
-    rows = [["a hand's markers", "mean", "worst", "at [m]"]]
-    for title, shares in (("two", volume.seen_by_two), ("three", volume.seen_by_three)):
-        least, place = f"{100 * shares.min():.1f}", coordinates(volume.points[shares.argmin()])
-        rows.append([f"seen by {title} [%]", f"{100 * shares.mean():.1f}", least, place])
-    errors = 1e3 * volume.error
-    if np.isfinite(errors).any():
-        worst = int(np.nanargmax(errors))
-        place = coordinates(volume.points[worst])
-        rows.append(["error [mm]", f"{np.nanmean(errors):.2f}", f"{errors[worst]:.2f}", place])
-    text = "Hands in poses of the work, set at each point of a grid in the volume, each alone."
-    caption = "Disks are cameras, numbered, with their directions. Colors are averages along the view."
-    drawn = picture((9.6, 4.6), _draw_map, volume, score.rig)
-    return Section("The volume", text, table=rows, pictures=[(drawn, caption)])
-
-
 def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
     """Draw the volume colored by the share of markers that two cameras see, averaged along the view."""
     panels = figure.subplots(1, 2)
@@ -531,20 +524,16 @@ def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
             np.unique(points[..., right]), np.unique(points[..., up]), flat.T,
             cmap=colors.cmap, norm=colors.norm, shading="nearest", rasterized=False,
         )  # fmt: skip
-        _draw_cameras(panel, rig, right, up)
+        for number, pose in enumerate(rig.T_world_camera, 1):
+            begin, ahead = pose[[right, up], 3], pose[[right, up], 2]
+            panel.plot(
+                *np.stack([begin, begin + _ARROW * ahead]).T, color=Paint.LINE, linewidth=2.0, zorder=2
+            )
+            panel.plot(*begin, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=11, zorder=3)
+            place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "zorder": 4}
+            panel.annotate(str(number), begin, fontsize=6.5, color=Paint.INK, **place)
         panel.set_title(title, color=Paint.SOFT)
         panel.set_xlabel("x [m]")
         panel.set_ylabel(f"{'xyz'[up]} [m]")
         panel.set_aspect("equal", adjustable="datalim")
     color_bar(figure, colors, "markers seen by two cameras [%]", ax=panels, shrink=0.7)
-
-
-def _draw_cameras(panel: Axes, rig: CameraRig, right: int, up: int) -> None:
-    for number, pose in enumerate(rig.T_world_camera, 1):
-        begin, ahead = pose[[right, up], 3], pose[[right, up], 2]
-        end = begin + _ARROW * ahead
-        panel.plot(*np.stack([begin, end]).T, color=Paint.LINE, linewidth=2.0, zorder=2)
-        panel.plot(*begin, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=11, zorder=3)
-        panel.annotate(
-            str(number), begin, ha="center", va="center_baseline", fontsize=6.5, color=Paint.INK, zorder=4
-        )

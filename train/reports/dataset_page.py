@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
-from handsim.errors import DatasetError
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
 from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
 from handsim.space.rig import load_rig
@@ -35,21 +34,7 @@ _PUBLISHED_P90: Final = (24, 43)  # the same, 90th percentile
 def write_dataset_page(
     path: Path, dataset: Dataset, *, present: Bool[np.ndarray, "T M"] | None = None, rate: float = 120.0
 ) -> Path:
-    """Write the page on a training set: one HTML file with its pictures inside, complete or not at all.
-
-    Args:
-        path: The page; an older one is replaced.
-        dataset: The set.
-        present: Which markers a continuous take of this glove and rig holds, for the lengths of gaps; a
-            training set's frames are independent and have none.
-        rate: Frames per second of that take [Hz].
-
-    Returns:
-        The page's path.
-
-    Raises:
-        DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
-    """
+    """Write the page on a training set, with gaps of markers that are `present` in a take at a rate [Hz]."""
     rows, manifest = sample_rows(dataset), dataset.manifest
     sections = [
         _figures_section(dataset, rows),
@@ -338,12 +323,6 @@ def _mark(panel: Axes, value: float, text: str, color: str) -> None:
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
     """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
-    if present.ndim != 2 or not present.size or present.dtype != np.bool_:
-        raise DatasetError(
-            f"present is {present.dtype} of shape {present.shape}, expected bool (frames, markers)"
-        )
-    if not 0.0 < rate < np.inf:
-        raise DatasetError(f"rate is {rate:g} Hz, expected a positive number")
     lengths = run_lengths(~present, inside=True)
     frames, markers = present.shape
     text = (

@@ -14,6 +14,7 @@ from gloves.layout import MarkerLayout, stored_layout
 from handsim.files.outputs import atomic_write
 from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
 from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
+from train.labelers.storage import GLOVE
 from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
 
 if TYPE_CHECKING:
@@ -37,12 +38,27 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: La
         "paper's recipe and the running mean of the weights; learning rate."
     )
     curves = picture((9.6, 5.6), draw_curves, history)
+    size = confusion_size(layout.num_markers + 1)
+    confusion = picture(size, draw_confusion, layout.names, report.confusion)
+    wrong = int((~report.right).sum())
+    mistaken = f"{wrong:,} of {report.right.size:,} points were called something else than they are."
+    shares = (
+        "A row holds the points of one marker, the last one ghosts; a column, what they were called. A row's "
+        "shares add up to 100 %. The colors' scale is logarithmic; blank cells are mistakes never made."
+    )
+    bins = reliability(report.confidences, report.right)
+    drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
+    sure = "Whether the confidence that comes with every label can be taken at its word."
+    binned = (
+        "Points in fifteen bins of confidence: how many of each bin are right, and how many there are. On "
+        "the gray line they would be right as often as the labeler says; orange is what they miss it by."
+    )
     sections = [
         _figures_section(card, report),
         Section("The run", "The course of training.", pictures=[(curves, caption)]),
-        _confusion_section(layout, report),
+        Section("What is taken for what", mistaken, pictures=[(confusion, shares)]),
         _hand_section(layout, report),
-        _reliability_section(report),
+        Section("How sure to believe it", sure, pictures=[(drawn, binned)]),
     ]
     path = out / PAGE
     write_sections(path, sections, title=f"Labeler {out.resolve().name}", lead=_lead(card, layout))
@@ -121,19 +137,6 @@ def draw_curves(figure: Figure, history: History) -> None:
     figure.align_ylabels()
 
 
-def _confusion_section(layout: MarkerLayout, report: LabelingReport) -> Section:
-    """The confusion matrix."""
-    size = confusion_size(layout.num_markers + 1)
-    drawn = picture(size, draw_confusion, layout.names, report.confusion)
-    caption = (
-        "A row holds the points of one marker, the last one ghosts; a column, what they were called. A row's "
-        "shares add up to 100 %. The colors' scale is logarithmic; blank cells are mistakes never made."
-    )
-    wrong = int((~report.right).sum())
-    text = f"{wrong:,} of {report.right.size:,} points were called something else than they are."
-    return Section("What is taken for what", text, pictures=[(drawn, caption)])
-
-
 def confusion_size(num_classes: int) -> tuple[float, float]:
     """Width and height [inch] of a confusion matrix in which every name can be read."""
     side = 1.6 + num_classes * float(np.clip(8.4 / num_classes, 0.15, 0.36))
@@ -181,21 +184,18 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
 
 def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     """Accuracies and confusions on a drawing of the hand."""
-    arrows = mistakes(report.confusion)
+    arrows, names = mistakes(report.confusion), layout.names
     drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
-    caption = HAND_CAPTION + (
-        f"Arrows lead from what points are to what they were called: the {len(arrows)} most frequent "
-        "pairs, wider the more often."
-        if arrows
-        else "No marker was taken for another."
-    )
-    names = layout.names
-    table = [["marker", "taken for", "points", "of its points [%]"]] if arrows else []
-    table += [
-        [names[arrow.truth], names[arrow.called], f"{arrow.points:,}", percent(arrow.share)]
-        for arrow in arrows
-    ]
-    return Section("On the hand", _hand_text(layout, report), pictures=[(drawn, caption)], table=table)
+    told, table = "No marker was taken for another.", []
+    if arrows:
+        told = f"Arrows lead from what points are to what they were called: the {len(arrows)} most frequent "
+        told += "pairs, wider the more often."
+        table = [["marker", "taken for", "points", "of its points [%]"]]
+    for arrow in arrows:
+        pair = names[arrow.truth], names[arrow.called]
+        table.append([*pair, f"{arrow.points:,}", percent(arrow.share)])
+    text = _hand_text(layout, report)
+    return Section("On the hand", text, pictures=[(drawn, HAND_CAPTION + told)], table=table)
 
 
 def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
@@ -215,18 +215,6 @@ def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
         f"{percent(figures['ghost_ratio'])} ghosts for a hundred slots: {named} % of them were taken for "
         f"markers, and {lost} % of the markers' points for ghosts."
     )
-
-
-def _reliability_section(report: LabelingReport) -> Section:
-    """The calibration of confidences."""
-    bins = reliability(report.confidences, report.right)
-    drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
-    caption = (
-        "Points in fifteen bins of confidence: how many of each bin are right, and how many there are. On "
-        "the gray line they would be right as often as the labeler says; orange is what they miss it by."
-    )
-    text = "Whether the confidence that comes with every label can be taken at its word."
-    return Section("How sure to believe it", text, pictures=[(drawn, caption)])
 
 
 def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
@@ -286,7 +274,7 @@ On held-out simulated frames, in percent:
 ## Use
 
 ```
-handsim label take.c3d --glove {layout} --labeler THIS_FOLDER --out labeled.c3d
+handsim label take.c3d --glove THIS_FOLDER/{glove} --labeler THIS_FOLDER --out labeled.c3d
 handsim export THIS_FOLDER --out labeler.onnx
 ```
 
@@ -328,6 +316,7 @@ def model_card(card: dict[str, Any]) -> str:
     return _CARD.format(
         license=card["license"],
         layout=dataset["layout"]["name"],
+        glove=GLOVE,
         kind=_CARD_KINDS[card["train"]["labeler"]],
         version=card["handsim"],
         count=len(card["marker_names"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -27,13 +28,13 @@ def project(xyz: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 def test_a_freihand_loader_reads_it(make_frame, tmp_path: Path) -> None:
     frames = [make_frame(0, ("right", "left")), make_frame(1, away=True), make_frame(2, noisy=True)]
-    writer = FreihandWriter(tmp_path, vertices=True)
+    writer = FreihandWriter(tmp_path)
     writer.write(1, frames[2:])
     writer.write(0, frames[:2])
     assert writer.done() == {0, 1}
     writer.finish()
     entries = [(frames[0], 0), (frames[0], 1), (frames[2], 0)]
-    lists = {name: load(tmp_path, name) for name in ("K", "xyz", "scale", "mano", "verts", "info")}
+    lists = {name: load(tmp_path, name) for name in ("K", "xyz", "scale", "mano", "info")}
     assert {len(values) for values in lists.values()} == {3}
     for number, (frame, place) in enumerate(entries):
         hand = frame.hands[place]
@@ -42,7 +43,6 @@ def test_a_freihand_loader_reads_it(make_frame, tmp_path: Path) -> None:
         bone = np.linalg.norm(hand.keypoints_world[10] - hand.keypoints_world[9])
         assert lists["scale"][number] == pytest.approx(bone)
         assert lists["info"][number]["side"] == hand.shape.side
-        np.testing.assert_allclose(lists["verts"][number], frame.camera.local(hand.vertices), atol=1e-6)
         picture = cv2.imread(str(tmp_path / "training" / "rgb" / f"{number:08d}.jpg"))
         assert picture.shape[1::-1] == frame.camera.size
         mask = cv2.imread(str(tmp_path / "training" / "mask" / f"{number:08d}.jpg"), cv2.IMREAD_GRAYSCALE)
@@ -85,8 +85,6 @@ def test_an_interrupted_finish_goes_on(make_frame, tmp_path: Path) -> None:
 
 
 def test_a_bent_lens_and_missing_colors_are_told(make_frame, camera, tmp_path: Path) -> None:
-    import dataclasses
-
     writer = FreihandWriter(tmp_path)
     fisheye = dataclasses.replace(camera, lens=Lens("fisheye", (0.1, 0.0, 0.0, 0.0)))
     with pytest.raises(HandSimError, match="'fisheye', which this format cannot hold"):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from handsim.cli.main import main
-from handsim.errors import DatasetError
 from handsim.hand.shape import JOINT_NAMES, JOINTS
 from train import Dataset, GenerateSettings
 from train.data.shards import row_dtype
@@ -89,21 +88,6 @@ def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_pat
     assert report.gap_section(np.ones((9, 2), bool), 120.0).pictures == ()
     page = report.write_dataset_page(tmp_path / "page.html", dataset, present=present, rate=240.0)
     assert len(pictures(page)) == 5
-
-
-@pytest.mark.parametrize(
-    ("present", "rate", "sentence"),
-    [
-        (np.ones(5, bool), 120.0, r"present is bool of shape \(5,\), expected bool \(frames, markers\)"),
-        (np.ones((5, 2)), 120.0, "present is float64 of shape"),
-        (np.ones((0, 2), bool), 120.0, r"of shape \(0, 2\)"),
-        (np.ones((5, 2), bool), 0.0, "rate is 0 Hz, expected a positive number"),
-        (np.ones((5, 2), bool), np.nan, "rate is nan Hz"),
-    ],
-)
-def test_no_take_is_told(present, rate, sentence):
-    with pytest.raises(DatasetError, match=sentence):
-        report.gap_section(present, rate)
 
 
 def test_a_large_set_is_sampled_evenly_over_its_shards(dataset):
