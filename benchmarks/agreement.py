@@ -8,18 +8,15 @@ and the deepest self-penetration of any sampled pose.
 
 from __future__ import annotations
 
-import argparse
-
 import mujoco
 import numpy as np
 
-from benchmarks.record import add_save, describe, save_figures
+from benchmarks.record import describe, report, run
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos, load_rig
 from handsim.hand.shape import EVERYBODY
-from handsim.space.rig import load_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes import HIGH, LOW, sample_valid_angles
 from train.simulation.training_frames import sample_hands
@@ -44,20 +41,15 @@ def blocked_rays(
     return blocked
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--hands", type=int, default=50)
-    parser.add_argument("--poses", type=int, default=2000)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(hands: int = 50, poses: int = 2000, save: str | None = None) -> None:
     print(describe("mujoco"))
     rng = np.random.default_rng(0)
     layout, cameras = load_layout("dense19"), load_rig("figure5").positions
     deepest = kinematics = 0.0
     outside = rays = disagreeing = 0
-    for _ in range(arguments.hands):
+    for _ in range(hands):
         model = sample_hands(EVERYBODY, rng=rng)[rng.integers(2)]
-        angles = sample_valid_angles(model, arguments.poses, rng=rng)
+        angles = sample_valid_angles(model, poses, rng=rng)
         outside += int(((angles < LOW) | (angles > HIGH)).any(axis=1).sum())
         deepest = max(deepest, float(model.penetration(join_qpos(angles)).max()))
         position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-0.3, 0.3, size=(CHECKED, 3))
@@ -73,18 +65,14 @@ def main() -> None:
             kinematics = max(kinematics, float(np.abs(data.xpos[1:] - bones[frame, :, :3, 3]).max()))
             blocked = blocked_rays(model, data, markers[frame], cameras)
             rays, disagreeing = rays + blocked.size, disagreeing + int((blocked == free[frame]).sum())
-    poses = arguments.hands * arguments.poses
-    print(f"{poses:,} poses of {arguments.hands} hands: {outside} outside a range")
-    print(f"deepest self-penetration {1e3 * deepest:.3f} mm (limit 1 mm)")
-    print(f"kinematics against mj_kinematics: largest difference {kinematics:.1e} m")
-    print(f"sight against mj_multiRay: {rays - disagreeing:,} of {rays:,} rays agree")
     figures = {
+        "outside": ("joint angles of the sampled poses out of range", outside),
         "kinematics": ("kinematics against mj_kinematics, largest difference [m]", kinematics),
         "rays": ("rays that agree with mj_multiRay, of all", [rays - disagreeing, rays]),
         "deepest": ("deepest self-penetration of the sampled poses [mm]", 1e3 * deepest),
     }
-    save_figures(arguments.save, figures)
+    report(save, figures)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -9,7 +9,6 @@ python -m benchmarks.any_layout [--frames 1000] [--random 4] [--captures FOLDER]
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
@@ -17,30 +16,25 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.record import describe
+from benchmarks.record import describe, run, timed
+from gloves import MarkerLayout, load_layout
 from gloves.captures.formats import read_markers
-from gloves.layout import MarkerLayout, list_layouts, load_layout
-from train.data.batches import Corruption, paper_corruption
-from train.evaluation import evaluate_labeler
+from gloves.layout import list_layouts
+from train import Corruption, Labeler, evaluate_labeler, load_labeler
+from train.data.batches import paper_corruption
 from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler, sample_worn_markers
 from train.labelers.layout_training import sample_places
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.labelers.storage import shipped_labelers
 
 CAPTURE_FRAMES = 3000
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=1000, help="of each layout")
-    parser.add_argument("--random", type=int, default=4, help="random layouts")
-    parser.add_argument("--captures", type=Path, help="real captures in dense19, for it and sparse13")
-    options = parser.parse_args()
+def main(frames: int = 1000, random: int = 4, captures: Path | None = None) -> None:
     print(describe("torch", "numpy"))
     print("slots right [%], clean / with the paper's drops and ghosts")
     rng = np.random.default_rng(2026)
     layouts = [load_layout(name) for name in list_layouts()]
-    layouts += [random_layout(number, rng) for number in range(options.random)]
+    layouts += [random_layout(number, rng) for number in range(random)]
     unseen = []
     for layout in layouts:
         labelers: dict[str, Labeler] = {"at once": LayoutLabeler.at_once(layout)}
@@ -49,7 +43,7 @@ def main() -> None:
         seconds = time.perf_counter() - began
         if layout.name in shipped_labelers():
             labelers["trained"] = load_labeler(layout.name)
-        markers = sample_worn_markers(layout, options.frames, rng=np.random.default_rng(77))
+        markers = sample_worn_markers(layout, frames, rng=np.random.default_rng(77))
         found = {name: accuracies(labeler, markers) for name, labeler in labelers.items()}
         print(
             f"{layout.name}: {layout.num_markers} markers, {told(found)}; known after {seconds:.0f} s, "
@@ -58,8 +52,8 @@ def main() -> None:
         )
         if layout.name not in list_layouts():
             unseen.append([found["at once"], found["after a minute"]])
-        if options.captures and "trained" in labelers:
-            real = real_markers(options.captures, layout)
+        if captures and "trained" in labelers:
+            real = real_markers(captures, layout)
             found = {name: accuracies(labeler, real) for name, labeler in labelers.items()}
             print(f"{layout.name}, real captures: {told(found)}", flush=True)
     for name, (at_once, tuned) in (("mean", np.mean(unseen, axis=0)), ("worst", np.min(unseen, axis=0))):
@@ -101,13 +95,9 @@ def told(found: Mapping[str, Sequence[float]]) -> str:
 
 def per_cloud(labeler: Labeler, markers: np.ndarray) -> float:
     """Median time of a cloud that comes alone [ms]."""
-    times = []
-    for cloud in markers[:60]:
-        began = time.perf_counter()
-        labeler.label_frames([cloud])
-        times.append(time.perf_counter() - began)
+    times = [timed(lambda cloud=cloud: labeler.label_frames([cloud])) for cloud in markers[:60]]  # type: ignore[misc]
     return 1e3 * float(np.median(times))
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

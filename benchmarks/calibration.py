@@ -12,9 +12,8 @@ as designed. Another capture of the same user holds the touches that the gaps ar
 which the true flesh of thumb and finger meets, how far the flesh of the tracked hand is from touching, apart
 or dug in, and how far the distance of its skins is from that of the true hand's.
 
-The same capture is calibrated three times more: from the mean hand of the next size, farther from the truth;
-with 1 % of labels wrong, neighbors having exchanged their names for a while; and with flesh that moves every
-marker by 0.5 mm RMS as its digit bends.
+The same capture is calibrated twice more: with 1 % of labels wrong, neighbors having exchanged names for
+a while; and with flesh that moves every marker by 0.5 mm RMS as its digit bends.
 
 FOLDER holds labeled dense19 captures of real people, one sub-folder each (right hands, *_right.trc): the
 first half of each calibrates, the second is tracked. There the truth is not known, only what markers are off.
@@ -22,7 +21,6 @@ first half of each calibrates, the second is tracked. There the truth is not kno
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from pathlib import Path
@@ -32,12 +30,11 @@ import numpy as np
 from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import right_hands
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit, attach_markers, nominal_fit
-from gloves.layout import MarkerLayout, load_layout
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import BONES, SIDES, SIZES, HandShape, sample_shape, shape_from_measures
+from benchmarks.record import Figures, describe, run, save_figures
+from gloves import GloveFit, MarkerLayout, Take, load_layout
+from gloves.fit import attach_markers, nominal_fit
+from handsim import HandModel, HandShape, join_qpos, sample_shape
+from handsim.hand.shape import BONES, SIDES, SIZES, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.energy import contact_geometry, initialize_contacts
@@ -68,17 +65,14 @@ def draw_shape(size: str, factor: float, rng: np.random.Generator) -> HandShape:
     )
 
 
-def draw_user(
-    number: int, layout: MarkerLayout, rng: np.random.Generator
-) -> tuple[GloveFit, GloveFit, GloveFit]:
-    """Somebody's hand in its glove, the hand that a calibration begins with, and one a size farther off."""
+def draw_user(number: int, layout: MarkerLayout, rng: np.random.Generator) -> tuple[GloveFit, GloveFit]:
+    """Somebody's hand in its glove, and the hand that a calibration begins with."""
     sizes, index, side = list(SIZES), 1 + number % 3, SIDES[1 - number % 2]
     grown = 1 if number % 4 < 2 else -1
     shape = draw_shape(sizes[index], 1.0 + OFF * grown, rng)
     model = HandModel(shape)
     worn = displace_markers(attach_markers(layout, model), shape, SLIP, LIFT, rng=rng)
-    starts = (nominal_fit(layout, size, side) for size in (sizes[index], sizes[index - grown]))
-    return GloveFit(model, worn).with_side(side), *starts
+    return GloveFit(model, worn).with_side(side), nominal_fit(layout, sizes[index], side)
 
 
 def exchange_labels(markers: np.ndarray, true: GloveFit, rng: np.random.Generator) -> np.ndarray:
@@ -146,18 +140,21 @@ def tell(name: str, hand: GloveFit, true: GloveFit, held_out: Take) -> list[floa
             tips.mean(), *np.nanmean(gaps, axis=0), np.nanmax(gaps[:, 0])]  # fmt: skip
 
 
-def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -> dict[str, list[float]]:
+def run_user(
+    rng: np.random.Generator,
+    number: int,
+    layout: MarkerLayout,
+    made: CalibrationTakeConfig,
+    picture: Path | None,
+) -> dict[str, list[float]]:
     """Simulate a user, calibrate in every way, print; what is averaged over users, by the way."""
-    rng = np.random.default_rng((arguments.seed, number))
-    true, start, farther = draw_user(number, layout, rng)
+    true, start = draw_user(number, layout, rng)
     worn = (true,)
-    made = CalibrationTakeConfig(free=arguments.free, rounds=arguments.rounds)
     take = simulate_calibration(worn, made, rng=rng)
     held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
     markers = take.observed(true.side)
     ways = {
         "after": (markers, start),
-        "from the next size": (markers, farther),
         "1 % wrong labels": (exchange_labels(markers, true, rng), start),
         "flesh": (move_flesh(markers, take.qpos[:, 0], true, rng), start),
     }
@@ -173,8 +170,8 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
               f"{1e3 * result.rms_after:.2f}; {len(result.touches)} touches found; {within:.0%} of places "
               f"within two standard errors; {' / '.join(result.suggestions()) or 'no advice'}",
               flush=True)  # fmt: skip
-        if arguments.picture and number == 0 and name == "after":
-            save_picture(arguments.picture, result)
+        if picture and number == 0 and name == "after":
+            save_picture(picture, result)
     return rows
 
 
@@ -194,42 +191,42 @@ def tell_people(captures: Path, layout: MarkerLayout) -> list[list[float]]:
     return medians
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--users", type=int, default=6)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--layout", default="dense19")
-    parser.add_argument("--free", type=float, default=40.0)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--picture")
-    parser.add_argument("--captures", type=Path)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(
+    users: int = 6,
+    seed: int = 0,
+    layout: str = "dense19",
+    free: float = 40.0,
+    rounds: int = 3,
+    picture: Path | None = None,
+    captures: Path | None = None,
+    save: str | None = None,
+) -> None:
     print(describe("scipy", "numba"))
-    layout = load_layout(arguments.layout)
-    users = [run_user(number, arguments, layout) for number in range(arguments.users)]
+    glove, made = load_layout(layout), CalibrationTakeConfig(free=free, rounds=rounds)
+    told = [
+        run_user(np.random.default_rng((seed, number)), number, glove, made, picture)
+        for number in range(users)
+    ]
     figures: Figures = {}
-    for name in users[0]:
-        mean, worst = (by([user[name] for user in users], axis=0) for by in (np.mean, np.max))
+    for name in told[0]:
+        mean, worst = (by([user[name] for user in told], axis=0) for by in (np.mean, np.max))
         print(f"{name}: places {mean[0]:.2f} mm (worst {worst[1]:.2f}; in the wrist's frame {mean[2]:.2f}), "
               f"bones {mean[3]:.2f} % (worst {worst[4]:.1f}), tips {mean[5]:.1f} %, touches off by "
               f"{mean[6]:.2f} mm (worst finger {worst[8]:.2f}), skins by {mean[7]:.2f} mm")  # fmt: skip
-        key = {"from the next size": "next_size", "1 % wrong labels": "wrong_labels"}.get(name, name)
+        key = {"1 % wrong labels": "wrong_labels"}.get(name, name)
         what = (
-            f"{len(users)} simulated users, mean and worst: marker positions [mm] | bones between joints [%] "
+            f"{users} simulated users, mean and worst: marker positions [mm] | bones between joints [%] "
             f"| last bones to their tips [%] | held-out touches [mm]: {name}"
         )
         figures[key] = what, [[mean[0], worst[1]], [mean[3], worst[4]], mean[5], [mean[6], worst[8]]]
         if name == "after":
             figures["wrist_frame"] = "marker positions in the wrist's frame, mean [mm]", mean[2]
-    if arguments.captures:
-        before, after = tell_people(arguments.captures, layout)
+    if captures:
+        before, after = tell_people(captures, glove)
         figures["people_before"] = "real people, held-out frames, 3D RMS median before [mm]", before
         figures["people_after"] = "the same after calibration [mm]", after
-    save_figures(arguments.save, figures)
+    save_figures(save, figures)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

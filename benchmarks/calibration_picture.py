@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit
+from gloves import GloveFit
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import BONES, PALM
 from handsim.hand.skin import vertex_normals
-from track.calibration.user_calibration import Calibration
+from track import Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,6 @@ is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count 
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import random
@@ -23,6 +22,11 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
+
+import tyro
+
+from benchmarks.record import run
 
 SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,6 +74,12 @@ CASES = {
 }
 
 
+Command = Literal[
+    "generate", "train", "render", "simulate", "track", "calibrate", "label", "cnn", "improve", "plan"
+]
+ALL: tuple[Command, ...] = get_args(Command)
+
+
 @dataclass
 class Counts:
     """What must be zero for a command, and how fast it ended."""
@@ -86,16 +96,7 @@ class Counts:
         return bool(self.differing or self.orphans or self.temporary or self.segments)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("commands", nargs="*", help=f"some of {', '.join(CASES)}; all when not given")
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    if not set(options.commands) <= set(CASES):
-        parser.error(f"commands are {', '.join(options.commands)}, expected some of {', '.join(CASES)}")
+def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int = 20, seed: int = 0) -> None:
     print(
         f"{'command':12s}{'kills':>7s}{'differ':>8s}{'orphans':>9s}{'temporary':>11s}{'shm':>5s}{'slowest':>9s}"
     )
@@ -103,15 +104,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="chaos-") as folder:
         work = Path(folder)
         prepare(work)
-        for name in options.commands or CASES:
-            counts = torment(name, work, options.kills, random.Random(f"{options.seed} {name}"))
+        for name in commands:
+            counts = torment(name, work, kills, random.Random(f"{seed} {name}"))
             failed |= counts.failed()
             print(
                 f"{name:12s}{counts.kills:7d}{counts.differing:8d}{counts.orphans:9d}{counts.temporary:11d}"
                 f"{counts.segments:5d}{counts.slowest:7.1f} s",
                 flush=True,
             )
-    return int(failed)
+    raise SystemExit(int(failed))
 
 
 def prepare(work: Path) -> None:
@@ -190,7 +191,7 @@ def finish(args: tuple[str, ...]) -> None:
 
 def program(args: tuple[str, ...]) -> list[str]:
     """The command with small shards, so that there are several."""
-    return [sys.executable, __file__, "--run", *args]
+    return [sys.executable, "-m", "benchmarks.chaos", "--run", *args]
 
 
 def arguments(case: Case, work: Path, out: Path) -> tuple[str, ...]:
@@ -217,4 +218,4 @@ if __name__ == "__main__":
         from handsim.cli.main import main as handsim_main
 
         sys.exit(handsim_main(sys.argv[2:]))
-    sys.exit(main())
+    run(main, __doc__)

@@ -9,7 +9,6 @@ and another one is started. At last shards that do nothing show what the schedul
 
 from __future__ import annotations
 
-import argparse
 import functools
 import hashlib
 import json
@@ -28,13 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.record import describe
+from benchmarks.record import describe, run
 from handsim.app.workers import chosen_workers, run_jobs
-from render.config import RenderConfig
-from render.session import render_take
+from render import RenderConfig, render_take
+from train import GenerateSettings, simulate_take
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 
@@ -92,26 +89,21 @@ class DaskProcesses:
 Make = Callable[[Path, int | Executor], object]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=400_000, help="of the training sets")
-    parser.add_argument("--pictures", type=int, default=5_000)
-    parser.add_argument("--workers", type=int, default=4, help="processes of either kind")
-    parser.add_argument("--rounds", type=int, default=2, help="of each, in turns")
-    parser.add_argument("--shards", type=int, default=10_000, help="that do nothing")
-    options = parser.parse_args()
+def main(
+    frames: int = 400_000, pictures: int = 5_000, workers: int = 4, rounds: int = 2, shards: int = 10_000
+) -> None:
     print(describe("dask", "distributed"))
-    with tempfile.TemporaryDirectory() as name, running(Path(name), options.workers) as dask:
+    with tempfile.TemporaryDirectory() as name, running(Path(name), workers) as dask:
         folder = Path(name)
-        take = simulate_take(kind="hand-hand", num_frames=options.pictures)
+        take = simulate_take(kind="hand-hand", num_frames=pictures)
         take.save(folder / "take.npz")
         kinds: dict[str, Make] = {
-            f"{options.frames} training frames": functools.partial(frames, options.frames),
-            f"{options.pictures} pictures": functools.partial(pictures, folder / "take.npz"),
+            f"{frames} training frames": functools.partial(make_frames, frames),
+            f"{pictures} pictures": functools.partial(draw_pictures, folder / "take.npz"),
         }
         for kind, make in kinds.items():
-            compare(kind, make, dask, options)
-        empty_shards(dask, options)
+            compare(kind, make, dask, workers, rounds)
+        empty_shards(dask, workers, shards)
 
 
 @contextmanager
@@ -126,31 +118,31 @@ def running(folder: Path, workers: int) -> Iterator[DaskProcesses]:
         dask.stop()
 
 
-def frames(count: int, out: Path, workers: int | Executor) -> None:
+def make_frames(count: int, out: Path, workers: int | Executor) -> None:
     make_dataset(GenerateSettings(num_frames=count, seed=3), out, workers=workers)
 
 
-def pictures(take: Path, out: Path, workers: int | Executor) -> None:
+def draw_pictures(take: Path, out: Path, workers: int | Executor) -> None:
     config = RenderConfig(passes=("rgb", "depth", "ids"), depth_sensor=None, color_sensor=None, seed=3)
     render_take(take, out, ("webdataset",), config, workers=workers)
 
 
-def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namespace) -> None:
+def compare(kind: str, make: Make, dask: DaskProcesses, count: int, rounds: int) -> None:
     """Make the same in turns by either, and once more while workers die and come."""
     seconds: dict[str, list[float]] = {"processes": [], "dask": []}
     results: set[str] = set()
-    for _ in range(options.rounds):
+    for _ in range(rounds):
         for name, times in seconds.items():
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "out"
                 start = time.perf_counter()
-                with chosen(name, dask, options) as workers:
+                with chosen(name, dask, count) as workers:
                     make(out, workers)
                 times.append(time.perf_counter() - start)
                 results.add(digest(out))
     pool, there = (float(np.median(each)) for each in seconds.values())
     print(
-        f"{kind}: {options.workers} processes {pool:.1f} s, {options.workers} Dask workers {there:.1f} s, "
+        f"{kind}: {count} processes {pool:.1f} s, {count} Dask workers {there:.1f} s, "
         f"overhead {100 * (there / pool - 1):.1f} %; bytes {'equal' if len(results) == 1 else 'DIFFER'}"
     )
     with tempfile.TemporaryDirectory() as folder:
@@ -160,7 +152,7 @@ def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namesp
         for timer in timers:
             timer.start()
         start = time.perf_counter()
-        with chosen("dask", dask, options) as workers:
+        with chosen("dask", dask, count) as workers:
             make(out, workers)
         took = time.perf_counter() - start
         for timer in timers:
@@ -186,24 +178,22 @@ def nothing(number: int) -> int:
     return number
 
 
-def chosen(
-    name: str, dask: DaskProcesses, options: argparse.Namespace
-) -> AbstractContextManager[int | Executor]:
+def chosen(name: str, dask: DaskProcesses, count: int) -> AbstractContextManager[int | Executor]:
     """Processes of this machine, or the workers of the scheduler."""
     if name == "dask":
         return chosen_workers(dask.address, None, lambda line: None)
-    return chosen_workers(None, options.workers, print)
+    return chosen_workers(None, count, print)
 
 
-def empty_shards(dask: DaskProcesses, options: argparse.Namespace) -> None:
+def empty_shards(dask: DaskProcesses, count: int, shards: int) -> None:
     """What either takes for a shard, if nothing is to be done."""
     for name in ("dask", "processes"):
         start = time.perf_counter()
-        with chosen(name, dask, options) as workers:
-            done = sum(1 for _ in run_jobs(nothing, range(options.shards), workers))
+        with chosen(name, dask, count) as workers:
+            done = sum(1 for _ in run_jobs(nothing, range(shards), workers))
         took = time.perf_counter() - start
         print(f"{done} empty shards, {name}: {took:.1f} s, {1e3 * took / done:.2f} ms each", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -6,9 +6,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from handsim import HandSimError
 from handsim.app.messages import told_warnings
 from handsim.cli.parsing import run_command
-from handsim.errors import HandSimError
 
 
 def run(

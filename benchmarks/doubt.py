@@ -12,24 +12,24 @@ single joints need many people.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.paper.take_evaluation import measured_users, nearest_size, nominal_users, seen_frame
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit, nominal_fit
-from gloves.takes.take import Take, keypoints_of
+from benchmarks.record import Figures, describe, run, save_figures
+from gloves import GloveFit, Take
+from gloves.fit import nominal_fit
+from gloves.takes.take import keypoints_of
 from handsim.hand.shape import JOINT_NAMES
+from track import Tracker, User
 from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
-from track.tracker import Tracker
-from track.user import MEASURED, User
-from train.labelers.storage import load_labeler
+from track.user import MEASURED
+from train import load_labeler, simulate_take
 from train.simulation.scenes import KINDS, CalibrationTakeConfig
-from train.simulation.takes import simulate_calibration, simulate_take
+from train.simulation.takes import simulate_calibration
 
 EVERY = 4  # frames
 
@@ -99,42 +99,39 @@ def tell(name: str, errors: Sequence[Errors]) -> list[float]:
     return [float(number) for number in row]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--gloves", nargs="+", default=["dense19", "sparse13", "starter10"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3])
-    parser.add_argument("--frames", type=int, default=480)
-    parser.add_argument("--free", type=float, default=20.0, help="free motion in a calibration capture [s]")
-    parser.add_argument("--without-calibration", action="store_true")
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(
+    gloves: tuple[str, ...] = ("dense19", "sparse13", "starter10"),
+    seeds: tuple[int, ...] = (0, 1, 2, 3),
+    frames: int = 480,
+    free: float = 20.0,
+    without_calibration: bool = False,
+    save: str | None = None,
+) -> None:
     print(describe("numba", "torch"))
     print(
         "errors within 1 and 2 standard deviations [%] | joint angles | worst joints | keypoints | RMS of "
         "angle errors, of standard deviations [deg]"
     )
     table: dict[str, list[Errors]] = {}
-    for glove in arguments.gloves:
-        for seed in arguments.seeds:
+    for glove in gloves:
+        for seed in seeds:
             kind = KINDS[seed % len(KINDS)]
-            take = simulate_take(kind=kind, glove=glove, num_frames=arguments.frames, seed=seed)
+            take = simulate_take(kind=kind, glove=glove, num_frames=frames, seed=seed)
             take = take.without_body()
             users = {
                 "named": User(tuple(nominal_users(take)), USUAL_SIZE),  # the notes of hands of a size
                 "measured": User(tuple(measured_users(take, load_labeler(glove))), f"{MEASURED}twin"),
             }
-            if not arguments.without_calibration:
-                users["calibrated"] = calibrated_hands(take, glove, seed, arguments.free)
+            if not without_calibration:
+                users["calibrated"] = calibrated_hands(take, glove, seed, free)
             for name, user in users.items():
                 table.setdefault(f"{glove} {name}", []).extend(errors_of(take, user, glove))
     figures: Figures = {}
     what = "within 1, 2 standard deviations [%]: joint angles, the worst joint of each, keypoints"
     for name, errors in {**table, "all": [one for some in table.values() for one in some]}.items():
         figures[name.replace(" ", "_")] = f"{name}: {what}", tell(name, errors)
-    save_figures(arguments.save, figures)
+    save_figures(save, figures)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -13,7 +13,7 @@ those in use are of seeds 101 to 114, which test nothing.
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -22,15 +22,20 @@ import numpy as np
 import torch
 from scipy.ndimage import binary_closing
 
-from benchmarks.doubtful_scenes import KINDS, real_takes, simulate
-from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.real_motion import tracker_of, true_labels
+from benchmarks.real_scenes import CONDITIONS, make_scene
+from benchmarks.record import Figures, describe, run, save_figures
+from gloves import Take
 from gloves.captures.capture import runs_of
-from gloves.takes.take import Take
-from track.captures import label_capture, track_capture
-from track.label_confidence import evidence_of
-from track.take_summary import find_suspect_spans, frame_confidence
+from track import find_suspect_spans, label_capture, track_capture
+from track.label_confidence import evidence_of, label_confidence
+from track.recorder import TakeRecorder
+from track.take_summary import frame_confidence
+from train import OpticsOptions, simulate_take
 from train.evaluation import expected_calibration_error
 
+KINDS = ("single-hand", "hand-hand", "hand-pen", "hand-controller")
+POOR = OpticsOptions(blob_loss=0.08, dropout=0.004, noise=0.25)  # the usual: 0.002, 0.0002, 0.12
 GLOVES = ("dense19", "sparse13", "dfki13", "starter10", "tips8")
 WHAT = (
     "runs of errors covered, spans with an error [%] | spans a minute | frames listed [%] | calibration "
@@ -38,11 +43,48 @@ WHAT = (
 )
 
 
-def simulated_takes(options: argparse.Namespace) -> Iterator[tuple[str, Take, np.ndarray]]:
+def simulate(glove: str, kind: str, seed: int, frames: int = 600) -> Take:
+    """A capture with its truth, in which errors are likely."""
+    turn, rng = (seed + KINDS.index(kind)) % 4, np.random.default_rng(seed)
+    optics, others = POOR if turn in (1, 2) else OpticsOptions(), (20, 0, 10, 0)[turn]
+    take = simulate_take(kind=kind, glove=glove, num_frames=frames, seed=seed, optics=optics, others=others)
+    take = take.without_body()
+    points, labels = take.points.copy(), take.labels.copy()
+    if turn == 3:
+        points += rng.normal(0.0, rng.uniform(0.0005, 0.0015), points.shape)
+    for t in np.flatnonzero(rng.random(frames) < 1.0 / 60.0) if turn == 1 else ():
+        seen = np.flatnonzero(labels[t] >= 0)
+        near = np.linalg.norm(points[t, seen, None] - points[t, seen], axis=-1) < 0.03
+        if len(pairs := np.argwhere(np.triu(near, 1))):
+            pair = seen[pairs[rng.integers(len(pairs))]]
+            for values in (points, labels):
+                values[t:, pair] = values[t:, pair[::-1]]
+    confidence = np.where(np.isfinite(points[..., 0]), 1.0, np.nan)
+    return dataclasses.replace(take, points=points, labels=labels, confidence=confidence)
+
+
+def real_takes(data: Path, frames: int) -> Iterator[tuple[str, Take, np.ndarray]]:
+    """What each scene of real hands is, its tracked take, and the true labels."""
+    for folder in sorted(data.glob("User*/capture*")):
+        for condition in CONDITIONS:
+            scene = make_scene(folder, condition, seed=1, frames=frames)
+            stream, tracker = tracker_of(scene)
+            recorder, there = TakeRecorder(tracker), np.isfinite(scene.points[..., 0])
+            for frame in stream:
+                recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
+            take = recorder.take(scene.capture())
+            sure = dataclasses.replace(take.point_list, confidence=label_confidence(take))
+            take = dataclasses.replace(take, point_list=sure)
+            yield f"{folder.parent.name} {condition}", take, np.where(there, true_labels(scene), -1)
+
+
+def simulated_takes(
+    gloves: tuple[str, ...], seeds: tuple[int, ...], frames: int, label: bool
+) -> Iterator[tuple[str, Take, np.ndarray]]:
     """What each take is, the take and the true labels."""
-    make = label_capture if options.label else track_capture
-    for glove, seed, kind in product(options.gloves, options.seeds, KINDS):
-        truth = simulate(glove, kind, seed, options.frames)
+    make = label_capture if label else track_capture
+    for glove, seed, kind in product(gloves, seeds, KINDS):
+        truth = simulate(glove, kind, seed, frames)
         yield f"{glove} {kind}", make(truth, glove=glove), truth.labels
 
 
@@ -87,7 +129,9 @@ def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
 
 
-def fit(told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: float = 10.0) -> np.ndarray:
+def fitted(
+    told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: float = 10.0
+) -> np.ndarray:
     """Coefficients of a logistic model, the constant first, by Newton's method.
 
     Args:
@@ -106,28 +150,25 @@ def fit(told: list[tuple[np.ndarray, np.ndarray]], most: float = 1000.0, ridge: 
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--gloves", nargs="+", default=GLOVES)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[300, 301, 302, 303])
-    parser.add_argument("--frames", type=int, default=600)
-    parser.add_argument("--label", action="store_true")
-    parser.add_argument("--real", type=Path)
-    parser.add_argument("--fit", action="store_true")
-    add_save(parser)
-    options = parser.parse_args()
+def main(
+    gloves: tuple[str, ...] = GLOVES,
+    seeds: tuple[int, ...] = (300, 301, 302, 303),
+    frames: int = 600,
+    label: bool = False,
+    real: Path | None = None,
+    fit: bool = False,
+    save: str | None = None,
+) -> None:
     torch.set_num_threads(1)
     print(describe("numba", "torch"), WHAT, sep="\n")
     table: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {}
     labeled: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[tuple[np.ndarray, np.ndarray]] = []
-    takes = real_takes(options.real, options.frames) if options.real else simulated_takes(options)
+    takes = real_takes(real, frames) if real else simulated_takes(gloves, seeds, frames, label)
     for name, take, truth in takes:
         for key in (*name.split(), "all"):
             table.setdefault(key, []).append(score(take, truth))
-        if options.fit:
+        if fit:
             evidence = evidence_of(take)
             points = take.point_list
             true = truth[points.frames[evidence.points], points.columns[evidence.points]]
@@ -142,10 +183,10 @@ def main() -> None:
         )
         print(f"{key:16s} | " + " | ".join(f"{value:6.1f}" for value in values), flush=True)
         figures[key] = f"{WHAT}; {key}", values
-    save_figures(options.save, figures)
-    if options.fit:
-        print("_LABELED", fit(labeled).round(2), "\n_UNLABELED", fit(others).round(2))
+    save_figures(save, figures)
+    if fit:
+        print("_LABELED", fitted(labeled).round(2), "\n_UNLABELED", fitted(others).round(2))
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

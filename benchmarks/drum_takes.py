@@ -21,9 +21,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from gloves import Take
 from gloves.optics.ghosts import reflect
 from gloves.optics.reconstruction import number_runs
-from gloves.takes.take import Take
 from train.simulation.room import label_false_points
 
 NUMBER = 20  # ghosts a frame

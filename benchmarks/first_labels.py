@@ -7,27 +7,27 @@ python -m benchmarks.first_labels [--captures DATA] [--labeler cnn] [--frames 10
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import tempfile
 import time
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
-from benchmarks.record import add_save, describe, save_figures
+from benchmarks.record import describe, report, run
+from gloves import load_layout
 from gloves.captures.formats import find_captures, read_markers
-from gloves.layout import load_layout
+from train import Dataset, GenerateSettings, TrainSettings
 from train.data.batches import draw_batch
-from train.data.shards import Dataset
+from train.fabric import start_fabric
 from train.labelers.networks import labeler_of
-from train.loop import TrainingState, start_fabric
-from train.settings import KINDS, TrainSettings, batch_recipe, usual_settings
+from train.loop import TrainingState
+from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import GenerateSettings
 
 GLOVE = "dense19"
 EVERY = {"set": 40_000, "cnn": 20_000}  # samples between two looks
@@ -35,23 +35,22 @@ FRAMES = {"set": 3000, "cnn": 300}  # of each test set
 LIMIT = 10.0  # minutes
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--captures", type=Path)
-    parser.add_argument("--labeler", choices=KINDS, default="set")
-    parser.add_argument("--frames", type=int, default=100_000)
-    parser.add_argument("--samples", type=int, default=400_000)
-    add_save(parser)
-    options = parser.parse_args()
+def main(
+    captures: Path | None = None,
+    labeler: Literal["set", "cnn"] = "set",
+    frames: int = 100_000,
+    samples: int = 400_000,
+    save: str | None = None,
+) -> None:
     print(describe("torch", "mujoco"))
-    tested = FRAMES[options.labeler]
+    tested = FRAMES[labeler]
     tests = {"unseen simulated": held_out_markers(GLOVE, tested, seed=1)}
-    if options.captures is not None:
-        markers = read_markers(find_captures([options.captures]), load_layout(GLOVE).names)
+    if captures is not None:
+        markers = read_markers(find_captures([captures]), load_layout(GLOVE).names)
         tests["captures"] = markers[:: -(-len(markers) // tested)]
     with tempfile.TemporaryDirectory() as folder:
-        config = dataclasses.replace(usual_settings(options.labeler), samples=options.samples)
-        beaten = race(tests, options.frames, config, Path(folder))
+        config = dataclasses.replace(usual_settings(labeler), samples=samples)
+        beaten = race(tests, frames, config, Path(folder))
     for name, times in beaten.items():
         print(name + ": " + ", ".join(f"{test} after {minutes:.1f} min" for test, minutes in times.items()))
     last = max((time for times in beaten.values() for time in times.values()), default=np.inf)
@@ -61,7 +60,7 @@ def main() -> None:
     if complete:
         what = "minutes until the last of the paper's four best figures was beaten, generation included"
         three = "minutes until the other three were beaten"
-        save_figures(options.save, {"all": (what, last), "three": (three, every[-1 - len(beaten)])})
+        report(save, {"all": (what, last), "three": (three, every[-1 - len(beaten)])})
 
 
 def race(
@@ -100,4 +99,4 @@ def race(
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

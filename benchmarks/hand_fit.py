@@ -11,20 +11,20 @@ range.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.people import right_hands
-from benchmarks.record import add_save, describe, save_figures
-from gloves.fit import Attachment, attach_markers
-from gloves.layout import MarkerLayout, load_layout
-from handsim.hand.model import HandModel, skinned_jacobian
-from handsim.hand.shape import JOINTS, HandShape, shape_from_measures
+from benchmarks.record import describe, report, run
+from gloves import GloveFit, MarkerLayout, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, HandShape
+from handsim.hand.model import skinned_jacobian
+from handsim.hand.shape import shape_from_measures
 from handsim.kernels import move
-from track.kinematics.pose_solver import PoseFit, solve_pose
+from track import PoseFit, solve_pose
 
 ROUNDS = 12
 STEP = 1e-5
@@ -46,7 +46,7 @@ class Person:
         spreads = [np.full(15, LENGTHS), np.full(15, KNUCKLES), np.repeat(DIRECTIONS, 3)]
         self.spread = np.concatenate([*spreads, np.full(3 * layout.num_markers, PLACES)])
 
-    def wear(self, parameters: np.ndarray) -> tuple[HandModel, Attachment]:
+    def wear(self, parameters: np.ndarray) -> GloveFit:
         """The hand and its glove for these parameters."""
         lengths, knuckles, directions = parameters[:45].reshape(3, 5, 3)
         shape = dataclasses.replace(
@@ -59,12 +59,13 @@ class Person:
         local = self.local + parameters[45:].reshape(-1, 3)
         rest = model.rest_transforms[self.bones]
         points = np.einsum("mij,mj->mi", rest[:, :3, :3], local) + rest[:, :3, 3]
-        return model, dataclasses.replace(self.glove, points=points)
+        return GloveFit(model, dataclasses.replace(self.glove, points=points))
 
 
 def improve(person: Person, parameters: np.ndarray, fit: PoseFit) -> tuple[np.ndarray, np.ndarray]:
     """One Gauss-Newton step of parameters and poses together, the poses eliminated frame by frame."""
-    model, glove = person.wear(parameters)
+    worn = person.wear(parameters)
+    model, glove = worn.model, worn.attachment
     bones = model.forward_kinematics(fit.qpos)
     frames = len(fit.qpos)
     poses = skinned_jacobian(model, bones, glove.points, glove.bone_indices, glove.bone_weights)
@@ -74,8 +75,7 @@ def improve(person: Person, parameters: np.ndarray, fit: PoseFit) -> tuple[np.nd
     for number in range(len(parameters)):
         nudged = parameters.copy()
         nudged[number] += STEP
-        other, its_glove = person.wear(nudged)
-        moved = its_glove.markers(other, other.forward_kinematics(fit.qpos))[0]
+        moved = person.wear(nudged).markers(fit.qpos)[0]
         shapes[..., number] = (moved.reshape(frames, -1) - base) / STEP
     residual = fit.residuals.reshape(frames, -1)
     normal = poses.transpose(0, 2, 1) @ poses + 1e-6 * np.eye(26)
@@ -103,47 +103,21 @@ def fit_person(markers: np.ndarray, layout: MarkerLayout) -> tuple[Person, np.nd
     return person, parameters
 
 
-def tell(name: str, person: Person, parameters: np.ndarray, fit: PoseFit) -> None:
-    """Print one person's residuals, worst markers, and joints out of range."""
-    rms = 1e3 * fit.rms
-    print(f"{name}: {len(rms)} held-out frames, 3D RMS median {np.median(rms):.2f} mm, "
-          f"p95 {np.percentile(rms, 95):.2f} mm, worst {rms.max():.2f} mm")  # fmt: skip
-    by_marker = 1e3 * np.sqrt((fit.residuals**2).sum(-1).mean(0))
-    order = by_marker.argsort()[::-1]
-    print(
-        "  markers: " + ", ".join(f"{person.layout.names[m]} {by_marker[m]:.1f}" for m in order[:6]) + " mm"
-    )
-    model, _ = person.wear(parameters)
-    low, high = model.skeleton.ranges.T
-    outside = ((fit.qpos[:, 7:] < low - 0.05) | (fit.qpos[:, 7:] > high + 0.05)).mean(axis=0)
-    worst = outside.argsort()[::-1][:3]
-    print("  out of range by 3 degrees: " + ", ".join(f"{JOINTS[j].name} {outside[j]:.1%}" for j in worst))
-    change = np.exp(parameters[:15]).reshape(5, 3)
-    print("  bone lengths against the mean hand of this size: " + " | ".join(
-        " ".join(f"{ratio:.2f}" for ratio in digit) for digit in change))  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("captures", type=Path)
-    parser.add_argument("--frames", type=int, default=400)
-    parser.add_argument("--held-out", type=int, default=400)
-    parser.add_argument("--seed", type=int, default=0)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(
+    captures: Path, frames: int = 400, held_out: int = 400, seed: int = 0, save: str | None = None
+) -> None:
     print(describe("scipy"))
-    rng, layout, everyone = np.random.default_rng(arguments.seed), load_layout("dense19"), []
-    for name, markers in right_hands(arguments.captures, layout.names).items():
-        chosen = rng.choice(len(markers), arguments.frames + arguments.held_out, replace=False)
-        person, parameters = fit_person(markers[chosen[: arguments.frames]], layout)
-        fit = solve_pose(person.wear(parameters), markers[chosen[arguments.frames :]])
-        tell(name, person, parameters, fit)
+    rng, layout, everyone = np.random.default_rng(seed), load_layout("dense19"), []
+    for name, markers in right_hands(captures, layout.names).items():
+        chosen = rng.choice(len(markers), frames + held_out, replace=False)
+        person, parameters = fit_person(markers[chosen[:frames]], layout)
+        fit = solve_pose(person.wear(parameters), markers[chosen[frames:]])
         everyone.append(1e3 * fit.rms)
+        print(f"{name}: 3D RMS median {np.median(everyone[-1]):.2f} mm, worst {everyone[-1].max():.2f} mm")
     rms = np.concatenate(everyone)
-    print(f"all: median {np.median(rms):.2f} mm, p95 {np.percentile(rms, 95):.2f} mm")
     what = f"fit of the hand to {len(rms)} other frames, 3D RMS median and p95 [mm]"
-    save_figures(arguments.save, {"all": (what, np.percentile(rms, [50, 95]))})
+    report(save, {"all": (what, np.percentile(rms, [50, 95]))})
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

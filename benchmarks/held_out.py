@@ -7,10 +7,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from gloves.layout import load_layout
-from handsim.space.rig import load_rig
+from gloves import load_layout
+from handsim import load_rig
+from train import GenerateSettings
 from train.data.shards import row_dtype
-from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
+from train.simulation.training_frames import FrameSource, sample_hands, simulate_frames
 
 _SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 

@@ -14,24 +14,21 @@ DATA is a folder of Mocap_SIG18_Data: each person's capture1 calibrates, capture
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.paper.hand_errors import hand_errors
-from benchmarks.record import describe
-from gloves.captures.capture import Capture
+from benchmarks.record import describe, run
+from gloves import Capture, GloveFit, Take, load_layout
 from gloves.captures.formats import read_markers
-from gloves.fit import GloveFit
-from gloves.layout import load_layout
-from gloves.takes.take import Take
-from handsim.errors import HandSimWarning
+from handsim import HandSimWarning
 from handsim.hand.shape import Side
-from track.captures import calibrate, measure_hands, track_capture
+from track import calibrate, measure_hands, track_capture
 from track.kinematics.pose_solver import PoseSolver
-from train.simulation.takes import simulate_take
+from train import simulate_take
+from train.simulation.scenes import SimulatedKind
 
 FRESH, RATE = 20.0, 120.0  # [s], [Hz]
 NAMES = (
@@ -113,30 +110,27 @@ def tell(name: str, values: np.ndarray) -> None:
     print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values), flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--gloves", nargs="+", default=["dense19", "dfki13", "starter10"])
-    parser.add_argument("--motions", nargs="+", default=["calibration", "hand-controller"])
-    parser.add_argument("--people", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--angles", action=argparse.BooleanOptionalAction, default=True)
-    parser.add_argument("--captures", type=Path)
-    options = parser.parse_args()
+def main(
+    gloves: tuple[str, ...] = ("dense19", "dfki13", "starter10"),
+    motions: tuple[SimulatedKind, ...] = ("calibration", "hand-controller"),
+    people: int = 2,
+    seconds: float = 30.0,
+    angles: bool = True,
+    captures: Path | None = None,
+) -> None:
     warnings.simplefilter("ignore", HandSimWarning)
     print(describe("scipy", "numba"))
     print("[mm], [deg] | " + " | ".join(NAMES))
-    if options.captures:
-        for person in sorted(options.captures.glob("User*")):
+    if captures:
+        for person in sorted(captures.glob("User*")):
             tell(person.name, np.array(run_person(person)))
-    count = round((options.seconds + FRESH) * RATE)
-    for glove in options.gloves:
-        for motion in options.motions:
+    count = round((seconds + FRESH) * RATE)
+    for glove in gloves:
+        for motion in motions:
             rows = []
-            for person in range(options.people):
+            for person in range(people):
                 truth = simulate_take(motion, glove=glove, num_frames=count, seed=100 + person)
-                for row in run_capture(truth, options.seconds, options.angles):
+                for row in run_capture(truth, seconds, angles):
                     tell(f"{glove}, {motion}, person {person}", np.array(row))
                     rows.append(row)
             tell(f"{glove}, {motion}, mean", np.nanmean(rows, axis=0))
@@ -145,4 +139,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -2,13 +2,13 @@
 
 A random 120 Hz motion is followed, every frame from the pose that the same solver found for the one before.
 For the comparison each marker of dense19 is bound to one bone, because a site of MuJoCo is; all stop where a
-step brings the markers less than a micron nearer. mink is left out where it is not installed.
+step brings the markers less than a micron nearer.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -16,12 +16,14 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from gloves.fit import Attachment, GloveFit, attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, build_spec, join_qpos, skinned_jacobian
+from benchmarks.record import timed
+from gloves import Attachment, GloveFit, load_layout
+from gloves.fit import attach_markers
+from handsim import HandModel, join_qpos
+from handsim.hand.model import build_spec, skinned_jacobian
 from handsim.kernels import move
 from handsim.space.transforms import random_quaternions
-from poses.motion import sample_motion
+from poses import sample_motion
 from poses.shapes import sample_valid_angles
 from track.kinematics.pose_solver import PoseSolver
 
@@ -117,34 +119,6 @@ def turning(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + (np.cos(angle) - 1.0) / angle * cross + (1.0 - np.sin(angle) / angle) * cross @ cross
 
 
-def mink_tasks(model: HandModel, glove: Attachment) -> Solver:
-    """A position task a marker; the quadratic program is daqp's."""
-    import mink
-
-    compiled, sites = with_sites(model, glove)
-    configuration = mink.Configuration(compiled)
-    tasks = [mink.FrameTask(name, "site", 1.0, 0.0) for name in glove.layout.names]
-
-    def solve(target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
-        configuration.update(start)
-        for task, place in zip(tasks, target, strict=True):
-            # A miss is told in the tangent space of poses, which is no plain distance unless nothing turns.
-            turn = configuration.get_transform_frame_to_world(task.frame_name, "site").rotation()
-            task.set_target(mink.SE3.from_rotation_and_translation(turn, place))
-        before, tried = np.inf, 0
-        while tried < MOST:
-            tried += 1
-            velocity = mink.solve_ik(configuration, tasks, 1.0, "daqp", damping=1e-9, limits=[])
-            configuration.integrate_inplace(velocity, 1.0)
-            cost = ((configuration.data.site_xpos[sites] - target) ** 2).sum()
-            if abs(before - cost) < SMALL:
-                break
-            before = cost
-        return configuration.q.copy(), tried
-
-    return solve
-
-
 def follow(
     solve: Solver, model: HandModel, glove: Attachment, qpos: np.ndarray, targets: np.ndarray
 ) -> tuple[list[float], float]:
@@ -187,12 +161,7 @@ def from_eight_starts(
 
 def _times(job: Callable[[int], object], count: int) -> list[float]:
     """Times of a job for each number below a count [s], the first left out."""
-    times = []
-    for number in range(count):
-        begun = time.perf_counter()
-        job(number)
-        times.append(time.perf_counter() - begun)
-    return times[1:]
+    return [timed(functools.partial(job, number)) for number in range(count)][1:]
 
 
 def times(seeds: Sequence[int], frames: int) -> Iterator[tuple[str, str, list[float]]]:
@@ -202,10 +171,6 @@ def times(seeds: Sequence[int], frames: int) -> Iterator[tuple[str, str, list[fl
         "numpy": ("the same steps, MuJoCo's Jacobian, numpy", mujoco_marquardt),
         "scipy": ("scipy least_squares, lm", scipy_marquardt),
     }
-    if importlib.util.find_spec("mink"):
-        contestants["mink"] = ("mink, daqp", mink_tasks)
-    else:
-        print("  mink is not installed and left out")
     model = HandModel.named("M")
     skin = attach_markers(load_layout("dense19"), model)
     weights = np.zeros_like(skin.bone_weights)

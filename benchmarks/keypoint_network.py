@@ -11,10 +11,6 @@ the reference is sure. Variants:
 ours: what `handsim render` draws; name it first, and the others are compared with it.
 plain: the loop that a user would write with pyrender: the same skins and cameras, one color of skin a
     picture, one light, a plain background.
-no backgrounds: ours before plain and graded backgrounds.
-no relief: ours with smooth skin, without knuckles, tendons and creases.
-no shadows: ours without shadows on what is behind the hand.
-no sensor: ours without exposure and noise.
 
 Photographs are counted twice: with the keypoints that the network finds, which are ours, and with those
 moved to where MediaPipe has them, by shares that were measured on drawn hands. `--photographs 100` adds about
@@ -27,30 +23,25 @@ photographs, evenly taken from those tried on, with the keypoints that a variant
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
-from unittest.mock import patch
+from typing import Annotated, Any, Final, Literal
 
 import cv2
 import numpy as np
 import torch
 import trimesh
+import tyro
 
 from benchmarks import keypoint_training as training
-from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.record import Figures, describe, run, save_figures
+from handsim import HandModel
 from handsim.files.outputs import atomic_write
-from handsim.hand.model import HandModel
-from render.config import RenderConfig
-from render.frames import RenderedFrame
-from render.painting.figures import Appearance, sample_people
+from render import RenderConfig, RenderedFrame
 from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
-from render.scenery.backgrounds import Backgrounds
 
-FEW_BACKGROUNDS: Final = Backgrounds({"plain": 1, "gradient": 1})
 LEARNED, HELD_OUT = 1, 2  # seeds of the pictures
 SKINS: Final = (
     (60, 42, 34),
@@ -69,34 +60,24 @@ LIMBS: Final = (
 )
 
 
-def draw_ours(count: int, seed: int) -> Any:
-    return training.draw(count, seed)
+@dataclass(frozen=True)
+class Options:
+    """The command line."""
 
-
-def draw_no_backgrounds(count: int, seed: int) -> Any:
-    return training.draw(count, seed, replace(training.CONFIG, background=FEW_BACKGROUNDS))
-
-
-def draw_no_sensor(count: int, seed: int) -> Any:
-    return training.draw(count, seed, replace(training.CONFIG, color_sensor=None))
-
-
-def draw_no_relief(count: int, seed: int) -> Any:
-    def smooth_people(*args: Any, **options: Any) -> tuple[Appearance, ...]:
-        people = sample_people(*args, **options)
-        return tuple(replace(one, skin=replace(one.skin, relief=0.0, creases=0.0)) for one in people)
-
-    with patch("render.session.sample_people", smooth_people):
-        return training.draw(count, seed)
-
-
-def draw_no_shadows(count: int, seed: int) -> Any:
-    with patch("render.studio.light_behind", return_value=None):
-        return training.draw(count, seed)
+    out: tyro.conf.Positional[Path]
+    photos: Path
+    reference: Path
+    variants: tuple[Literal["ours", "plain"], ...] = ("ours", "plain")
+    pictures: int = 12000
+    samples: int = 240000
+    seed: int = 0
+    photographs: int = 0
+    page: Path | None = None
+    save: str | None = None
 
 
 def draw_plain(count: int, seed: int) -> Any:
-    """Pictures by pyrender alone; poses, cameras and cuts are drawn as those of `draw_ours`."""
+    """Pictures by pyrender alone; poses, cameras and cuts are drawn as those of `keypoint_training.draw`."""
     rng, found = np.random.default_rng(seed), []
     config: RenderConfig = replace(training.CONFIG, passes=("ids",), seed=seed)
     renderer = offscreen_renderer(640, 480)
@@ -126,12 +107,8 @@ def plain_picture(frame: RenderedFrame, renderer: Any, rng: np.random.Generator)
 
 
 VARIANTS: Final[dict[str, Callable[[int, int], Any]]] = {
-    "ours": draw_ours,
+    "ours": training.draw,
     "plain": draw_plain,
-    "no backgrounds": draw_no_backgrounds,
-    "no relief": draw_no_relief,
-    "no shadows": draw_no_shadows,
-    "no sensor": draw_no_sensor,
 }
 
 
@@ -146,13 +123,13 @@ def pictures_of(variant: str, count: int, seed: int, out: Path) -> Any:
         return training.Pictures(*(arrays[name] for name in training.Pictures._fields))
 
 
-def learned_by(variant: str, options: argparse.Namespace) -> Any:
+def learned_by(variant: str, options: Options) -> Any:
     """1,000 of the pictures that a variant's network learned from."""
     cut = pictures_of(variant, options.pictures, LEARNED, options.out)
     return training.middle_of(training.Pictures(*(values[:1000] for values in cut)))
 
 
-def network_of(variant: str, labeled: Any, options: argparse.Namespace) -> torch.nn.Module:
+def network_of(variant: str, labeled: Any, options: Options) -> torch.nn.Module:
     """The network that has seen a variant and labeled photographs, trained or from the folder."""
     trained_from = f"{options.pictures}-{options.samples}-{options.seed}"
     if labeled is not None:
@@ -186,19 +163,7 @@ def page(network: torch.nn.Module, photos: Any, path: Path, count: int = 50) -> 
     cv2.imwrite(str(path), np.vstack(rows)[..., ::-1])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--photos", type=Path, required=True)
-    parser.add_argument("--reference", type=Path, required=True)
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
-    parser.add_argument("--pictures", type=int, default=12000)
-    parser.add_argument("--samples", type=int, default=240000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--photographs", type=int, default=0)
-    parser.add_argument("--page", type=Path)
-    add_save(parser)
-    options = parser.parse_args()
+def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     print(describe())
     some, photos = training.split(
@@ -239,4 +204,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

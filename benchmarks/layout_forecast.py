@@ -10,7 +10,6 @@ python -m benchmarks.layout_forecast FOLDER [--labelers] [--frames 60000] [--sam
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import time
@@ -21,27 +20,17 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.record import describe
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from benchmarks.record import describe, run
+from gloves import MarkerLayout, MarkerPlace, load_layout
+from handsim import load_rig
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
-from handsim.space.rig import load_rig
-from track.glove_score import (
-    CAPTURES,
-    FRAMES,
-    METHODS,
-    NOISE,
-    WORK,
-    LayoutScore,
-    mean_trial,
-    score_layout,
-    try_layout,
-)
+from track import LayoutScore
+from track.glove_score import CAPTURES, FRAMES, METHODS, NOISE, WORK, mean_trial, score_layout, try_layout
 from track.kinematics.pose_solver import PoseSolver
+from train import Labeler, load_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_poses
 from train.labelers.layout_labeler import fine_tuned_labeler, learned_labeler
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
@@ -49,17 +38,11 @@ FEWEST_MARKERS = 4  # of a pose
 Figures = dict[str, Any]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="training sets, runs and results")
-    parser.add_argument("--labelers", action="store_true", help="train a labeler of each layout, too")
-    parser.add_argument("--frames", type=int, default=60_000, help="of each training set")
-    parser.add_argument("--samples", type=int, default=300_000, help="of each training: minutes on one core")
-    options = parser.parse_args()
+def main(folder: Path, labelers: bool = False, frames: int = 60_000, samples: int = 300_000) -> None:
     print(describe("torch", "numpy"))
-    compare_captures(options.folder)
-    if options.labelers:
-        compare_labelers(options.folder, options.frames, options.samples)
+    compare_captures(folder)
+    if labelers:
+        compare_labelers(folder, frames, samples)
 
 
 def compare_captures(folder: Path) -> None:
@@ -258,4 +241,4 @@ def print_layout(layout: MarkerLayout, told: Figures, measured: Figures) -> None
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

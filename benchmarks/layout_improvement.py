@@ -8,15 +8,14 @@ python -m benchmarks.layout_improvement FOLDER [--minutes 3]
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.layout_forecast import chosen_layouts, stored, trial_figures
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout
+from benchmarks.record import Figures, describe, run, save_figures
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from track.glove_score import METHODS
@@ -27,22 +26,17 @@ FIRST, FRAMES = 80, 600  # of the fresh captures
 WHAT = "slots right of label, of track [%], joints' error [deg]; means of nine captures"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="layouts and results")
-    parser.add_argument("--minutes", type=float, default=3.0, help="of each search")
-    add_save(parser)
-    options = parser.parse_args()
+def main(folder: Path, minutes: float = 3.0, save: str | None = None) -> None:
     print(describe("torch", "numpy"))
     figures: Figures = {}
     better = np.zeros(3, int)
     for layout in hard_layouts():
-        folder = options.folder / layout.name
-        folder.mkdir(parents=True, exist_ok=True)
-        before, after = folder / "before.toml", folder / "after.toml"
+        path = folder / layout.name
+        path.mkdir(parents=True, exist_ok=True)
+        before, after = path / "before.toml", path / "after.toml"
         layout.save(before)
         if not after.exists():
-            command = ["glove", "improve", str(before), "--minutes", str(options.minutes)]
+            command = ["glove", "improve", str(before), "--minutes", str(minutes)]
             assert handsim([*command, "--captures", "0", "--out", str(after)]) == 0
         measured = {path.stem: outcome(path) for path in (before, after)}
         gained = np.subtract(measured["after"], measured["before"]) * (1, 1, -1)
@@ -51,7 +45,7 @@ def main() -> None:
             print(f"{layout.name} {when}: " + ", ".join(f"{value:.2f}" for value in values), flush=True)
             figures[f"{layout.name}_{when}"] = (f"Layout {layout.name} {when} glove improve: {WHAT}", values)
     print(f"better in {' / '.join(map(str, better))} of the layouts: {WHAT}")
-    save_figures(options.save, figures)
+    save_figures(save, figures)
 
 
 def hard_layouts() -> list[MarkerLayout]:
@@ -82,4 +76,4 @@ def outcome(path: Path) -> list[float]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -1,19 +1,19 @@
 """Live output: frames lost from a NatNet server to WebSocket and OSC clients, and the latency that is added.
 
 A simulated capture of two hands is replayed at 120 Hz by a process of its own, tracked here, and sent to two
-clients, which are processes of their own. In the middle the server is restarted, with another data port.
-The latency that is added to the tracker's own time is from the server's `sendto` to the client's `recv`.
+clients, which are processes of their own. In the middle the server is restarted. The latency that is added to
+the tracker's own time is from when the server takes up a frame to the client's `recv`.
 
 python -m benchmarks.live_output [--seconds 600]
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import socket
 import time
+from collections.abc import Iterable, Iterator
 from multiprocessing.sharedctypes import Synchronized
 from types import SimpleNamespace
 from typing import Any
@@ -23,15 +23,12 @@ from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
 from benchmarks.paper.take_evaluation import true_users
-from benchmarks.record import describe
-from gloves.takes.take import Take
-from track.sinks import open_sinks
-from track.streams import LOOPBACK, natnet
-from track.streams.live_stream import open_source
-from track.streams.natnet import ReplayServer, ServerInfo
-from track.tracker import Tracker, warm_up
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from benchmarks.record import describe, run
+from gloves import Take
+from track import ReplayServer, StreamedFrame, Tracker, open_sinks, open_source
+from track.streams import LOOPBACK
+from track.tracker import warm_up
+from train import load_labeler, simulate_take
 
 RATE = 120.0
 SPAWN = multiprocessing.get_context("spawn")
@@ -39,27 +36,18 @@ Times = Any  # a shared array of monotonic times [s] by frame
 
 
 class StampedServer(ReplayServer):
-    """A server that notes when it sent which frame, and sends them from a data port of its own."""
+    """A server that notes when it sends which frame."""
 
     def __init__(self, take: Take, port: int, first: int, count: int, times: Times) -> None:
-        rows = (first + np.arange(count)) % take.num_frames
         self._first, self._times = first, times
-        self._data = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._data.bind((LOOPBACK, 0))
+        turns, rows = np.divmod(first + np.arange(count), take.num_frames)
         ids = take.ids[rows].astype(np.int64)
-        ids[ids >= 0] += (
-            (first + np.arange(count))[:, None].repeat(ids.shape[1], 1)[ids >= 0] // take.num_frames * 100_000
-        )
+        ids = np.where(ids >= 0, ids + 100_000 * turns[:, None], ids)
         super().__init__(SimpleNamespace(points=take.points[rows], ids=ids, rate=RATE), port=port)
 
-    def _send_all(self, packet: bytes) -> None:
-        self._times[self._first + self.sent] = time.monotonic()
-        for client in self._clients:
-            self._data.sendto(packet, client)
-
-    def _send(self, packet: bytes, client: tuple[str, int]) -> None:
-        info = ServerInfo("benchmark", self._version, self._data.getsockname()[1], None)
-        super()._send(natnet.pack_server_info(info), client)
+    def _frame(self, number: int) -> StreamedFrame:
+        self._times[self._first + number] = time.monotonic()
+        return super()._frame(number)
 
 
 def serve(
@@ -108,15 +96,13 @@ def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half:
             times[first + last] = now
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=600.0)
-    frames = round(parser.parse_args().seconds * RATE)
+def main(seconds: float = 600.0) -> None:
+    frames = round(seconds * RATE)
     print(describe("numba", "torch", "websockets", "python-osc"))
     take, half = simulate_take(kind="hand-hand", num_frames=1200), frames // 2
     sent, websocket, osc = (SPAWN.Array("d", frames, lock=False) for _ in range(3))
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
-    command, web, bundles = _free_ports(3)
+    command, web, bundles = _free_ports(socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM)
     tracker = Tracker(true_users(take), load_labeler("dense19"))
     warm_up(tracker.hands, load_labeler("dense19"))
     ranges = [(0, half), (half, frames - half)]
@@ -167,12 +153,9 @@ def _tell(sent: np.ndarray, own: np.ndarray, arrived: dict[str, np.ndarray]) -> 
         )
 
 
-def _free_ports(count: int) -> list[int]:
-    sockets = [
-        socket.socket(socket.AF_INET, kind)
-        for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM)
-    ]
-    for one in sockets[:count]:
+def _free_ports(*kinds: int) -> list[int]:
+    sockets = [socket.socket(socket.AF_INET, kind) for kind in kinds]
+    for one in sockets:
         one.bind((LOOPBACK, 0))
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:
@@ -181,4 +164,4 @@ def _free_ports(count: int) -> list[int]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -1,20 +1,16 @@
-"""A live stream for an hour, on a bad network: frames lost, memory, lag, and what is on disk after a kill.
+"""A live stream for an hour, on a bad network: frames lost, memory, and what is on disk after a kill.
 
 Two hands at 120 Hz are tracked and recorded as `handsim track --live` does it. The server sends as fast as
 the tracker reads. On the way 5 % of the packets are dropped, as many doubled, overtaken by the next one, and
 corrupted; others bring junk, wild times and frames of another sender. The server restarts now and then, on
-its port; another one on another port is not heard. Then the command itself is killed. At last two hands come
-at 120 Hz for a minute while as many processes as there are cores do nothing but compute: how late the command
-sends them on, and what it drops.
+its port; another one on another port is not heard. Then the command itself is killed.
 
-python -m benchmarks.live_stream [soak kill lag] [--seconds 3600] [--no-hands]
+python -m benchmarks.live_stream [soak kill] [--seconds 3600] [--no-hands]
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import os
 import signal
 import socket
@@ -26,30 +22,27 @@ import time
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
+import tyro
 
 from benchmarks.paper.take_evaluation import true_users
-from benchmarks.record import describe
+from benchmarks.record import describe, resident_memory, run
+from gloves import Take, load_take
 from gloves.takes.archives import GrownArchive
-from gloves.takes.take import Take, load_take
-from track.frames import StreamedFrame
-from track.recorder import Recorder
+from track import LiveStream, Recorder, ReplayServer, StreamedFrame, Tracker
 from track.streams import LOOPBACK, natnet
-from track.streams.live_stream import MOST_LAG, LiveStream
-from track.streams.natnet import Kind, ReplayServer, ServerInfo, open_stream
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import simulate_take
+from track.streams.natnet import Kind, ServerInfo, open_stream
+from train import load_labeler, simulate_take
 
 RATE = 120.0
 SHARE = 0.05  # of the packets, for each kind of damage
 RARE = 0.002  # of the packets, for junk, wild times and other senders
-AHEAD = 40  # packets that may wait for the reader
+AHEAD = 40  # frames that may wait for the reader
 RESTARTS = 4
 WARM = 10.0  # [s] of the stream before memory is measured
 SETTLED = 12.0  # [s] of a recording before it is killed: the size of the hands is measured first
-LAG_SECONDS = 60.0  # of the stream on a busy machine
 PROGRAM = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
 WILD = (1e17, 1e9, -1e9, np.inf, 7e4, -3.0)
 
@@ -62,8 +55,8 @@ class BadServer(threading.Thread):
         self.lost = {"dropped": 0, "corrupted": 0}
         self.good = np.zeros(frames, dtype=bool)
         """Which frames were sent undamaged."""
-        self.sent = self.read = 0
-        """Numbers of packets that were sent, and that the reader has had."""
+        self.read = 0
+        """The last frame that the reader has had."""
         self.segment = -(-frames // (RESTARTS + 1))
         """Frames from one start of the server to the next."""
         self._start = 0
@@ -85,7 +78,7 @@ class BadServer(threading.Thread):
                 self._socket = _socket(self._port)
             client = self._greet()
             for number in range(start, min(start + self.segment, self._frames)):
-                while self.sent > self.read + AHEAD:
+                while number > self.read + AHEAD:
                     time.sleep(0.001)
                 self._send(number - start, client)
             self._flush(client)
@@ -143,7 +136,6 @@ class BadServer(threading.Thread):
             self._say(natnet.pack(Kind.FRAME, self._rng.bytes(300)), client, self._stranger)
 
     def _say(self, packet: bytes, client: tuple[str, int], sender: socket.socket | None = None) -> None:
-        self.sent += 1
         (sender or self._socket).sendto(packet, client)
 
     def _corrupt(self, packet: bytes) -> bytes:
@@ -173,22 +165,19 @@ def _socket(port: int = 0) -> socket.socket:
     return one
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", help="some of soak, kill, lag; all when not given")
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of the bad stream, at 120 Hz")
-    parser.add_argument("--no-hands", action="store_true", help="only other markers: the tracker has no work")
-    options = parser.parse_args()
-    parts, pace = set(options.parts or ("soak", "kill", "lag")), np.inf
+def main(
+    parts: tyro.conf.Positional[tuple[Literal["soak", "kill"], ...]] = ("soak", "kill"),
+    seconds: float = 3600.0,
+    hands: bool = True,
+) -> None:
+    pace = np.inf
     print(describe("numba", "torch"))
     take = simulate_take(kind="hand-hand", num_frames=1200)
     with tempfile.TemporaryDirectory() as folder:
         if "soak" in parts:
-            pace = soak(take, round(options.seconds * RATE), not options.no_hands, Path(folder))
+            pace = soak(take, round(seconds * RATE), hands, Path(folder))
         if "kill" in parts:
             kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream
-        if "lag" in parts:
-            lag(take, Path(folder))
 
 
 def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
@@ -208,12 +197,12 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
             for frame in stream:
                 tracked = tracker.step(frame.points, frame.ids, frame.time)
                 recorder.add(frame, tracked)
-                server.read = packets.packets
                 first += server.segment * frame.restarted
                 if not frame.silent and first + frame.number < frames:
-                    there[first + frame.number] = True
+                    server.read = first + frame.number
+                    there[server.read] = True
                 if not frame.silent and recorder.num_frames % 600 == 0:
-                    memory.append((frame.time, _resident()))
+                    memory.append((frame.time, resident_memory()))
             seconds, size = time.perf_counter() - start, recorder.part.stat().st_size
             print(f"{frames} frames in {seconds:.0f} s, {frames / RATE / seconds:.1f} times their own pace")
             print(f"lost on the way: {server.lost}; arrived undamaged: {server.good.sum()}")
@@ -225,7 +214,7 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
             print(f"on disk while recording: {size / recorded / 1e3:.2f} kB a frame")
             at = time.perf_counter()
             recorder.finish(stream.counts)
-    print(f"written as .npz in {time.perf_counter() - at:.0f} s; {_resident() / 1e6:.0f} MB resident")
+    print(f"written as .npz in {time.perf_counter() - at:.0f} s; {resident_memory() / 1e6:.0f} MB resident")
     if recorded < 200_000:
         loaded = load_take(out)
         gaps = np.diff(loaded.times).max()
@@ -259,62 +248,5 @@ def kill(take: Take, rate: float, folder: Path) -> None:
         print(f"{number.name}: exit code {code}, {name} has {len(numbers)} frames, {told}")
 
 
-class StampedServer(ReplayServer):
-    """A server that notes when it sent which frame."""
-
-    def __init__(self, take: Take) -> None:
-        self.stamps: list[float] = []
-        super().__init__(take, loop=True)
-
-    def _send_all(self, packet: bytes) -> None:
-        self.stamps.append(time.monotonic())
-        super()._send_all(packet)
-
-
-def lag(take: Take, folder: Path) -> None:
-    """How late the command is on a machine all of whose cores are busy."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
-    over, heard = threading.Event(), []
-    listener = _socket()
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-    listener.settimeout(0.5)
-
-    def listen() -> None:
-        while not over.is_set():
-            try:
-                packet, now = listener.recv(1 << 16), time.monotonic()
-            except TimeoutError:
-                continue
-            if (document := json.loads(packet))["type"] == "frame" and not document["silent"]:
-                heard.append((document["number"], now))
-
-    thread = threading.Thread(target=listen)
-    thread.start()
-    address = "{}:{}".format(*listener.getsockname())
-    try:
-        with StampedServer(take) as server:
-            command = ["track", "--live", server.url, "--out", str(folder / "lag.npz")]
-            command += ["--seconds", str(LAG_SECONDS), "--send", f"udp://{address}"]
-            told = subprocess.run(
-                [sys.executable, "-c", PROGRAM, *command], capture_output=True, text=True, check=True
-            )
-    finally:
-        over.set()
-        thread.join()
-        for process in busy:
-            process.kill()
-    print(f"with {len(busy)} processes that compute beside it:", *told.stdout.splitlines()[2:5], sep="\n  ")
-    late = 1e3 * np.array([now - server.stamps[number] for number, now in heard])
-    began = int(np.argmax(late < 1e3 * MOST_LAG))
-    p50, p99, most = np.percentile(late[began:], [50, 99, 100])
-    print(f"from the server's sendto to the receiver of the hands, behind the first {began} frames:")
-    print(f"  p50 {p50:.0f} ms, p99 {p99:.0f} ms, {most:.0f} ms at most")
-
-
-def _resident() -> int:
-    """Memory of this process [bytes]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -1,12 +1,11 @@
 """Whether a hand tracker that was trained on photographs takes the renders for hands.
 
     python -m benchmarks.looks_like_a_hand OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
-        [--takes TRACKED.npz ...]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
 OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
 among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box
-takes 20 to 30 % of the frame. With --takes hands and poses are those of tracked takes instead.
+takes 20 to 30 % of the frame.
 OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
 
 The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
@@ -16,30 +15,28 @@ pose, tone, side and background; without, its command lines are.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.fit import attach
-from gloves.layout import load_layout
-from gloves.takes.take import Take, load_take
+from benchmarks.record import run
+from gloves import Take, attach, load_layout
+from handsim import Camera, HandModel, join_qpos, sample_shape
 from handsim.errors import PoseError
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import SIDES, Side, sample_shape
-from handsim.space.camera import Camera, preset
+from handsim.hand.shape import SIDES, Side
+from handsim.space.camera import preset
 from poses.shapes import gesture, make_valid
-from render.color_sensor import ExposureConfig, sample_exposure
+from render import Backgrounds, ExposureConfig, RenderedFrame
+from render.color_sensor import sample_exposure
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import Background, Backgrounds
+from render.scenery.backgrounds import Background
 from render.scenery.lights import Lighting, expose_for, sample_surroundings
 from render.skin.look import TONES
 from render.studio import FrameChoices, Moment, Studio
@@ -63,16 +60,6 @@ FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
 JUDGED: Final = "judged.json"
 GROUPS: Final = ("view", "pose", "tone", "side", "background")
-WRIST, INDEX, MIDDLE, LITTLE = 0, 5, 9, 17  # keypoints
-PARTS: Final = {
-    "wrist": [WRIST],
-    "knuckles": [5, 9, 13, 17],
-    "finger tips": [8, 12, 16, 20],
-    "thumb's last two": [3, 4],
-}
-Tracked = dict[Side, list[tuple[HandModel, np.ndarray]]]
-"""Hands of tracked takes, and their poses (T, 27); empty where gestures are drawn."""
-FLAT: Final = 5.0  # width of a palm that is seen edge on [px]
 
 
 class Case(NamedTuple):
@@ -89,35 +76,16 @@ class Case(NamedTuple):
     background: str
 
 
-def make_case(number: int, background: str, tracked: Tracked, rng: np.random.Generator) -> Case:
+def make_case(number: int, background: str, rng: np.random.Generator) -> Case:
     """Kinds go round by number; all else is drawn."""
-    pose = "tracked" if tracked else list(POSES)[number % 5]
+    pose = list(POSES)[number % 5]
     view = list(VIEWS)[number // 5 % 3]
     side = SIDES[number // 15 % 2]
     tone = list(TONES)[(number // 30 + number) % 6]
-    if tracked:
-        model, rows = tracked[side][int(rng.integers(len(tracked[side])))]
-        number = int(rng.integers(len(rows)))
-        name, qpos = f"pose {number}", rows[number]
-    else:
-        name = POSES[pose][int(rng.integers(len(POSES[pose])))]
-        model, qpos = sample_pose(name, side, rng)
+    name = POSES[pose][int(rng.integers(len(POSES[pose])))]
+    model, qpos = sample_pose(name, side, rng)
     camera = place_camera(model, qpos, view, rng)
     return Case(pose, view, tone, side, name, model, qpos, camera, background)
-
-
-def load_tracked(paths: list[Path]) -> Tracked:
-    """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
-    found: Tracked = {side: [] for side in SIDES} if paths else {}
-    for path in paths:
-        take = load_take(path)
-        for number, hand in enumerate(take.hands):
-            rows = take.qpos[np.isfinite(take.qpos[:, number, 0]), number, 7:]
-            found[hand.model.shape.side].append((hand.model, join_qpos(rows)))
-    for side in found:
-        if not found[side]:
-            sys.exit(f"no {side} hand in {', '.join(map(str, paths))}, expected both sides")
-    return found
 
 
 def sample_pose(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
@@ -181,23 +149,21 @@ def photograph(
     return dataclasses.replace(studio.photograph(moment, case.camera, choices), number=number)
 
 
-def frames_of(
-    name: str, hands: int, empty: int, seed: int, tracked: Tracked, cases: list[Case]
-) -> Iterator[RenderedFrame]:
+def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -> Iterator[RenderedFrame]:
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
         background, lighting = sample_surroundings(SETS[name], None, rng=rng)
-        cases.append(make_case(number, background.kind, tracked, rng))
+        cases.append(make_case(number, background.kind, rng))
         yield photograph(number, cases[-1], background, lighting, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
 
 
-def write_set(name: str, hands: int, empty: int, seed: int, tracked: Tracked, out: Path) -> None:
+def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
     """Pictures and judged.json of one set."""
     writer, cases = open_writer("coco", out), []
-    writer.write(0, frames_of(name, hands, empty, seed, tracked, cases))
+    writer.write(0, frames_of(name, hands, empty, seed, cases))
     writer.finish()
     coco = json.loads((out / "annotations.json").read_text(encoding="utf-8"))
     for image, case in zip(coco["images"], cases, strict=True):
@@ -206,7 +172,7 @@ def write_set(name: str, hands: int, empty: int, seed: int, tracked: Tracked, ou
     (out / JUDGED).write_text(json.dumps(coco), encoding="utf-8")
 
 
-def judge(program: Path | None, out: Path) -> None:
+def run_judge(program: Path | None, out: Path) -> None:
     """Run the judge on a set and print its figures, or print how to run it."""
     report = out / "report.json"
     line = ["--images", str(out), "--annotations", str(out / JUDGED), "--report", str(report)]
@@ -223,52 +189,24 @@ def judge(program: Path | None, out: Path) -> None:
         values = (row["found"], row["err"], row["pck_all"], row["side"])
         cells = "".join(f"{'-' if value is None else format(100 * value, '.1f'):>8s}" for value in values)
         print(f"{name:22s}{row['n']:6d}{cells}")
-    print_offsets(out / JUDGED, figures["hands"])
     empty = [found for _, found in figures["controls"]]
     if empty:
         print(f"pictures without a hand: one reported in {sum(empty)} of {len(empty)}")
 
 
-def print_offsets(annotations: Path, hands: list[dict[str, Any]]) -> None:
-    """How far the judge's keypoints lie from ours on the median hand, and its error without that.
-
-    Along the hand, from our wrist to the knuckle of the middle finger, in thousandths of the box's diagonal.
-    """
-    coco = json.loads(annotations.read_text(encoding="utf-8"))
-    known = {one["id"]: one for one in coco["annotations"]}
-    errors = []
-    for hand in hands:
-        truth = np.array(known[hand["ann"]]["keypoints"]).reshape(21, 3)[:, :2]
-        across = truth[INDEX] - truth[LITTLE]
-        ahead = (truth[MIDDLE] - truth[WRIST]) / np.linalg.norm(truth[MIDDLE] - truth[WRIST])
-        across -= ahead * (across @ ahead)
-        if hand["found"] and np.linalg.norm(across) > FLAT:
-            axes = np.stack([ahead, across / np.linalg.norm(across)], axis=1)
-            diagonal = np.linalg.norm(known[hand["ann"]]["bbox"][2:])
-            errors.append((np.array(hand["points"]) - truth) @ axes / diagonal)
-    if errors:
-        offsets = np.median(errors, axis=0)
-        rest = np.linalg.norm(errors - offsets, axis=-1).mean()
-        told = ", ".join(f"{name} {1e3 * offsets[rows, 0].mean():+.0f}" for name, rows in PARTS.items())
-        print(f"keypoints along the hand against ours: {told}; error without these offsets {100 * rest:.1f}")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--clean", type=int, default=300)
-    parser.add_argument("--mixed", type=int, default=300)
-    parser.add_argument("--empty", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--judge", type=Path, default=None)
-    parser.add_argument("--takes", type=Path, nargs="+", default=[])
-    options = parser.parse_args()
-    tracked = load_tracked(options.takes)
-    for name, hands, empty in (("clean", options.clean, 0), ("mixed", options.mixed, options.empty)):
-        if hands + empty:
-            write_set(name, hands, empty, options.seed, tracked, options.out / name)
-            judge(options.judge, options.out / name)
+def main(
+    out: Path,
+    clean: int = 300,
+    mixed: int = 300,
+    empty: int = 100,
+    seed: int = 0,
+    judge: Path | None = None,
+) -> None:
+    for name, hands, bare in (("clean", clean, 0), ("mixed", mixed, empty)):
+        if hands + bare:
+            write_set(name, hands, bare, seed, out / name)
+            run_judge(judge, out / name)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -5,32 +5,26 @@ python -m benchmarks.new_layout [--frames 170330] [--samples 800000]
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.record import add_save, describe, save_figures
+from benchmarks.record import describe, report, run
 from handsim.cli.main import main as handsim
 
 GLOVE = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WANTED, LIMIT = 0.93, 15 * 60
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=170_330)
-    parser.add_argument("--samples", type=int, default=800_000)
-    add_save(parser)
-    options = parser.parse_args()
+def main(frames: int = 170_330, samples: int = 800_000, save: str | None = None) -> None:
     print(describe("torch", "mujoco"))
     with tempfile.TemporaryDirectory() as folder:
         data, run = Path(folder) / "data", Path(folder) / "run"
         commands = (
             ["glove", "check", str(GLOVE), "--out", str(Path(folder) / "glove.png")],
-            ["generate", "--glove", str(GLOVE), "--num-frames", str(options.frames), "--out", str(data)],
-            ["train", str(data), "--samples", str(options.samples), "--out", str(run)],
+            ["generate", "--glove", str(GLOVE), "--num-frames", str(frames), "--out", str(data)],
+            ["train", str(data), "--samples", str(samples), "--out", str(run)],
         )
         begin = time.perf_counter()
         for command in commands:
@@ -50,8 +44,8 @@ def main() -> None:
         "clean": ("ten markers: slots right on clean frames [%]", 100 * clean),
         "minutes": ("minutes from the TOML file to the trained labeler", total / 60),
     }
-    save_figures(options.save, kept)
+    report(save, kept)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

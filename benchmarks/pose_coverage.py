@@ -10,17 +10,16 @@ each person's mean BackHand1-IndexMCP distance, aligned rigidly (Kabsch) and com
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from benchmarks.people import right_hands
-from benchmarks.record import add_save, describe, save_figures
+from benchmarks.record import describe, report, run
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
-from handsim.hand.model import HandModel, join_qpos
+from handsim import HandModel, join_qpos
 from handsim.space.transforms import rigid_fit
 from poses.shapes import sample_valid_angles
 
@@ -47,41 +46,32 @@ def nearest_rms(queries: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return result
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("captures", type=Path)
-    parser.add_argument("--poses", type=int, default=100_000)
-    parser.add_argument("--frames", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(
+    captures: Path, poses: int = 100_000, frames: int = 2000, seed: int = 0, save: str | None = None
+) -> None:
     print(describe("torch"))
-    rng = np.random.default_rng(arguments.seed)
+    rng = np.random.default_rng(seed)
     layout, model = load_layout("dense19"), HandModel.named("M")
-    qpos = join_qpos(sample_valid_angles(model, arguments.poses, rng=rng))
-    poses, _ = attach_markers(layout, model).markers(model, model.forward_kinematics(qpos))
+    qpos = join_qpos(sample_valid_angles(model, poses, rng=rng))
+    sampled, _ = attach_markers(layout, model).markers(model, model.forward_kinematics(qpos))
     first, second = layout.names.index("BackHand1"), layout.names.index("IndexMCP")
 
     def size(markers: np.ndarray) -> float:
         return float(np.linalg.norm(markers[:, first] - markers[:, second], axis=1).mean())
 
-    people = right_hands(arguments.captures, layout.names)
+    people = right_hands(captures, layout.names)
     total = sum(map(len, people.values()))
     errors = []
     for name, markers in people.items():
-        count = round(arguments.frames * len(markers) / total)
+        count = round(frames * len(markers) / total)
         chosen = markers[rng.choice(len(markers), count, replace=False)]
-        errors.append(1e3 * nearest_rms(chosen, poses * (size(markers) / size(poses))))
+        errors.append(1e3 * nearest_rms(chosen, sampled * (size(markers) / size(sampled))))
         print(f"{name}: {count} frames, median {np.median(errors[-1]):.2f} mm, "
               f"p95 {np.percentile(errors[-1], 95):.2f} mm")  # fmt: skip
     everyone = np.concatenate(errors)
-    print(
-        f"all: {len(everyone)} frames against {len(poses)} poses: median {np.median(everyone):.2f} mm, "
-        f"p90 {np.percentile(everyone, 90):.2f} mm, p95 {np.percentile(everyone, 95):.2f} mm"
-    )
-    what = f"nearest of {len(poses):,} sampled poses to {len(everyone):,} frames, 3D RMS median and p95 [mm]"
-    save_figures(arguments.save, {"all": (what, np.percentile(everyone, [50, 95]))})
+    what = f"nearest of {poses:,} sampled poses to {len(everyone):,} frames, 3D RMS median and p95 [mm]"
+    report(save, {"all": (what, np.percentile(everyone, [50, 95]))})
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -21,59 +21,53 @@ The size of the hands is measured (`handsim track --size auto`). With --label th
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 import torch
 
-from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.layout import load_layout
-from track.captures import label_capture
-from track.frames import StreamedFrame
+from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Condition, Scene, make_scene
+from benchmarks.record import Figures, describe, run, save_figures
+from gloves import load_layout
+from track import StreamedFrame, Tracker, label_capture
 from track.hand_size import fit_size, sample_frames
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from train import load_labeler
 
 SIDES = ("right", "left")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS)
-    parser.add_argument("--frames", type=int, default=0, help="of each capture at most; all when 0")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--label", action="store_true", help="label instead of tracking")
-    add_save(parser)
-    options = parser.parse_args()
+def main(
+    data: Path,
+    conditions: tuple[Condition, ...] = CONDITIONS,
+    frames: int = 0,
+    seed: int = 0,
+    label: bool = False,
+    save: str | None = None,
+) -> None:
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
-    print(
-        "frames right [%] | " + " | ".join(options.conditions) + " | median, p99 of the time of a frame [ms]"
-    )
+    print("frames right [%] | " + " | ".join(conditions) + " | median, p99 of the time of a frame [ms]")
     table: list[list[float]] = []
     figures: Figures = {}
-    conditions = ", ".join(options.conditions)
-    for folder in sorted(options.data.glob("User*/capture*")):
+    for folder in sorted(data.glob("User*/capture*")):
         name, row, times = "/".join(folder.parts[-2:]), list[float](), []
-        for condition in options.conditions:
-            scene = make_scene(folder, condition, seed=options.seed, frames=options.frames)
-            right, seconds = (label if options.label else track)(scene)
+        for condition in conditions:
+            scene = make_scene(folder, condition, seed=seed, frames=frames)
+            right, seconds = (labeled if label else tracked)(scene)
             row.append(100.0 * right.mean())
             times.append(1e3 * seconds)
         table.append(row)
         p50, p99 = np.percentile(np.concatenate(times), [50, 99])
         print_row(f"{name}, {'40' if name in FAST else '120'} Hz", row, f" | {p50:.2f}, {p99:.1f}")
-        figures[name.lower().replace("/", "_")] = (f"frames right [%] of {name}: {conditions}", row)
+        figures[name.lower().replace("/", "_")] = (
+            f"frames right [%] of {name}: {', '.join(conditions)}",
+            row,
+        )
     for name, values in (("mean", np.mean(table, axis=0)), ("worst", np.min(table, axis=0))):
         print_row(name, values)
-        figures[name] = (f"frames right [%] over the captures, {name}: {conditions}", values)
-    save_figures(options.save, figures)
+        figures[name] = (f"frames right [%] over the captures, {name}: {', '.join(conditions)}", values)
+    save_figures(save, figures)
 
 
 def print_row(name: str, values: object, rest: str = "") -> None:
@@ -81,7 +75,7 @@ def print_row(name: str, values: object, rest: str = "") -> None:
     print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values) + rest, flush=True)  # type: ignore[attr-defined]
 
 
-def label(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def labeled(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The same for `handsim label`; the computing time is the mean one, the size measured included."""
     start = perf_counter()
     take = label_capture(scene.capture(), glove="dense19")
@@ -109,7 +103,7 @@ def tracker_of(scene: Scene) -> tuple[list[StreamedFrame], Tracker]:
     return frames, Tracker(size.hands(SIDES), labeler)
 
 
-def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def tracked(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Which counted frames are right, and the computing time of each frame [s]."""
     seen = np.isfinite(scene.points[..., 0])
     frames, tracker = tracker_of(scene)
@@ -124,4 +118,4 @@ def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

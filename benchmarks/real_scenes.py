@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from gloves.captures.capture import Capture
-from gloves.layout import load_layout
+from gloves import Capture, load_layout
 from gloves.optics.reconstruction import number_runs
 
-CONDITIONS = ("clean", "gaps", "close", "new-ids", "exchanged-ids")
+Condition = Literal["clean", "gaps", "close", "new-ids", "exchanged-ids"]
+CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 FAST = {"User1/capture1", "User2/capture1", "User2/capture3"}  # three times as fast as 120 Hz would show
 NAMES = load_layout("dense19").names
 _DARK = 0.5  # [s] between two sequences

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
+import tyro
 
 from handsim import __version__
 
@@ -36,10 +37,35 @@ def describe(*packages: str) -> str:
     return f"Python {platform.python_version()}, {', '.join(versions)}; {processor}, {os.cpu_count()} cores"
 
 
-def add_save(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--save NAME`, whose value is the first argument of `save_figures`."""
-    what = "keep the figures as benchmarks/figures/NAME.json, of which make results makes docs/results.md"
-    parser.add_argument("--save", metavar="NAME", help=what)
+def run(main: Callable[..., None], description: str | None) -> None:
+    """Call a benchmark's function with the words of the command line.
+
+    Args:
+        main: Parameters without a default are positional, others options; `save` is for `save_figures`.
+        description: What the help begins with.
+    """
+    tyro.cli(
+        main, description=description, config=(tyro.conf.PositionalRequiredArgs, tyro.conf.FlagCreatePairsOff)
+    )
+
+
+def report(save: str | None, figures: Figures) -> None:
+    """Print the figures of a benchmark and keep them, see `save_figures`."""
+    for what, value in figures.values():
+        print(f"{what}: {_rounded(value)}")
+    save_figures(save, figures)
+
+
+def timed(job: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    """Time of a job [s]."""
+    start = clock()
+    job()
+    return clock() - start
+
+
+def resident_memory() -> int:
+    """Memory of this process [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def save_figures(name: str | None, figures: Figures, folder: Path = FOLDER) -> Path | None:

@@ -1,10 +1,6 @@
-"""Accuracy of drawn depth, and memory; and the pictures that `benchmarks.speed` times.
+"""Accuracy of drawn depth and ids against embree; and the pictures that `benchmarks.speed` times.
 
-    python -m benchmarks.rendering [accuracy memory stream] [--frames 200 --images 20000]
-
-accuracy: depth and ids against embree through trimesh on the same triangles.
-memory: resident memory over many pictures.
-stream: resident memory of a `DataLoader` of the stream, with a worker a core, over as many as --frames.
+    python -m benchmarks.rendering accuracy [--frames 200]
 
 What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
 keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
@@ -14,38 +10,35 @@ skin), each for depth and for colors.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import mujoco
 import numpy as np
 import trimesh
+import tyro
 from torch.utils.data import DataLoader
 
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.takes.take import Take
+from benchmarks.record import Figures, describe, report, run, timed
+from gloves import Take
 from handsim.app.workers import run_jobs
-from render.config import RenderConfig
+from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
 from render.painting.rasterizer import join, rasterize
 from render.session import Drawing
 from render.skin.look import ALL_TONES
-from render.stream import PictureStream
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
-from render.viewpoints import ViewConfig, Viewpoints
-from train.simulation.takes import simulate_take
+from render.viewpoints import Viewpoints
+from train import simulate_take
 
-SECTIONS: Final = ("accuracy", "memory", "stream")
 CROP, BATCH = 256, 16  # of the stream's pictures [px], and in a batch
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
@@ -83,12 +76,7 @@ def draw_and_write(config: RenderConfig, folder: Path, frames: int, shard: int) 
 def rate(job: Callable[[], object], count: int) -> float:
     """Pictures per second, the median of some rounds after a warm-up."""
     job()
-    seconds = []
-    for _ in range(ROUNDS):
-        start = time.perf_counter()
-        job()
-        seconds.append(time.perf_counter() - start)
-    return count / float(np.median(seconds))
+    return count / float(np.median([timed(job) for _ in range(ROUNDS)]))
 
 
 def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
@@ -160,28 +148,6 @@ def stream_batches() -> Iterator[object]:
     return batches
 
 
-def stream_memory(images: int) -> Figures:
-    batches, megabytes = stream_batches(), list[float]()
-    for number in range(-(-images // BATCH)):
-        next(batches)
-        if number % max(1, images // BATCH // 4) == 0:
-            megabytes.append(sum(_megabytes(process) for process in ("self", *_children())))
-    print(f"\nresident memory of a stream: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
-    what = "resident memory of all processes of a stream, first | last [MB]"
-    return {"memory": (what, (megabytes[0], megabytes[-1]))}
-
-
-def _children() -> list[str]:
-    me = os.getpid()
-    return Path(f"/proc/{me}/task/{me}/children").read_text().split()
-
-
-def _megabytes(process: str) -> float:
-    """Resident memory."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
 def accuracy(frames: int) -> Figures:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -205,14 +171,10 @@ def accuracy(frames: int) -> Figures:
         off.append(1e3 * np.abs(depth - mine.depth)[both])
         agree.append(np.mean(part == mine.parts))
     errors = np.concatenate(off)
-    print(
-        f"\nagainst embree: depth median {np.median(errors):.2g} mm, 99.9 % within "
-        f"{np.quantile(errors, 0.999):.2g} mm; ids and silhouettes agree on {100 * min(agree):.3f} % of the "
-        "pixels or more"
-    )
     return {
         "median": ("drawn depth against embree, median [mm]", np.median(errors)),
         "most": ("drawn depth against embree, 99.9 % within [mm]", np.quantile(errors, 0.999)),
+        "agree": ("pixels on which ids and silhouettes agree, at least [%]", 100 * min(agree)),
     }
 
 
@@ -221,36 +183,15 @@ def bare_studio(take: Take) -> Studio:
     return Studio(take.hands, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng))
 
 
-def memory(images: int) -> Figures:
-    frames, megabytes = 200, list[float]()
-    print(f"\nresident memory over {images} pictures (colors, depth, ids)")
-    for shard in range(images // frames):
-        draw(COLORS, frames, shard)
-        if shard % max(1, images // frames // 8) == 0:
-            megabytes.append(_megabytes("self"))
-            print(f"  {(shard + 1) * frames:6d}: {megabytes[-1]:.1f} MB", flush=True)
-    few = min(1, len(megabytes) - 1)
-    return {
-        "early": ("resident memory at the second look [MB]", megabytes[few]),
-        "late": ("resident memory at the last look [MB]", megabytes[-1]),
-    }
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("section", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
-    parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--images", type=int, default=20000)
-    add_save(parser)
-    options = parser.parse_args()
-    if options.save and len(options.section) != 1:
-        parser.error("--save keeps the figures of one section")
+def main(
+    section: tyro.conf.Positional[Literal["accuracy"]] = "accuracy",
+    *,
+    frames: int = 200,
+    save: str | None = None,
+) -> None:
     print(describe())
-    for name in options.section or SECTIONS:
-        section = {"accuracy": accuracy, "stream": stream_memory}.get(name, memory)
-        figures = section(options.images if name == "memory" else options.frames)
-        save_figures(options.save, figures)
+    report(save, accuracy(frames))
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -11,7 +11,6 @@ The rigs are written into the folder, for `python -m benchmarks.paper cameras --
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import tempfile
 from pathlib import Path
@@ -19,15 +18,14 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.record import describe
+from benchmarks.record import describe, run
+from gloves import load_layout
 from gloves.captures.capture import run_lengths
-from gloves.layout import load_layout
-from handsim.space.camera import look_at
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs, load_rig
-from train.forecast.rig_forecast import Forecast, forecast, light_work, sample_work
-from train.forecast.rig_plan import plan_rig
+from handsim import CameraRig, load_rig, look_at
+from handsim.space.rig import ROOM_CENTER, list_rigs
+from train import Forecast, plan_rig, simulate_take
+from train.forecast.rig_forecast import forecast, light_work, sample_work
 from train.simulation.scenes import SimulatedKind
-from train.simulation.takes import simulate_take
 
 GLOVE = "dense19"
 CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
@@ -45,17 +43,13 @@ ERROR = "error [mm]"
 COUNTS = (4, 5, 6, 8, 10, 12)  # cameras of the rigs that are planned and hung by hand
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=1500, help="of each capture")
-    parser.add_argument("--folder", type=Path, help="where the rigs are written; a temporary one by default")
-    options = parser.parse_args()
+def main(frames: int = 1500, folder: Path | None = None) -> None:
     print(describe("numpy", "numba"))
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.folder or Path(temporary)
+        folder = folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        compare(folder, options.frames)
-        compare_placements(folder, options.frames)
+        compare(folder, frames)
+        compare_placements(folder, frames)
 
 
 def compare(folder: Path, frames: int) -> None:
@@ -158,4 +152,4 @@ def captured(rig: Path, frames: int, kind: SimulatedKind, seed: int) -> tuple[fl
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -10,7 +10,6 @@ takes longer than that is the scheduler's, and that of this machine's cores, whi
 
 from __future__ import annotations
 
-import argparse
 import resource
 import tempfile
 import time
@@ -21,15 +20,11 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.held_out import held_out_markers
-from benchmarks.record import describe
+from benchmarks.record import describe, run
 from handsim.app.workers import chosen_workers, run_jobs
-from render.config import RenderConfig
-from render.session import render_take
-from train.data.batches import Corruption, corrupt
-from train.labelers.storage import load_labeler
+from render import RenderConfig, render_take
+from train import Corruption, GenerateSettings, corrupt, load_labeler, simulate_take
 from train.simulation.generation import make_dataset
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings
 
 SHARD = 1.0  # [s] that a shard sleeps
 EACH = 8  # shards of each worker
@@ -44,12 +39,7 @@ class Cost(NamedTuple):
     num_bytes: float
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--core-hour", type=float, default=0.045)
-    parser.add_argument("--gigabyte-month", type=float, default=0.023)
-    parser.add_argument("--workers", type=int, nargs="*", default=[4, 16])
-    options = parser.parse_args()
+def main(core_hour: float = 0.045, gigabyte_month: float = 0.023, workers: tuple[int, ...] = (4, 16)) -> None:
     print(describe("dask", "torch"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -60,10 +50,10 @@ def main() -> None:
             "labeled hands": label_cost(),
         }
         for kind, one in items.items():
-            print_cost(kind, one, options)
+            print_cost(kind, one, core_hour, gigabyte_month)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         print(f"largest memory so far: {peak / 1e6:.2g} GB")
-        for count in options.workers:
+        for count in workers:
             share = efficiency(count)
             print(f"{count} workers: {100 * share:.0f} % of their time in shards of a second", flush=True)
 
@@ -102,15 +92,15 @@ def label_cost(count: int = 6000) -> Cost:
     return Cost((time.process_time() - start) / count, 0.0)
 
 
-def print_cost(kind: str, one: Cost, options: argparse.Namespace) -> None:
+def print_cost(kind: str, one: Cost, core_hour: float, gigabyte_month: float) -> None:
     hours = one.seconds / 3600.0
     print(f"{kind}: {1e-3 / hours:.0f} thousand a core-hour, {one.num_bytes / 1e3:.2f} kB each")
     for name, count in (("million", 1e6), ("billion", 1e9)):
         core_hours, gigabytes = count * hours, count * one.num_bytes / 1e9
         print(
             f"  {name}: {plain(core_hours)} core-hours, {plain(gigabytes)} GB; "
-            f"${plain(options.core_hour * core_hours)}, "
-            f"and ${plain(options.gigabyte_month * gigabytes)} a month"
+            f"${plain(core_hour * core_hours)}, "
+            f"and ${plain(gigabyte_month * gigabytes)} a month"
         )
 
 
@@ -138,4 +128,4 @@ def efficiency(count: int) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -8,7 +8,6 @@ pictures looked up through lenses. The least of the repeats, and their median: t
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,8 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.record import describe
-from handsim.space.camera import Camera, Lens, pinhole
+from benchmarks.record import describe, run, timed
+from handsim import Camera, Lens
+from handsim.space.camera import pinhole
 from render.color_sensor import Exposure, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DEPTH_NOISES, SENSORS, apply_depth_noise, reflectance_of
 from render.painting.rasterizer import faces_for, warp, warp_depth, warp_normals
@@ -39,21 +39,12 @@ def sphere_and_wall(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def clock(name: str, job: Callable[[], Any], repeats: int) -> None:
     """Print how long a job takes."""
     job()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        job()
-        times.append(1e3 * (time.process_time() - start))
+    times = [1e3 * timed(job, time.process_time) for _ in range(repeats)]
     print(f"  {name:34s} {min(times):6.2f} ms   median {np.median(times):6.2f}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--height", type=int, default=480)
-    parser.add_argument("--repeats", type=int, default=50)
-    arguments = parser.parse_args()
-    size, repeats = (arguments.width, arguments.height), arguments.repeats
+def main(width: int = 640, height: int = 480, repeats: int = 50) -> None:
+    size = (width, height)
     cv2.setNumThreads(1)
     print(describe("opencv-python-headless"))
     rng = np.random.default_rng(0)
@@ -108,4 +99,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -1,42 +1,35 @@
-"""How right and how fast lines of sight past the skin are, what capsules miss, and what each rig sees.
+"""How right lines of sight past the skin are, what capsules miss, and what each rig sees.
 
     python -m benchmarks.sight [--poses 500 --seed 0]
 
 One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference
-for every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of
-one core; the floor of a frame is its kinematics, skinning and refit, which come before the first line.
+for every line is embree (through trimesh, package embreex) on the same meshes.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.record import Figures, describe, report, run
+from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.layout import load_layout
 from gloves.optics.visibility import (
     MAX_FACING,
-    clear_of_body,
     clear_of_mesh,
-    free_rays,
     hand_tree,
     visible_cameras,
 )
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import Side, sample_shape
-from handsim.space.rig import CameraRig, list_rigs, load_rig
+from handsim import CameraRig, HandModel, join_qpos, load_rig, sample_shape
+from handsim.hand.shape import Side
+from handsim.space.rig import list_rigs
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
 
 CENTER = np.array([0.0, 0.0, 1.1])
 POSES_A_HAND = 50
-CHUNK = 128
 
 
 class Scene(NamedTuple):
@@ -93,29 +86,20 @@ def agreement(poses: int, rng: np.random.Generator) -> Figures:
         asked.append(wanted)
         capsules.append(visible_cameras(scene.markers, scene.normals, rig, scene.segments, radii))
     oracle, ours, facing, flesh = (np.concatenate(each) for each in (embree, skin, asked, capsules))
-    both = (ours & facing).sum(-1) >= 2
-    print(f"\nskin against embree, {ours.size:,} lines (all cameras, facing or not), {both.size:,} markers")
-    print(f"  lines alike {(oracle == ours).mean():.4%}, of those in view and facing "
-          f"{(oracle == ours)[facing].mean():.4%}")  # fmt: skip
-    print(
-        f"  markers alike (seen by 2 cameras or not) {(both == ((oracle & facing).sum(-1) >= 2)).mean():.4%}"
-    )
-    seen, loose = ours & facing, flesh.sum(-1) >= 2
-    print("\ncapsules against skin, of the lines in view and facing")
-    print(f"  capsules see, skin hides {(flesh & ~seen)[facing].mean():.3%}; "
-          f"the reverse {(seen & ~flesh)[facing].mean():.3%}")  # fmt: skip
-    print(f"  markers only capsules see {(loose & ~both).mean():.3%}, skin {(both & ~loose).mean():.3%}")
-    names = load_layout("dense19").names
-    print(f"  markers missing, capsules -> skin: all {(~loose).mean():.2%} -> {(~both).mean():.2%}")
-    for number, name in enumerate(names):
-        print(f"    {name:10s} {(~loose[:, number]).mean():.2%} -> {(~both[:, number]).mean():.2%}")
-    hidden, clear = 100 * (flesh & ~seen)[facing].mean(), 100 * (seen & ~flesh)[facing].mean()
-    missing = [100 * (~loose).mean(), 100 * (~both).mean()]
+    both, loose = (ours & facing).sum(-1) >= 2, flesh.sum(-1) >= 2
+    seen, alike = ours & facing, oracle == ours
+    markers = both == ((oracle & facing).sum(-1) >= 2)
     return {
-        "lines": ("lines of sight that agree with embree", int((oracle == ours).sum())),
-        "false_clear": ("lines in view and facing that capsules see and the skin hides [%]", hidden),
-        "false_hidden": ("the reverse [%]", clear),
-        "missing": ("markers missing, capsules and skin [%]", missing),
+        "all": ("lines of sight past the skin, facing or not", ours.size),
+        "lines": ("lines of sight that agree with embree", int(alike.sum())),
+        "facing": ("of those in view and facing [%]", 100 * alike[facing].mean()),
+        "markers": ("markers that are seen by two cameras, or not, as embree says [%]", 100 * markers.mean()),
+        "false_clear": (
+            "lines in view and facing that capsules see and the skin hides [%]",
+            100 * (flesh & ~seen)[facing].mean(),
+        ),
+        "false_hidden": ("the reverse [%]", 100 * (seen & ~flesh)[facing].mean()),
+        "missing": ("markers missing, capsules and skin [%]", [100 * (~loose).mean(), 100 * (~both).mean()]),
     }
 
 
@@ -132,74 +116,12 @@ def rigs(poses: int, rng: np.random.Generator) -> None:
               f"{(seen >= 2).mean():.1%} {(seen >= 3).mean():.1%}; {seen.mean():.2f}")  # fmt: skip
 
 
-def cost(job: Callable[[], object]) -> float:
-    """Processor time [us] per frame of a job over CHUNK frames, median of nine."""
-    job()
-    times = []
-    for _ in range(9):
-        start = time.process_time()
-        job()
-        times.append(time.process_time() - start)
-    return float(np.median(times)) / CHUNK * 1e6
-
-
-def speeds(rng: np.random.Generator) -> None:
-    rig = load_rig("figure5")
-    cameras, tree = rig.positions, hand_tree()
-    hands = []
-    for side, offset in (("right", -0.06), ("left", 0.06)):
-        model = HandModel.named("M", side=side)  # type: ignore[arg-type]
-        hands.append(make_scene(model, CHUNK, CENTER, rng))
-        shift = (
-            CENTER + np.array([0.0, offset, 0.0]) - hands[-1].qpos[:, None, :3]
-        )  # two hands close together
-        hands[-1] = hands[-1]._replace(
-            qpos=np.concatenate([hands[-1].qpos[:, :3] + shift[:, 0], hands[-1].qpos[:, 3:]], axis=1),
-            skin=hands[-1].skin + shift, markers=hands[-1].markers + shift,
-            segments=hands[-1].segments + shift[:, None],
-        )  # fmt: skip
-    markers = np.concatenate([hand.markers for hand in hands], axis=1)
-    normals = np.concatenate([hand.normals for hand in hands], axis=1)
-    wanted = in_view_and_facing(markers, normals, rig)
-    nothing = np.zeros_like(wanted)
-
-    def past_both(lines: np.ndarray) -> np.ndarray:
-        for hand in hands:
-            lines = clear_of_mesh(tree, hand.skin, markers, cameras, lines)
-        return lines
-
-    count = wanted.sum() / CHUNK
-    bones = cost(lambda: [hand.model.forward_kinematics(hand.qpos) for hand in hands])
-    skinning = cost(lambda: [hand.model.skin(hand.qpos) for hand in hands]) - bones
-    refit = sum(cost(lambda h=hand: clear_of_mesh(tree, h.skin, markers, cameras, nothing)) for hand in hands)  # type: ignore[misc]
-    rays = cost(lambda: past_both(wanted)) - refit
-    facing = cost(lambda: in_view_and_facing(markers, normals, rig))
-    flesh = cost(lambda: [free_rays(markers, cameras, h.segments, h.model.capsules.radii) for h in hands])
-    poses = np.tile(np.eye(4), (CHUNK, 1, 1))
-    poses[:, :3, 3] = CENTER
-    body = cost(lambda: clear_of_body(tree, poses, markers, cameras, wanted))
-    whole = bones + skinning + refit + rays
-    print(f"\ntwo hands, {markers.shape[1]} markers, {len(cameras)} cameras, two skins of "
-          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, us per frame")  # fmt: skip
-    print(f"  bones {bones:.0f}, skinning {skinning:.0f}, refit {refit:.0f}, rays {rays:.0f} "
-          f"({count:.0f} lines, each past two skins: {rays / count * 1e3:.0f} ns): {whole:.0f}")  # fmt: skip
-    print(f"  {1e6 / whole:,.0f} frames/s; floor without a single line {1e6 / (whole - rays):,.0f} frames/s")
-    print(f"  beside it: in view and facing {facing:.0f}, the same lines past a rigid body of as many "
-          f"triangles {body:.0f}, capsules of both hands, all lines {flesh:.0f}")  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--poses", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    add_save(parser)
-    arguments = parser.parse_args()
+def main(poses: int = 500, seed: int = 0, save: str | None = None) -> None:
     print(describe("numba", "trimesh", "embreex"))
-    rng = np.random.default_rng(arguments.seed)
-    save_figures(arguments.save, agreement(arguments.poses, rng))
-    rigs(4 * arguments.poses, rng)
-    speeds(rng)
+    rng = np.random.default_rng(seed)
+    report(save, agreement(poses, rng))
+    rigs(4 * poses, rng)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

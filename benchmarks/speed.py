@@ -17,8 +17,8 @@ training: images that the paper's network learns from, alone and beside a busy p
 pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
     pictures; a plain pyrender loop and MuJoCo's renderer.
 generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy, SciPy and mink, from nothing,
-    and from eight starts.
+solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy and SciPy, from nothing, and
+    from eight starts.
 rays: lines of sight past a hand by our kernel and by `mj_multiRay`.
 
 Run it where nothing else runs. --quick tries every part with a few frames and one seed.
@@ -26,7 +26,6 @@ Run it where nothing else runs. --quick tries every part with a few frames and o
 
 from __future__ import annotations
 
-import argparse
 import functools
 import multiprocessing
 import os
@@ -38,7 +37,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -49,33 +48,42 @@ from benchmarks.agreement import blocked_rays
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
-from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.record import Figures, describe, run, save_figures, timed
 from benchmarks.tracking import calibrated_users, labeler, twin
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit, attach_markers
-from gloves.layout import load_layout
+from gloves import GloveFit, Take, load_layout, write_capture
+from gloves.fit import attach_markers
 from gloves.optics.visibility import free_rays
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel, join_qpos
-from handsim.space.rig import load_rig
+from handsim import HandModel, join_qpos, load_rig
 from poses.shapes import sample_valid_angles
-from track.tracker import Tracker, warm_up
-from train.data.batches import Corruption, corrupt, draw_batch
-from train.data.shards import Dataset
+from track import Tracker
+from track.tracker import warm_up
+from train import (
+    CNNConfig,
+    Corruption,
+    Dataset,
+    GenerateSettings,
+    Labeler,
+    SceneMix,
+    corrupt,
+    load_labeler,
+    simulate_take,
+)
+from train.data.batches import draw_batch
 from train.fabric import start_fabric
 from train.labelers.networks import labeler_of, new_network
-from train.labelers.protocol import Labeler, torch_threads
-from train.labelers.storage import OnnxLabeler, export_onnx, load_labeler, load_network
+from train.labelers.protocol import torch_threads
+from train.labelers.storage import OnnxLabeler, export_onnx, load_network
 from train.loop import TrainingState
-from train.settings import CNNConfig, batch_recipe, usual_settings
+from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
-from train.simulation.training_frames import GenerateSettings, SceneMix
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
 BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
+Section = Literal[
+    "tracker", "labels", "paper", "commands", "training", "pictures", "generation", "solvers", "rays"
+]
 CORES: Final = os.cpu_count() or 1
 COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 
@@ -83,10 +91,9 @@ COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main()
 class Speeds:
     """What is measured: printed, and kept as figures."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.seeds: list[int] = options.seeds[:1] if options.quick else options.seeds
-        self.cnn: Path | None = options.cnn
-        self._quick: bool = options.quick
+    def __init__(self, seeds: tuple[int, ...], cnn: Path | None, *, quick: bool) -> None:
+        self.seeds, self.cnn = seeds, cnn
+        self._quick = quick
         self.figures: Figures = {}
         self._unit = unit()
         self._units = [self._unit]
@@ -125,13 +132,6 @@ def unit() -> float:
     data.qpos[7:] = 0.3
     return float(np.median([timed(lambda: [mujoco.mj_kinematics(model, data) for _ in range(1000)])
                             for _ in range(15)]))  # fmt: skip
-
-
-def timed(job: Callable[[], object]) -> float:
-    """Time of a job [s]."""
-    start = time.perf_counter()
-    job()
-    return time.perf_counter() - start
 
 
 def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray]) -> list[float]:
@@ -400,33 +400,24 @@ def rays(speeds: Speeds) -> None:
     speeds.rate("rays_mujoco", what, len(few) * lines / float(theirs))
 
 
-SECTIONS: Final[dict[str, Callable[[Speeds], None]]] = {
-    section.__name__: section
-    for section in (tracker, labels, paper, commands, training, pictures, generation, solvers, rays)
-}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), metavar="SECTION")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
-    parser.add_argument("--cnn", type=Path, help="folder of a trained network of the paper")
-    parser.add_argument("--quick", action="store_true", help="a try: a few frames, one seed")
-    add_save(parser)
-    options = parser.parse_args()
-    if options.save and options.quick:
-        parser.error("--quick is a try and saves nothing")
+def main(
+    only: tuple[Section, ...] = get_args(Section),
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
+    cnn: Path | None = None,
+    quick: bool = False,
+    save: str | None = None,
+) -> None:
+    if save and quick:
+        raise SystemExit("--quick is a try and saves nothing")
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     print(describe("mujoco", "numba", "torch"))
-    speeds = Speeds(options)
-    for name in options.only:
+    speeds = Speeds(seeds[:1] if quick else seeds, cnn, quick=quick)
+    for name in only:
         speeds.begin(name)
-        SECTIONS[name](speeds)
-    save_figures(options.save, speeds.figures)
+        globals()[name](speeds)
+    save_figures(save, speeds.figures)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

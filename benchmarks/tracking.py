@@ -19,14 +19,13 @@ told in docs/tracking.md. One core is used.
 
 from __future__ import annotations
 
-import argparse
-import os
 import time
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 
 from benchmarks.drum_takes import with_drum
 from benchmarks.paper.hand_errors import hand_errors
@@ -38,19 +37,18 @@ from benchmarks.paper.take_evaluation import (
     seen_frame,
     true_users,
 )
-from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
-from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from track.captures import calibrate
-from track.tracker import Tracker, warm_up
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
-from train.simulation.scenes import KINDS, SIMULATED_KINDS, CalibrationTakeConfig, SimulatedKind
-from train.simulation.takes import simulate_calibration, simulate_take
+from benchmarks.paper.trials import initialization_times, recovery_times
+from benchmarks.record import Figures, describe, resident_memory, run, save_figures
+from gloves import GloveFit, Take
+from track import Tracker, calibrate
+from track.tracker import warm_up
+from train import Labeler, load_labeler, simulate_take
+from train.simulation.scenes import KINDS, CalibrationTakeConfig, SimulatedKind
+from train.simulation.takes import simulate_calibration
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
+Section = Literal["calibrated", "drums", "starts", "memory"]
 EVERY = 36000  # frames between two looks at the memory: five minutes
 HANDS = {
     "true": true_users,
@@ -103,14 +101,14 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
     return list(calibrate(made).of_sides(take.sides))
 
 
-def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+def calibrated(takes: dict[str, Take], seed: int, free: float) -> Figures:
     head("calibrated as users are")
     reports = []
     for name, take in takes.items():
         for number, (users, hands) in enumerate(HANDS.items()):
             tell(f"{name if number == 0 else ''} {users}", follow(take, hands(take)))
         began = time.perf_counter()
-        found = calibrated_users(take, arguments.seeds[0], arguments.free)
+        found = calibrated_users(take, seed, free)
         took = time.perf_counter() - began
         reports.append(follow(take, found))
         tell(" calibrated", reports[-1])
@@ -133,15 +131,14 @@ def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures
     }
 
 
-def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+def drums(takes: dict[str, Take], seed: int) -> Figures:
     head("twenty ghosts a frame near the hands")
     lost: dict[tuple[str, str], list[float]] = {}
     right: dict[str, list[float]] = {}
     for name, take in takes.items():
         begins = {"ghosts": 0, "ghosts from 1 s": int(take.rate)}
         noisy = {
-            when: with_drum(take, begin, rng=np.random.default_rng(arguments.seeds[0]))
-            for when, begin in begins.items()
+            when: with_drum(take, begin, rng=np.random.default_rng(seed)) for when, begin in begins.items()
         }
         for users, hands in HANDS.items():
             clean = follow(take, hands(take))
@@ -160,14 +157,14 @@ def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     return {key: (f"hands and ghosts {key}: {right_of(takes)}", shares) for key, shares in right.items()}
 
 
-def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+def starts(takes: dict[str, Take], seed: int, tried: dict[str, int]) -> Figures:
     figures: Figures = {}
     print(f"\nfrom nothing, and after a second of darkness; {len(takes)} takes")
     for users, hands in HANDS.items():
         waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
         for name, take in takes.items():
-            rng = np.random.default_rng(arguments.seeds[0])
-            for what, trials in (("start", arguments.starts), ("recovery", arguments.recoveries)):
+            rng = np.random.default_rng(seed)
+            for what, trials in tried.items():
                 wait, within = TRIALS[what]
                 count, known = -(-trials // len(takes)), hands(take)
                 waits[what].append(
@@ -195,21 +192,20 @@ def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     )
 
 
-def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+def memory(takes: dict[str, Take], hour: int) -> Figures:
     sizes = []
     name, take = next(iter(takes.items()))
     print(f"\nresident memory, {name} forwards and backwards")
     tracker, lap, right = Tracker(true_users(take), labeler()), int(take.ids.max()) + 1, 0
     there_and_back = [*range(take.num_frames), *range(take.num_frames - 2, 0, -1)]
     began = time.perf_counter()
-    for number in range(arguments.hour):
+    for number in range(hour):
         laps, place = divmod(number, len(there_and_back))
         seen = seen_frame(take, there_and_back[place])
         tracked = tracker.step(seen.points, seen.ids + laps * lap, number / take.rate)
         right += np.array_equal(tracked.labels, seen.labels)
-        if (number + 1) % min(EVERY, max(1, arguments.hour // 12)) == 0:
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
-            size = 1e-6 * pages * os.sysconf("SC_PAGE_SIZE")
+        if (number + 1) % min(EVERY, max(1, hour // 12)) == 0:
+            size = 1e-6 * resident_memory()
             sizes.append(size)
             print(
                 f"  {(number + 1) / take.rate / 60:5.1f} min: {size:7.1f} MB, "
@@ -224,42 +220,33 @@ def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     }
 
 
-SECTIONS = {"calibrated": calibrated, "drums": drums, "starts": starts, "memory": memory}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("sections", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=SIMULATED_KINDS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
-    parser.add_argument("--frames", type=int, help="of every twin; the paper's number when not given")
-    parser.add_argument("--free", type=float, default=40.0, help="free motion in a calibration capture [s]")
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--recoveries", type=int, default=100)
-    parser.add_argument("--hour", type=int, default=432000, help="frames that memory is watched for")
-    add_save(parser)
-    arguments = parser.parse_args()
-    unknown = set(arguments.sections) - set(SECTIONS)
-    if arguments.save and len(arguments.sections) != 1:
-        parser.error("--save keeps the figures of one section")
-    if unknown:
-        parser.error(f"no section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
+def main(
+    sections: tyro.conf.Positional[tuple[Section, ...]] = ("calibrated", "drums", "starts", "memory"),
+    *,
+    kinds: tuple[SimulatedKind, ...] = KINDS,
+    seeds: tuple[int, ...] = (0, 1),
+    frames: int | None = None,
+    free: float = 40.0,
+    starts_tried: Annotated[int, tyro.conf.arg(name="starts")] = 200,
+    recoveries: int = 100,
+    hour: int = 432000,
+    save: str | None = None,
+) -> None:
     print(describe("numba", "scipy", "torch"))
-    takes = {
-        f"{kind} {seed}": twin(kind, arguments.frames, seed)
-        for seed in arguments.seeds
-        for kind in arguments.kinds
-    }
+    takes = {f"{kind} {seed}": twin(kind, frames, seed) for seed in seeds for kind in kinds}
     for take in takes.values():
         warm_up(nominal_users(take), labeler())
-    for section in arguments.sections or SECTIONS:
-        if section == "starts" and min(take.num_frames for take in takes.values()) < FEWEST_FRAMES:
-            parser.error(f"starts needs {FEWEST_FRAMES} frames of every twin")
-        figures = SECTIONS[section](takes, arguments)
-        save_figures(arguments.save, figures)
+    work = {
+        "calibrated": lambda: calibrated(takes, seeds[0], free),
+        "drums": lambda: drums(takes, seeds[0]),
+        "starts": lambda: starts(takes, seeds[0], {"start": starts_tried, "recovery": recoveries}),
+        "memory": lambda: memory(takes, hour),
+    }
+    figures: Figures = {}
+    for section in sections:
+        figures |= work[section]()
+    save_figures(save, figures)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

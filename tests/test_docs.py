@@ -57,6 +57,14 @@ def test_the_blocks_of_a_page_run_and_print_what_the_page_says(path, tmp_path, c
             assert float(ours) == pytest.approx(float(stated), rel=0.05, abs=0.2), block.name
 
 
+def test_the_script_of_the_readme_mostly_agrees_with_the_truth(tmp_path, commands):
+    script = next(block for block in blocks_of(ROOT / "README.md") if block.kind == "python")
+    (printed,) = run_blocks([script], tmp_path, commands)
+    labels, truth = (list(map(int, re.findall(r"-?\d+", row))) for row in printed.split("]")[:2])
+    assert len(labels) == len(truth) >= 14
+    assert sum(a == b for a, b in zip(labels, truth, strict=True)) > 0.8 * len(truth)
+
+
 def test_every_python_and_shell_block_of_the_documents_is_run():
     for path in PAGES:
         text = path.read_text(encoding="utf-8")

@@ -6,16 +6,13 @@ import ast
 import importlib
 import inspect
 import re
-import subprocess
-import sys
-from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
 
 from tests.documents import PAGES
+from tests.programs import ROOT, run_python
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
 UNIT = re.compile(r"\[(m|m\^2|rad|s|min|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
@@ -58,23 +55,6 @@ def test_name_is_documented_with_units_and_shapes(package, name):
         assert ARRAY.search(source) or UNIT.search(source_of(value)), "neither shapes nor units"
     if re.search(r"Float(32|64)?\[", source):
         assert UNIT.search(source) or "share" in source or "probabilit" in source, "an array without a unit"
-
-
-@pytest.mark.parametrize(("package", "name"), exported())
-def test_name_is_typed(package, name):
-    value = getattr(importlib.import_module(package), name)
-    functions = [value]
-    if inspect.isclass(value):
-        functions = [
-            member
-            for key, member in vars(value).items()
-            if inspect.isfunction(member) and (not key.startswith("_") or key in ("__init__", "__call__"))
-            and member.__module__ == value.__module__
-        ]  # fmt: skip
-    for function in functions:
-        for parameter in list(inspect.signature(function).parameters.values()):
-            if parameter.name not in ("self", "cls"):
-                assert parameter.annotation is not parameter.empty, f"{function.__name__}: {parameter.name}"
 
 
 @pytest.mark.parametrize(("package", "name"), exported())
@@ -180,8 +160,7 @@ def test_unknown_names_are_told():
 def test_importing_a_package_imports_none_of_its_rooms(package):
     code = f"import sys, {package}; print(sorted(m for m in sys.modules if m.startswith({ROOMS[package]})"
     code += " or m in ('numpy', 'torch', 'mujoco', 'OpenGL')))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert run_python(code).stdout == "[]\n"
 
 
 def test_the_door_is_small():

@@ -5,13 +5,14 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib import metadata
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.programs import ROOT, run_python
+
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 
 
@@ -28,11 +29,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     subprocess.run(command, check=True)
     (path,) = out.glob("handsim-*.whl")
     return zipfile.ZipFile(path)
-
-
-def run_python(code: str, cwd: Path = ROOT) -> str:
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=True).stdout
 
 
 def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
@@ -67,11 +63,8 @@ def test_wheel_carries_license_command_and_one_version(wheel: zipfile.ZipFile) -
     assert f"## [{stated.group(1)}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def _project_table() -> dict[str, object]:
-    import tomllib
-
-    project: dict[str, object] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return project
+def _project_table():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -96,7 +89,7 @@ def test_nobody_pays_for_another_packages_imports() -> None:
         )
         code += f"for name in {modules}: importlib.import_module(name)\n"
         code += f"print(sorted({set(heavy)} & set(sys.modules)))\n"
-    assert run_python(code) == "[]\n[]\n"
+    assert run_python(code).stdout == "[]\n[]\n"
 
 
 def test_labeling_and_tracking_load_only_what_they_need() -> None:
@@ -107,19 +100,7 @@ def test_labeling_and_tracking_load_only_what_they_need() -> None:
         "heavy = {'torch', 'mujoco', 'trimesh', 'matplotlib', 'cv2', 'scipy.optimize', 'scipy.spatial'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
-    assert run_python(code) == "[]\n"
-
-
-def test_a_neighbor_called_train_is_told(tmp_path: Path) -> None:
-    (tmp_path / "train.py").write_text("")
-    code = f"import sys; sys.path.append({str(ROOT)!r}); import handsim"
-    command = [sys.executable, "-c", code]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
-    assert (
-        "ShadowedPackageWarning: handsim needs its own package 'train', but `import train` finds"
-        in result.stderr
-    )
-    assert "train.py; rename that" in result.stderr
+    assert run_python(code).stdout == "[]\n"
 
 
 def test_constraints_pin_every_dependency() -> None:
@@ -127,8 +108,8 @@ def test_constraints_pin_every_dependency() -> None:
     pins = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert all(pins.values())
     project = _project_table()
-    extras = [name for extra in project["optional-dependencies"].values() for name in extra]  # type: ignore[attr-defined]
-    wanted = [*project["dependencies"], *(name for name in extras if not name.startswith("handsim["))]  # type: ignore[misc]
+    extras = [name for extra in project["optional-dependencies"].values() for name in extra]
+    wanted = [*project["dependencies"], *(name for name in extras if not name.startswith("handsim["))]
     names = {_canonical(re.split(r"[<>=!]", requirement)[0]) for requirement in wanted}
     pinned = {_canonical(name) for name in pins}
     assert names <= pinned

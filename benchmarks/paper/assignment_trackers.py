@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
+from gloves import GloveFit, Status
 from handsim.errors import ArgumentError
 from handsim.kernels import move, velocity_of
-from track.frames import TrackedFrame, TrackedHand
+from track import TrackedFrame, TrackedHand
 
 NEAR: Final = 0.01
 """Upper bound of the distance of a new point from the predicted position of a lost marker [m]."""

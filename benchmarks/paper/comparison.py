@@ -19,14 +19,12 @@ from benchmarks.paper.take_evaluation import (
     true_users,
 )
 from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
+from gloves import GloveFit, Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
+from track import RigidTemplate, Tracker
 from track.frames import FrameTracker
-from track.rigid_body import RigidTemplate
-from track.tracker import Tracker
-from train.labelers.protocol import Labeler
+from train import Labeler
 
 MakeTracker = Callable[[Take, Sequence[GloveFit]], FrameTracker]
 

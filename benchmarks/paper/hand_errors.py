@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.fit import Attachment, GloveFit
+from gloves import Attachment, GloveFit
+from handsim import HandModel
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel
 from handsim.hand.shape import PALM
 from handsim.space.transforms import rigid_fit
 

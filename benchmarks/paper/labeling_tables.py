@@ -16,21 +16,26 @@ from rich.table import Table
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from benchmarks.record import Figures, save_figures
+from gloves import Take
 from gloves.captures.capture import count_gaps, run_lengths
 from gloves.captures.formats import find_captures, read_markers
-from gloves.takes.take import Take
+from handsim import HandSimError
 from handsim.app.messages import progress_bar
-from handsim.errors import HandSimError
-from train.data.batches import Corruption, paper_corruption
-from train.data.shards import Dataset
-from train.evaluation import LabelingReport, evaluate_labeler
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
-from train.loop import train_labeler
+from train import (
+    Corruption,
+    Dataset,
+    Labeler,
+    LabelingReport,
+    evaluate_labeler,
+    load_labeler,
+    simulate_take,
+    train_labeler,
+)
+from train.data.batches import paper_corruption
+from train.labelers.storage import shipped_labelers
 from train.settings import Kind, usual_settings
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
-from train.simulation.takes import simulate_take
 
 # Median and p90 of real finger markers' gaps [frames]; docs/room.md.
 PUBLISHED_GAPS: Final = "3-4", "24-43"
@@ -127,42 +132,41 @@ def table3(glove: str = "dense19", seed: int = 0, save: str | None = None) -> No
     save_figures(save, _table3_figures(measures))
 
 
-def table4(
-    labelers: tuple[str, ...] = ("dense19",),
-    num_frames: int = 5000,
-    captures: tuple[Path, ...] = (),
-    seed: int = 0,
-    save: str | None = None,
-) -> None:
+@dataclasses.dataclass(frozen=True, slots=True)
+class TestConfig:
+    """Settings of Tables 4 and 6."""
+
+    labelers: tuple[str, ...] = ()
+    """Shipped names, folders of trained labelers, or exported .onnx files; the layout's when not given."""
+    num_frames: int = 5000
+    """Test frames of people and poses that are in no training set, with the paper's recipe."""
+    captures: tuple[Path, ...] = ()
+    """Labeled captures or folders of them, for another column with the paper's recipe."""
+    seed: int = 0
+    """Seed of the test frames, the takes and the recipe; 0 gives the twins."""
+    save: str | None = None
+    """Name under which the last labeler's figures are kept in benchmarks/figures, such as table4."""
+
+
+_Config = Annotated[TestConfig, tyro.conf.arg(name="")]
+
+
+def table4(config: _Config) -> None:
     """Labelers of the dense layout on simulated test frames and on the twins of the paper's captures.
 
     Args:
-        labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
-        captures: Labeled captures or folders of them, for another column with the paper's recipe.
-        seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
-        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
+        config: Settings of the measurement.
     """
-    _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed, save)
+    _print_tests("Table 4", "dense19", TABLE4, config)
 
 
-def table6(
-    labelers: tuple[str, ...] = ("sparse13",),
-    num_frames: int = 5000,
-    captures: tuple[Path, ...] = (),
-    seed: int = 0,
-    save: str | None = None,
-) -> None:
+def table6(config: _Config) -> None:
     """Labelers of the sparse layout on simulated test frames and on the twins of the paper's captures.
 
     Args:
-        labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
-        captures: Labeled captures or folders of them, for another column with the paper's recipe.
-        seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
-        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
+        config: Settings of the measurement.
     """
-    _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed, save)
+    _print_tests("Table 6", "sparse13", TABLE6, config)
 
 
 LABELING_TABLES: Final[dict[str, Callable[..., None]]] = {
@@ -173,30 +177,22 @@ LABELING_TABLES: Final[dict[str, Callable[..., None]]] = {
 }
 
 
-def _print_tests(
-    table: str,
-    glove: str,
-    paper: Mapping[str, tuple[float, ...]],
-    labelers: tuple[str, ...],
-    num_frames: int,
-    captures: tuple[Path, ...],
-    seed: int,
-    save: str | None,
-) -> None:
-    if num_frames < 1:
-        raise HandSimError(f"num_frames is {num_frames}, expected at least 1")
+def _print_tests(table: str, glove: str, paper: Mapping[str, tuple[float, ...]], config: TestConfig) -> None:
+    if config.num_frames < 1:
+        raise HandSimError(f"num_frames is {config.num_frames}, expected at least 1")
     found = {
-        name: load_labeler(glove, name if name in shipped_labelers() else Path(name)) for name in labelers
+        name: load_labeler(glove, name if name in shipped_labelers() else Path(name))
+        for name in config.labelers or (glove,)
     }
-    stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
-    takes = _simulate(glove, seed)
-    if captures:
+    stills = {"synthetic": held_out_markers(glove, config.num_frames, seed=config.seed)}
+    takes = _simulate(glove, config.seed)
+    if config.captures:
         names = next(iter(found.values())).marker_names
-        stills["captures"] = read_markers(find_captures(captures), names)
+        stills["captures"] = read_markers(find_captures(config.captures), names)
     for name, labeler in found.items():
-        reports = measure_tests(labeler, stills, takes, seed=seed)
+        reports = measure_tests(labeler, stills, takes, seed=config.seed)
         Console().print(print_tests(reports, paper, title=f"{table}, {name}: ours (the paper's)"))
-        save_figures(save, _tests_figures(reports, paper, f"{table}, {name}"))
+        save_figures(config.save, _tests_figures(reports, paper, f"{table}, {name}"))
 
 
 def _simulate(glove: str, seed: int) -> dict[str, Take]:

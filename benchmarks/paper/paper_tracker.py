@@ -30,10 +30,9 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
-from track.frames import TrackedFrame, TrackedHand
-from train.labelers.protocol import Labeler
+from gloves import GloveFit, Status
+from track import TrackedFrame, TrackedHand
+from train import Labeler
 
 RADIUS: Final = 0.2
 """Largest distance between the centers of two clusters that are joined [m]."""

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit
-from gloves.takes.points import Status
+from gloves import GloveFit, Status
 from handsim.hand.shape import NUM_QPOS
-from track.frames import TrackedHand
-from track.kinematics.pose_solver import PoseFit, PoseSolver
+from track import PoseFit, TrackedHand
+from track.kinematics.pose_solver import PoseSolver
 
 MOST_RMS: Final = 0.008
 """RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""

@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from benchmarks.paper.plain_hand import MOST_RMS
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import load_layout
-from gloves.takes.take import Take
-from handsim.hand.model import HandModel
+from gloves import GloveFit, Take, load_layout
+from gloves.fit import nominal_fit
+from handsim import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
-from track.frames import FrameTracker, StreamedFrame, TrackedFrame
+from track import StreamedFrame, TrackedFrame
+from track.frames import FrameTracker
 from track.hand_size import fit_size, sample_frames
-from train.labelers.protocol import Labeler
+from train import Labeler
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""

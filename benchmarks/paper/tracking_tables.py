@@ -27,11 +27,10 @@ from benchmarks.paper.comparison import (
 )
 from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE7
 from benchmarks.record import Figures, save_figures
-from gloves.takes.take import Take
+from gloves import Take
 from handsim.app.messages import progress_bar
-from train.labelers.storage import load_labeler
+from train import SimulateSettings, load_labeler, simulate_take
 from train.simulation.scenes import KINDS
-from train.simulation.takes import SimulateSettings, simulate_take
 
 _HEAD: Final = ("method", "hands")
 _PAPERS_GLOVE: Final = "dense19"

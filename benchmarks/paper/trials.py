@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.paper.take_evaluation import is_right, is_valid, seen_frame
-from gloves.takes.take import Take
+from gloves import Take
 from handsim.errors import ArgumentError
 from track.frames import FrameTracker
 

@@ -23,8 +23,8 @@ from benchmarks.public.manifest import PUBLISHED, differing_files, load_benchmar
 from benchmarks.public.score_tables import figure_text, score_record, score_tables
 from benchmarks.public.scoring import score_results
 from benchmarks.record import describe
+from handsim import HandSimWarning
 from handsim.app.messages import print_line, progress_bar
-from handsim.errors import HandSimWarning
 from handsim.files.outputs import atomic_write, check_outputs, save_json, shown_bytes
 
 _TABLE: Final = ("frame_accuracy", "slot_accuracy", "mpjpe", "angle_error")

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from gloves.fit import GloveFit
+from gloves import GloveFit
 from gloves.takes.take import keypoints_of
 from handsim.errors import FileError
 from handsim.files.arrays import read_npz

@@ -17,15 +17,12 @@ from benchmarks.paper.paper_tracker import PaperTracker
 from benchmarks.public.answers import SIDES, Answers, BenchmarkError, poses_of, save_answers
 from benchmarks.public.difficulties import BENCHMARK, GLOVE
 from benchmarks.public.manifest import Benchmark
-from gloves.captures.capture import Capture
-from gloves.fit import GloveFit
+from gloves import Capture, GloveFit
 from handsim.files.outputs import claim
 from handsim.hand.shape import NUM_QPOS
-from track.captures import measure_hands
+from track import Tracker, measure_hands
 from track.frames import FrameTracker, capture_frames
-from track.tracker import Tracker
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
+from train import Labeler, load_labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
 

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.public.answers import load_answers
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from benchmarks.public.manifest import capture_path, label_names, truth_path
-from gloves.captures.formats import read_capture
+from gloves import read_capture
 from train.simulation.scenes import RATE
 
 _TAGS: Final = ("motion-capture", "hand-tracking", "marker-labeling", "point-cloud", "synthetic", "handsim")

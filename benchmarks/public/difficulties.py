@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from gloves import OpticsConfig
 from gloves.optics.ghosts import StrayConfig
-from gloves.optics.reconstruction import OpticsConfig
 from train.simulation.room import RoomConfig
 from train.simulation.scenes import KINDS, SimulatedKind
 

@@ -28,15 +28,11 @@ from benchmarks.public.manifest import (
     user_path,
     write_manifest,
 )
-from gloves.captures.capture import UNLABELED, Capture
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit
-from gloves.layout import load_layout
-from gloves.takes.take import Take
+from gloves import Capture, GloveFit, Take, load_layout, write_capture
+from gloves.captures.capture import UNLABELED
+from handsim import HandModel, load_rig
 from handsim.files.outputs import atomic_write, check_free, claim, remove_leftovers
-from handsim.hand.model import HandModel
-from handsim.space.rig import load_rig
-from track.user import User, load_user
+from track import User, load_user
 from train.simulation.room import record_take
 from train.simulation.scenes import Kind, sample_real_like_scene
 from train.simulation.takes import sample_scene

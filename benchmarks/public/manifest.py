@@ -14,15 +14,13 @@ import numpy as np
 
 from benchmarks.public.answers import SIDES, Answers, BenchmarkError, load_answers
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
-from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture
-from gloves.layout import load_layout
+from gloves import Capture, load_layout, read_capture
 from handsim import __version__
 from handsim.errors import DatasetError
 from handsim.files.inputs import checksum, load_json
 from handsim.files.outputs import save_json
 from handsim.hand.model import KEYPOINT_NAMES
-from track.user import User, load_user
+from track import User, load_user
 from train.simulation.scenes import RATE
 
 MANIFEST: Final = "manifest.json"

@@ -26,10 +26,11 @@ from benchmarks.public.answers import (
     poses_of,
     unpack_answers,
 )
-from gloves.captures.capture import UNLABELED, Capture
-from gloves.captures.formats import MOTIVE_BEGIN, read_capture
-from gloves.takes.take import load_take
-from handsim.errors import HandSimError, choices
+from gloves import Capture, load_take, read_capture
+from gloves.captures.capture import UNLABELED
+from gloves.captures.formats import MOTIVE_BEGIN
+from handsim import HandSimError
+from handsim.errors import choices
 from handsim.files.inputs import check_regular, read_bytes
 
 SUFFIXES: Final = (".npz", ".csv", ".trc", ".c3d")

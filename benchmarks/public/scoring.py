@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from benchmarks.public.answers import Answers
 from benchmarks.public.manifest import Benchmark, BenchmarkCapture, label_names
 from benchmarks.public.results import find_results, read_result
-from handsim.errors import HandSimWarning
+from handsim import HandSimWarning
 from handsim.hand.shape import NUM_KEYPOINTS
 from train.evaluation import LabelCounts
 

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from handsim import _imports
+from handsim import ShadowedPackageWarning, _imports
 from handsim._imports import (
     SIBLINGS,
     VARIABLE,
-    ShadowedPackageWarning,
     ensure_kernel_cache,
     kernel_cache,
     shadowed_siblings,

@@ -9,6 +9,7 @@ from gloves import Take, load_layout
 from gloves.fit import nominal_fit
 from handsim import join_qpos, write_page
 from handsim.errors import ArgumentError
+from handsim.pages import Section, write_sections
 
 
 def test_a_take_has_a_page_and_tables(tmp_path):
@@ -25,3 +26,19 @@ def test_what_has_no_page_is_told(tmp_path):
     with pytest.raises(ArgumentError, match=r"page\.pdf, expected a file name that ends in \.html"):
         write_page(tmp_path / "page.pdf", 5)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_page_escapes_what_it_shows(tmp_path):
+    table, pictures = [["<i>"], ["1"]], [("x.png", 'a "b" & c')]
+    section = Section("a < b", "text", pictures=pictures, table=table, notes=["<n>"])
+    write_sections(tmp_path / "index.html", [section], title="<title>", lead="x & y")
+    page = (tmp_path / "index.html").read_text("utf-8")
+    for shown in (
+        "<title>&lt;title&gt;</title>",
+        "x &amp; y</p>",
+        "a &lt; b",
+        "<th>&lt;i&gt;</th>",
+        "&lt;n&gt;",
+    ):
+        assert shown in page
+    assert 'alt="a &quot;b&quot; &amp; c"' in page and "http" not in page

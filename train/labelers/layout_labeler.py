@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -63,6 +64,7 @@ WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
 _CHUNK: Final = 500  # poses whose features are in memory at once
+_MANY_MARKERS: Final = 24  # beyond which poses and clouds become fewer, as work goes with the square
 _POSES_PER_PERSON: Final = 100
 
 
@@ -125,12 +127,19 @@ class LayoutLabeler:
 
 def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConfig) -> Float[Tensor, "M M K"]:
     """Mean over poses of the `distance_features` of a layout's markers [m]."""
+    share = _share_of_work(markers.shape[1])
+    markers, chunk = markers[:: math.ceil(1.0 / share)], int(_CHUNK * share)
     centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
     sums = [
-        distance_features(centered[first : first + _CHUNK], config).sum(0)
-        for first in range(0, len(centered), _CHUNK)
+        distance_features(centered[first : first + chunk], config).sum(0)
+        for first in range(0, len(centered), chunk)
     ]
     return torch.stack(sums).sum(0) / len(markers)
+
+
+def _share_of_work(num_markers: int) -> float:
+    """Share of poses and clouds that a layout is learned from, so that large ones take two minutes too."""
+    return min(1.0, (_MANY_MARKERS / num_markers) ** 2)
 
 
 @cache
@@ -187,7 +196,7 @@ def sample_worn_markers(
 MAX_KEPT: Final = 32
 """Labelers in the cache; one takes about four megabytes."""
 NUM_CLOUDS: Final = 15_000
-_BATCH: Final = 64
+_BATCH, _LEAST_BATCH = 64, 16  # clouds of a step
 _PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
 
 
@@ -197,7 +206,7 @@ def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
-    """The labeler of a glove: learned within a minute the first time, and read from the cache later."""
+    """The labeler of a glove: learned in a minute or two the first time, and read from the cache later."""
     file = _file_of(layout, rig)
     found = _read(file, layout)
     if found is not None:
@@ -263,8 +272,13 @@ def fine_tuned_labeler(
     num_clouds: int = NUM_CLOUDS,
     seed: int = 0,
 ) -> LayoutLabeler:
-    """A labeler for any layout after training on clouds of one layout, as a rig sees them."""
+    """A labeler for any layout after training on clouds of one layout, as a rig sees them.
+
+    Layouts of more than 24 markers are learned from fewer clouds, in the square of their number.
+    """
     rng = np.random.default_rng(seed)
+    share = _share_of_work(layout.num_markers)
+    num_clouds, batch = math.ceil(share * num_clouds), max(_LEAST_BATCH, int(share * _BATCH))
     labeler = LayoutLabeler.at_once(layout, seed=seed)
     source = FrameSource(GenerateSettings(), layout, load_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
@@ -272,9 +286,9 @@ def fine_tuned_labeler(
         models = sample_hands(source.settings.population, rng=rng)
         simulate_frames(rows[first : first + _POSES_PER_PERSON], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
-    recipe = batch_recipe(TrainSettings(batch=_BATCH), layout.num_markers)
+    recipe = batch_recipe(TrainSettings(batch=batch), layout.num_markers)
     optimizer = new_optimizer(network)
-    steps = -(-num_clouds // _BATCH)
+    steps = -(-num_clouds // batch)
     with torch_threads(1):
         for step in range(steps):
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,8 +15,9 @@ from gloves.optics.ghosts import (
     sample_ghosts,
     sample_strays,
 )
-from handsim.space.rig import load_rig
+from handsim import load_rig
 
+RIG = load_rig("figure5")
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
 
 
@@ -40,36 +39,33 @@ def test_reflection_is_its_own_inverse_and_keeps_distances(seed):
     )
 
 
+def ghosts_of(config, rng, min_cameras=2, markers=None):
+    markers = hand_sized_cloud(rng) if markers is None else markers
+    return sample_ghosts(markers, RIG, *NOTHING, config, min_cameras=min_cameras, rng=rng)
+
+
 def test_without_sources_there_are_no_ghosts(rng):
-    config = GhostConfig(mirror_rate=0.0, stray_rate=0.0)
-    ghosts = sample_ghosts(
-        hand_sized_cloud(rng), load_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
-    )
+    ghosts = ghosts_of(GhostConfig(mirror_rate=0.0, stray_rate=0.0), rng)
     assert ghosts.shape == (200, MAX_GHOSTS, 3)
     assert np.isnan(ghosts).all()
 
 
 def test_mirror_ghosts_lie_behind_the_surface_and_need_cameras(rng):
-    config = GhostConfig(mirror_rate=1.0, stray_rate=0.0, reflectance=1.0)
-    markers, rig = hand_sized_cloud(rng), load_rig("figure5")
-    ghosts = sample_ghosts(markers, rig, *NOTHING, config, min_cameras=2, rng=rng)
+    config, markers = GhostConfig(mirror_rate=1.0, stray_rate=0.0, reflectance=1.0), hand_sized_cloud(rng)
+    ghosts = ghosts_of(config, rng, markers=markers)
     there = np.isfinite(ghosts[..., 0])
     assert there.any()
     low, high = markers.min(axis=(0, 1)) - 0.6, markers.max(axis=(0, 1)) + 0.6
     assert ((ghosts[there] > low) & (ghosts[there] < high)).all()
-    strict = sample_ghosts(markers, rig, *NOTHING, config, min_cameras=12, rng=np.random.default_rng(0))
+    strict = ghosts_of(config, np.random.default_rng(0), 12, markers)
     assert np.isfinite(strict[..., 0]).sum() < there.sum()
 
 
 def test_strays_follow_their_rate(rng):
-    config = dataclasses.replace(GhostConfig(), mirror_rate=0.0, stray_rate=0.5)
-    ghosts = sample_ghosts(
-        hand_sized_cloud(rng), load_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
-    )
+    ghosts = ghosts_of(GhostConfig(mirror_rate=0.0, stray_rate=0.5), rng)
     assert 0.35 < np.isfinite(ghosts[..., 0]).sum(axis=1).mean() < 0.65
 
 
-RIG = load_rig("figure5")
 PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
 MIRRORS_NOTHING = np.zeros((1, 0, 2, 3)), np.zeros(0)
 
@@ -87,10 +83,7 @@ def test_light_leaves_a_mirror_as_it_comes() -> None:
     np.testing.assert_allclose(image, [0.01, 0.02, 0.9])
     for camera in RIG.positions[seen]:
         hit = image + (1.0 - image[2]) / (camera[2] - image[2]) * (camera - image)
-        inwards, outwards = (
-            (hit - marker) / np.linalg.norm(hit - marker),
-            (camera - hit) / np.linalg.norm(camera - hit),
-        )
+        inwards, outwards = (way / np.linalg.norm(way) for way in (hit - marker, camera - hit))
         np.testing.assert_allclose(inwards * [1, 1, -1], outwards, atol=1e-12)
 
 

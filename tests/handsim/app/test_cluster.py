@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import os
 import signal
@@ -22,39 +23,22 @@ from handsim.app.output import open_output
 from handsim.app.workers import ClusterExecutor, _Task, _versions, check_worker, chosen_workers, run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, LayoutError
-from handsim.files.inputs import checksum
 from render import RenderConfig, render_take
+from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents, two_workers
+from tests.programs import ROOT, run_python
 from tests.sentences import error_names
 from tests.waiting import LONG
-from train import GenerateSettings, SceneMix, simulate_take
+from train import simulate_take
 from train.simulation import generation
 from train.simulation.generation import make_dataset
 
 distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
-ROOT = Path(__file__).resolve().parents[3]
-ROWS = 100
-PRELOAD = f"from train.simulation import generation\ngeneration.ROWS_PER_SHARD = {ROWS}\n"
-CONFIG = GenerateSettings(
-    num_frames=12 * ROWS - 30,
-    seed=5,
-    frames_per_hand=50,
-    scenes=SceneMix(alone=1.0, together=0.0, holding=0.0),
-)
+LARGER = dataclasses.replace(CONFIG, num_frames=12 * ROWS - 30)
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """Two worker processes with one thread each, and a client of the tests' own."""
-    preload = tmp_path_factory.mktemp("preload") / "small_shards.py"
-    preload.write_text(PRELOAD)
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        preload=[str(preload)],
-        silence_logs="CRITICAL",
-    ) as started:
+    with two_workers(tmp_path_factory.mktemp("preload")) as started:
         yield started
 
 
@@ -67,13 +51,6 @@ def client(cluster):
 @pytest.fixture
 def small_shards(monkeypatch):
     monkeypatch.setattr(generation, "ROWS_PER_SHARD", ROWS)
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Checksums of all files, hidden ones too."""
-    return {
-        path.relative_to(folder).as_posix(): checksum(path) for path in folder.rglob("*") if path.is_file()
-    }
 
 
 @contextmanager
@@ -94,19 +71,19 @@ def test_training_sets_have_the_same_bytes_also_when_a_worker_is_killed(
     cluster, client, small_shards, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)  # workers have another folder
-    make_dataset(CONFIG, Path("here"), workers=1)
+    make_dataset(LARGER, Path("here"), workers=1)
     expected = contents(tmp_path / "here")
     assert len([name for name in expected if name.startswith("rows-")]) == 12
     there, killed = Path("there"), Path("killed")
     lines, counts = [], []
     with chosen_workers(cluster.scheduler_address, None, lines.append) as workers:
-        make_dataset(CONFIG, there, workers=workers, progress=lambda done, _: counts.append(done))
+        make_dataset(LARGER, there, workers=workers, progress=lambda done, _: counts.append(done))
         assert contents(there) == expected
-        assert counts == sorted(counts) and counts[-1] == CONFIG.num_frames and len(counts) == 12
+        assert counts == sorted(counts) and counts[-1] == LARGER.num_frames and len(counts) == 12
         (line,) = lines
         assert "2 workers; dashboard of the cluster: http" in line
         with killing(client) as kill:
-            make_dataset(CONFIG, killed, workers=workers, progress=kill)
+            make_dataset(LARGER, killed, workers=workers, progress=kill)
         assert contents(killed) == expected
 
 
@@ -136,13 +113,6 @@ def test_what_a_job_raises_comes_back_and_is_not_tried_again(client, tmp_path):
 
 def echo(number: int) -> int:
     return number
-
-
-def test_more_jobs_than_the_scheduler_is_given_at_once(client, monkeypatch):
-    monkeypatch.setattr("handsim.app.workers._MAX_PENDING", 5)
-    executor = ClusterExecutor(client)
-    assert sorted(run_jobs(echo, range(3, 40), executor)) == list(range(3, 40))
-    assert list(run_jobs(echo, [], executor)) == []
 
 
 def die(number: int) -> int:
@@ -320,9 +290,7 @@ for address in ["tcp://a:b", "tls://localhost:1"] * 3:
 threads = [thread.name for thread in threading.enumerate()]
 assert threads == ["MainThread"], threads
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=LONG, check=False
-    )
+    done = run_python(script, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("no Dask scheduler answers at") == len(done.stdout.splitlines()) == 6
 

@@ -8,7 +8,6 @@ import cv2
 import pytest
 
 from handsim.cli.main import main
-from handsim.pages import Section, write_sections
 
 
 class Links(HTMLParser):
@@ -43,18 +42,3 @@ def test_demo_leaves_a_page_with_its_pictures(tmp_path: Path, capsys: pytest.Cap
     clean, occluded = map(float, accuracy.groups())
     assert clean > 90
     assert occluded > 75
-
-
-def test_page_escapes_what_it_shows(tmp_path: Path) -> None:
-    section = Section(
-        "a < b", "text", pictures=[("x.png", 'a "b" & c')], table=[["<i>"], ["1"]], notes=["<n>"]
-    )
-    write_sections(tmp_path / "index.html", [section], title="<title>", lead="x & y")
-    page = (tmp_path / "index.html").read_text("utf-8")
-    assert "<title>&lt;title&gt;</title>" in page
-    assert "x &amp; y</p>" in page
-    assert "a &lt; b" in page
-    assert 'alt="a &quot;b&quot; &amp; c"' in page
-    assert "<th>&lt;i&gt;</th>" in page
-    assert "&lt;n&gt;" in page
-    assert "http" not in page

@@ -29,6 +29,7 @@ def folder(tmp_path_factory):
     [
         ("simulate --num-frames 20 --out", "a.c3d"),
         ("simulate --num-frames 20 --out", "a.trc"),
+        ("simulate --num-frames 20 --out", "a.csv"),
         *(("export take.truth.npz --out", f"a{ending}") for ending in MOTION_FORMATS),
         *(("hand --out", f"a{ending}") for ending in (".xml", ".urdf", ".osim", ".glb")),
         ("export dense19 --out", "a.onnx"),

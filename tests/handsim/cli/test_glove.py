@@ -11,20 +11,23 @@ from handsim.cli.main import main
 from train.labelers.storage import shipped_labelers
 
 
-def test_list_names_every_layout(capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_and_show_name_every_layout_marker_and_labeler(capsys):
     assert main(["glove", "list"]) == 0
     out = capsys.readouterr().out
     for name in list_layouts():
-        assert f"{name} " in out
-        assert str(load_layout(name).num_markers) in out
+        assert f"{name} " in out and str(load_layout(name).num_markers) in out
     assert "doi.org/10.1145/3197517.3201399" in out.replace("\n", "")
-
-
-def test_list_says_which_gloves_have_a_labeler(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["glove", "list"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    having = tuple(line.split()[0] for line in lines if "comes with it" in line)
+    having = tuple(line.split()[0] for line in out.splitlines() if "comes with it" in line)
     assert having == shipped_labelers()
+    assert main(["glove", "show", "dense19"]) == 0
+    out = capsys.readouterr().out  # of 80 columns
+    assert all(marker.name in out and marker.bone in out for marker in load_layout("dense19").markers)
+
+
+@pytest.fixture
+def mine(tmp_path):
+    assert main(["glove", "new", str(tmp_path / "mine.toml")]) == 0
+    return tmp_path / "mine.toml"
 
 
 @pytest.mark.slow
@@ -53,45 +56,24 @@ def test_show_and_check_a_left_glove_with_a_stalk(tmp_path: Path, capsys: pytest
     assert load_take(tmp_path / "x.truth.npz").sides == ("left",)
 
 
-def test_show_lists_every_marker(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["glove", "show", "dense19"]) == 0
-    out = capsys.readouterr().out  # of 80 columns
-    assert all(marker.name in out and marker.bone in out for marker in load_layout("dense19").markers)
-
-
-def test_new_writes_a_file_that_checks_and_keeps_what_is_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "mine.toml"
-    assert main(["glove", "new", str(file)]) == 0
-    before = file.read_bytes()
-    assert main(["glove", "new", str(file)]) == 1
+def test_new_writes_a_file_that_checks_and_keeps_what_is_there(mine, capsys):
+    before = mine.read_bytes()
+    assert main(["glove", "new", str(mine)]) == 1
     assert "exists already" in capsys.readouterr().err
-    assert file.read_bytes() == before
-    assert main(["glove", "check", str(file)]) == 0
+    assert mine.read_bytes() == before
+    assert main(["glove", "check", str(mine)]) == 0
     assert "my_glove: 8 markers" in capsys.readouterr().out
-    picture = cv2.imread(str(tmp_path / "mine.png"))
+    picture = cv2.imread(str(mine.with_suffix(".png")))
     assert picture.shape[1] > picture.shape[0] > 800
     assert (picture.min(axis=(1, 2)) < 120).mean() > 0.6
 
 
-def test_check_tells_markers_that_overlap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "mine.toml"
-    assert main(["glove", "new", str(file)]) == 0
-    file.write_text(
-        file.read_text()
-        + '\n[[marker]]\nname = "Again"\nbone = "palm"\nalong = 0.56\naround = 0.0\nacross = -0.17\n'
-    )
-    assert main(["glove", "check", str(file), "--out", str(tmp_path / "x.png")]) == 1
+def test_check_tells_markers_that_overlap(mine, tmp_path, capsys):
+    again = '\n[[marker]]\nname = "Again"\nbone = "palm"\nalong = 0.56\naround = 0.0\nacross = -0.17\n'
+    mine.write_text(mine.read_text() + again)
+    assert main(["glove", "check", str(mine), "--out", str(tmp_path / "x.png")]) == 1
     assert "BackHand1 and Again on size XS" in capsys.readouterr().err
     assert not (tmp_path / "x.png").exists()
-
-
-@pytest.fixture
-def mine(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(starter_layout(), "utf-8")
-    return path
 
 
 @pytest.mark.slow
@@ -106,14 +88,8 @@ def test_a_score_is_printed_and_drawn(mine, capsys):
 
 def test_an_improved_layout_is_written(mine, tmp_path, capsys):
     out = tmp_path / "better.toml"
-    command = [
-        *"glove improve".split(),
-        str(mine),
-        "--out",
-        str(out),
-        *"--minutes 0 --markers 7 --captures 0".split(),
-    ]
-    assert main(command) == 0
+    options = "--minutes 0 --markers 7 --captures 0".split()
+    assert main(["glove", "improve", str(mine), "--out", str(out), *options]) == 0
     assert load_layout(out).num_markers == 7
     told = capsys.readouterr().out
     assert "before: 8 markers" in told and "after:  7 markers" in told and "drop " in told

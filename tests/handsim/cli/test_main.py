@@ -1,4 +1,4 @@
-"""None"""
+"""The command as users type it: exit codes, one sentence for a mistake, and help that loads little."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,17 +16,16 @@ import handsim
 from handsim.cli.main import COMMANDS, load, main, run
 from handsim.errors import LayoutError
 from handsim.files.signals import Stopped
-
-ROOT = Path(__file__).resolve().parents[3]
+from tests.programs import ROOT, run_python
 
 
 @pytest.fixture
-def invoke(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+def invoke(monkeypatch):
     """Runs a function (or dict of functions) as the command `fake` of a table of its own."""
 
-    def invoke(command: Any, *args: str) -> int:
+    def invoke(command, *args):
         module = types.ModuleType("fake_commands")
-        module.command = command  # type: ignore[attr-defined]
+        module.command = command
         monkeypatch.setitem(sys.modules, "fake_commands", module)
         return run({"fake": ("fake_commands:command", "Do nothing much.")}, ["fake", *args])
 
@@ -63,18 +61,17 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"handsim {handsim.__version__}\n"
 
 
-def test_unknown_command_is_usage_and_offers_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["trian"]) == 2
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("trian", "handsim: unknown command 'trian' (did you mean 'train'?); valid names: demo,"),
+        ("--verison", "handsim: unknown option '--verison' (did you mean '--version'?)"),
+    ],
+)
+def test_what_is_unknown_is_usage_and_offers_the_nearest(given, said, capsys):
+    assert main([given]) == 2
     captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith(
-        "handsim: unknown command 'trian' (did you mean 'train'?); valid names: demo,"
-    )
-
-
-def test_unknown_option_is_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--verison"]) == 2
-    assert "unknown option '--verison' (did you mean '--version'?)" in capsys.readouterr().err
+    assert captured.out == "" and captured.err.startswith(said)
 
 
 def test_arguments_reach_the_function(invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,18 +90,14 @@ def test_help_of_a_command(invoke: Callable[..., int], capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("args", [[], ["--name", "x", "--tims", "3"], ["--name", "x", "--times", "often"]])
-def test_wrong_options_are_usage(
-    args: list[str], invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_options_are_usage(args, invoke, capsys):
     with pytest.raises(SystemExit) as stop:
         invoke(greet, *args)
     assert stop.value.code == 2
     assert "handsim fake --help" in capsys.readouterr().err
 
 
-def test_a_table_of_functions_becomes_subcommands(
-    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_of_functions_becomes_subcommands(invoke, capsys):
     table = {"greet": greet, "fail": raising(LayoutError("no"))}
     assert invoke(table, "greet", "--name", "x") == 0
     assert capsys.readouterr().out == "hello x\n"
@@ -134,98 +127,59 @@ def test_a_returned_number_is_the_exit_code(invoke: Callable[..., int]) -> None:
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_what_a_user_can_set_right_is_told_in_one_line(
-    error: BaseException, code: int, line: str, invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_user_can_set_right_is_told_in_one_line(error, code, line, invoke, capsys):
     assert invoke(raising(error)) == code
     err = capsys.readouterr().err
     assert err.startswith(f"handsim fake: {line}")
     assert err.count("\n") == 1
 
 
-def test_our_own_mistakes_are_one_line_and_a_log(
-    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_our_own_mistakes_are_one_line_and_a_log(invoke, capsys):
     assert invoke(lambda: 1 // 0) == 1
     said = capsys.readouterr().err
-    found = re.fullmatch(
-        r"handsim fake: unexpected ZeroDivisionError: .*; this is a mistake in handsim, please report it "
-        r"with (\S+)\n",
-        said,
-    )
+    words = "this is a mistake in handsim, please report it"
+    found = re.fullmatch(rf"handsim fake: unexpected ZeroDivisionError: .*; {words} with (\S+)\n", said)
     assert found is not None, said
     log = Path(found[1])
     assert "Traceback (most recent call last)" in log.read_text() and "test_main.py" in log.read_text()
     log.unlink()
 
 
-def test_a_signal_is_told_with_what_is_kept(
-    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_signal_is_told_with_what_is_kept(invoke, capsys):
     assert invoke(raising(Stopped(15, "3 of 8 frames are in out"))) == 143
     assert capsys.readouterr().err == "handsim fake: ended by SIGTERM; 3 of 8 frames are in out\n"
 
 
-def test_names_that_are_no_text_are_printed(
-    invoke: Callable[..., int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_that_are_no_text_are_printed(invoke, monkeypatch):
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8"))
     assert invoke(lambda: print("take\udcff.trc")) == 0
     assert raw.getvalue() == b"take\\udcff.trc\n"
 
 
-def test_a_real_missing_file_names_its_path(
-    invoke: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "gone.trc"
-
-    def read() -> None:
-        path.read_text()
-
-    assert invoke(read) == 1
-    assert capsys.readouterr().err == f"handsim fake: {path}: no such file or folder\n"
-
-
 def shell(line: str) -> subprocess.CompletedProcess[str]:
-    line = line.replace(
-        "handsim", f"{sys.executable} -c 'import handsim.cli.main as c; raise SystemExit(c.main())'"
-    )
+    command = f"{sys.executable} -c 'import handsim.cli.main as c; raise SystemExit(c.main())'"
+    line = line.replace("handsim", command)
     return subprocess.run(["bash", "-c", line], capture_output=True, text=True, cwd=ROOT, check=False)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_on_stdout_is_one_line_and_code_1() -> None:
-    result = shell("handsim --version > /dev/full")
-    assert result.returncode == 1
-    assert result.stderr == "handsim: the disk is full; free some space and run the same command again\n"
+FULL = "handsim: the disk is full; free some space and run the same command again\n"
+NO_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 
 
-def test_a_closed_pipe_is_no_traceback() -> None:
-    result = shell("(sleep 0.5; handsim --version) | true; exit ${PIPESTATUS[0]}")
-    assert (result.returncode, result.stderr) == (141, "")
-
-
-def test_help_into_a_closed_pipe_is_no_traceback() -> None:
-    result = shell("(sleep 0.5; handsim train --help) | true; exit ${PIPESTATUS[0]}")
-    assert (result.returncode, result.stderr) == (141, "")
-
-
-def test_closed_streams_are_no_traceback() -> None:
-    assert shell("handsim --help >&-").stderr == ""
-    result = shell("handsim trian >&- 2>&-")
-    assert (result.returncode, result.stdout) == (2, "")
-
-
-def test_overview_loads_nothing_heavy() -> None:
-    code = (
-        "import sys; from handsim.cli.main import main; main(['--help']); "
-        "print(sorted({'torch', 'mujoco', 'numpy', 'pyrender', 'tyro'} & set(sys.modules)), file=sys.stderr)"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    assert result.stderr == "[]\n"
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        pytest.param("handsim --version > /dev/full", 1, FULL, marks=NO_FULL),
+        ("(sleep 0.5; handsim --version) | true; exit ${PIPESTATUS[0]}", 141, ""),
+        ("(sleep 0.5; handsim train --help) | true; exit ${PIPESTATUS[0]}", 141, ""),
+        ("handsim --help >&-; true", 0, ""),
+        ("handsim trian >&- 2>&-", 2, ""),
+    ],
+)
+def test_full_disks_and_closed_streams_are_no_traceback(line, code, said):
+    result = shell(line)
+    assert (result.returncode, result.stderr) == (code, said)
 
 
 def test_completion_knows_commands_and_options(tmp_path: Path) -> None:
@@ -235,9 +189,8 @@ def test_completion_knows_commands_and_options(tmp_path: Path) -> None:
     def complete(*words: str) -> list[str]:
         typed = " ".join(f"'{word}'" for word in words)
         line = f"source {script}; COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _tyro_handsim; "
-        return subprocess.run(
-            ["bash", "-c", line + 'echo "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
-        ).stdout.split()
+        asked = ["bash", "-c", line + 'echo "${COMPREPLY[@]}"']
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.split()
 
     assert sorted(complete("handsim", "tra")) == ["track", "train"]
     assert complete("handsim", "train", "--thr") == ["--threads"]
@@ -276,10 +229,11 @@ LIGHT = (
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from handsim.cli.main import main\n"
+        "heavy = {'torch', 'mujoco', 'numpy', 'pyrender', 'tyro'}\n"
         "for name in sys.argv[1:]:\n"
         "    try: main([name, '--help'])\n"
         "    except SystemExit: pass\n"
-        "    heavy = sorted(set(sys.modules) & {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib', 'cv2'})\n"
-        "    assert not heavy, (name, heavy)\n"
+        "    assert not heavy & set(sys.modules), (name, heavy & set(sys.modules))\n"
+        "    heavy = {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib', 'cv2'}\n"
     )
-    subprocess.run([sys.executable, "-c", code, "--help", *LIGHT], capture_output=True, text=True, check=True)
+    run_python(code, "--help", *LIGHT)

@@ -35,10 +35,3 @@ def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
     page = out.read_text(encoding="utf-8")
     assert f"<h1>Take {name}</h1>" in page and "Right hand: joint angles" in page
     assert ("mean hands of size M" in page) == (name == "tracked.npz")
-
-
-def test_an_output_that_is_the_take_is_refused(folder, tmp_path, capsys):
-    link = tmp_path / "page.markers.csv"
-    link.symlink_to(folder / "tracked.npz")
-    assert main(["report", str(folder / "tracked.npz"), "--out", str(tmp_path / "page.html")]) == 1
-    assert "is the input" in capsys.readouterr().err

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 
 import numpy as np
 import pytest
@@ -57,35 +55,6 @@ def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, 
     assert ",Take Name,text," in (tmp_path / "text.csv").read_text().splitlines()[0]
     present = truth.markers_present()
     assert present.shape == (20, 38) and present.mean() > 0.8
-
-
-@pytest.mark.parametrize("older", [False, True])
-@pytest.mark.parametrize("step", ["writing the truth", "renaming the truth"])
-def test_a_full_disk_leaves_no_half_pair(older, step, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "take.c3d"
-    command = ["simulate", "--num-frames", "5", "--out", str(out)]
-    if older:
-        assert main(command) == 0
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    full = OSError(errno.ENOSPC, "No space left on device")
-    replace = os.replace
-
-    def fill(*_arguments, **_rest):
-        raise full
-
-    def rename(source, target):
-        if step.startswith("renaming") and str(target) == str(tmp_path / "take.truth.npz"):
-            raise full
-        replace(source, target)
-
-    if step.startswith("writing"):
-        monkeypatch.setattr("gloves.takes.archives.write_npz", fill)
-    monkeypatch.setattr(os, "replace", rename)
-    assert main([*command, "--seed", "1"]) == 1
-    said = capsys.readouterr().err
-    assert "the disk is full" in said and said.count("\n") == 1
-    left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert left == before, "what was there stays"
 
 
 def test_the_optics_are_options_of_the_command(tmp_path):

@@ -93,32 +93,6 @@ def test_folders_and_devices_are_refused_before_any_work(tmp_path: Path) -> None
     assert Path(os.devnull).exists()
 
 
-def test_a_file_where_a_folder_is_wanted(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError), atomic_write(tmp_path / "file" / "a.trc"):
-        pytest.fail("the block must not run")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no file size limits")
-def test_a_write_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
-    """A file size limit stands in for the full disk: the same OSError from the same system call."""
-    script = (
-        "import resource, sys\n"
-        "from handsim.files.outputs import atomic_write\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "try:\n"
-        "    with atomic_write(sys.argv[1]) as temporary:\n"
-        "        temporary.write_bytes(bytes(5000))\n"
-        "except OSError as error:\n"
-        "    print(type(error).__name__)\n"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "a.trc")], capture_output=True, text=True, check=True
-    )
-    assert result.stdout.strip() == "OSError"
-    assert entries(tmp_path) == []
-
-
 def test_files_that_belong_together_come_together(tmp_path: Path) -> None:
     first, second = tmp_path / "a.trc", tmp_path / "b" / "a.npz"
     with pytest.raises(OSError, match="full"), written_together():
@@ -339,9 +313,8 @@ def test_links_that_lead_nowhere_are_named(tmp_path, monkeypatch, capsys):
 def test_commands_refuse_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "take.c3d").write_text("x")
-    (tmp_path / "take.json").symlink_to("take.c3d")
-    (tmp_path / "take.npz").symlink_to("take.c3d")
-    (tmp_path / "take.toml").symlink_to("take.c3d")
+    for ending in ("json", "npz", "toml", "glb", "markers.csv"):
+        (tmp_path / f"take.{ending}").symlink_to("take.c3d")
     for command in (
         ["label", "take.c3d", "--out", "take.c3d"],
         ["label", "take.c3d", "--out", "./take.c3d"],
@@ -350,9 +323,11 @@ def test_commands_refuse_it(tmp_path, monkeypatch, capsys):
         ["track", "take.c3d", "--out", "new.npz", "--labeled", "take.c3d"],
         ["calibrate", "take.c3d", "--out", "take.json"],
         ["body", "take.c3d", "--out", "take.toml"],
+        ["export", "take.npz", "--out", "take.glb"],
+        ["report", "take.c3d", "--out", "take.html"],
     ):
         assert main(command) == 1
-        assert "is the input take.c3d, expected another file" in capsys.readouterr().err
+        assert f"is the input {command[1]}, expected another file" in capsys.readouterr().err
     assert (tmp_path / "take.c3d").read_text() == "x"
 
 

@@ -18,11 +18,6 @@ from handsim.hand.model_files import coordinate_names, hand_osim, hand_urdf
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
 
-@pytest.fixture(params=["right", "left"])
-def model(request, rng):
-    return HandModel(sample_shape(side=request.param, rng=rng))
-
-
 def test_mujoco_reads_it_and_bones_are_where_ours_are(model, rng):
     opened = mujoco.MjModel.from_xml_string(hand_urdf(model))
     data = mujoco.MjData(opened)
@@ -73,6 +68,11 @@ PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "other_programs.md"
 @pytest.fixture(params=["right", "left"])
 def fit(request, rng):
     return attach("dense19", HandModel(sample_shape(side=request.param, rng=rng)))
+
+
+@pytest.fixture
+def model(fit):
+    return fit.model
 
 
 @pytest.fixture

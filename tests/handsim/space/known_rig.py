@@ -123,7 +123,6 @@ MCAL = f"""<?xml version="1.0" encoding="UTF-16LE"?>
 </Cameras></Calibration>
 </calibrationProfile>
 """
-MOTIVE_POINT = np.array([0.4, 1.5, -1.0])
 
 # OpenCV: rows of R are right, down, ahead, and T = -R position. Its pixels count from the first one's center.
 # A: T = -(0, -1, -3) = (0, 1, 3). B: rows y, -z, -x: T = -(1, -2, -4) = (-1, 2, 4).

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import cv2
@@ -91,19 +90,6 @@ def test_what_are_no_cameras_is_told(given):
         CameraRig("mine", given)
 
 
-def test_the_documented_file_says_what_the_document_says(capsys):
-    script = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "rigs.md").read_text("utf-8"), re.S)
-    assert script is not None
-    exec(script[1], {})
-    assert capsys.readouterr().out.split("\n") == [
-        "[ True  True]",
-        "[[587.7 431.5]",
-        " [579.8 451.8]]",
-        "1204 px, 56 x 46 degrees",
-        "",
-    ]
-
-
 distance = st.floats(-2.0, 2.0)
 
 
@@ -171,87 +157,39 @@ def test_points_behind_a_camera_have_no_pixel():
     assert np.isnan(pixels[1, 1, 0]).all()
 
 
-MISTAKES = {
-    "one camera": (TOP + FIRST, "rig 'mine' | 1 cameras | 2 to 32"),
-    "no camera": (TOP, "rig 'mine' | 0 cameras | 2 to 32"),
-    "33 cameras": (
-        TOP + "".join(FIRST.replace("1.0, 0.0, 2.0", f"1.0, {n}.0, 2.0") for n in range(33)),
-        "rig 'mine' | 33 cameras | 2 to 32",
-    ),
-    "two cameras at one place": (TOP + FIRST + SECOND + FIRST, "cameras 1 and 3 | 'mine' | one position"),
-    "text for a number": (
-        TOP + FIRST + SECOND.replace("0.5", '"half"'),
-        'camera 2 | position is [-1.0, "half", 2.0] | three numbers',
-    ),
-    "not a number": (
-        TOP + FIRST + SECOND.replace("0.5", "nan"),
-        "camera 2 | position is [-1.0, NaN, 2.0] | three numbers",
-    ),
-    "two numbers": (
-        TOP + FIRST + SECOND.replace("-1.0, 0.5, 2.0", "-1.0, 0.5"),
-        "camera 2 | position is [-1.0, 0.5] | three numbers",
-    ),
-    "a camera that looks at itself": (
-        TOP + FIRST + SECOND.replace("[-1.0, 0.5, 2.0]", "[0.0, 0.0, 1.0]"),
-        "camera 2 | its own position | target",
-    ),
-    "millimeters": (
-        TOP + FIRST + SECOND.replace("[-1.0, 0.5, 2.0]", "[-1000.0, 500.0, 2000.0]"),
-        "camera 2 | 'mine' | 2291 m | at most 50 m | millimeters",
-    ),
-    "damaged": (TOP + FIRST + SECOND + "target = [0.0,", "not a TOML file | end of document"),
-    "name of another type": ("name = 3\n" + FIRST + SECOND, "name is 3 | text in quotes"),
-    "no field of view": (
-        'name = "mine"\n' + FIRST + SECOND,
-        "camera 1 | focal, K, field_of_view, horizontal_field_of_view",
-    ),
-    "unknown key": (
-        TOP + FIRST + SECOND.replace("target", "targets"),
-        "camera 2 | 'targets' | 'target' | T_world_camera",
-    ),
-    "no target": (
-        TOP + FIRST + SECOND.split("target", maxsplit=1)[0],
-        "camera 2 has position | position and target, or T_world_camera",
-    ),
-    "too much": (
-        TOP + FIRST + SECOND + "T_world_camera = [[1.0]]\n",
-        "camera 2 has position and target and T_world_camera | position and target, or T_world_camera",
-    ),
-    "three rows": (
-        TOP + FIRST + "[[camera]]\nT_world_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]\n",
-        "camera 2 | T_world_camera is [[1, 0, 0, 0] | four rows of four numbers",
-    ),
-    "ragged rows": (
-        TOP + FIRST + "[[camera]]\nT_world_camera = [[1, 0, 0, 0], [0, 1]]\n",
-        "camera 2 | T_world_camera is [[1, 0, 0, 0], [0, 1]] | four rows of four numbers",
-    ),
-    "a pose that scales": (
-        TOP
-        + FIRST
-        + "[[camera]]\nT_world_camera = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]\n",
-        "'camera2' | T_world_camera | rigid transform",
-    ),
-    "field of view in radians": (
-        TOP.replace("50.0", "0.87") + FIRST + SECOND,
-        "camera 1 | field_of_view is 0.87 degrees | 1 to 170",
-    ),
-    "resolution of half a pixel": (
-        TOP + "resolution = 640.5\n" + FIRST + SECOND,
-        "camera 1 | resolution is 640.5 | whole number of pixels",
-    ),
-    "resolution of nothing": (
-        TOP + "resolution = 0\n" + FIRST + SECOND,
-        "'camera1' | 0 x 0 pixels | 1 to 8192",
-    ),
-    "camera is no table": (TOP + "camera = 3\n", "camera | [[camera]] table"),
-}
+FILE = TOP + FIRST + SECOND
+CROWD = "".join(FIRST.replace("1.0, 0.0, 2.0", f"1.0, {n}.0, 2.0") for n in range(1, 33))
+POSE = "position = [-1.0, 0.5, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
+MISTAKES = [  # what is exchanged for what, at its last place, and what is told
+    (SECOND, "", "rig 'mine' | 1 cameras | 2 to 32"),
+    (FIRST + SECOND, "", "rig 'mine' | 0 cameras | 2 to 32"),
+    (SECOND, CROWD, "rig 'mine' | 33 cameras | 2 to 32"),
+    (SECOND, SECOND + FIRST, "cameras 1 and 3 | 'mine' | one position"),
+    ("0.5", '"half"', 'camera 2 | position is [-1.0, "half", 2.0] | three numbers'),
+    ("0.5", "nan", "camera 2 | position is [-1.0, NaN, 2.0] | three numbers"),
+    ("0.5, 2.0", "0.5", "camera 2 | position is [-1.0, 0.5] | three numbers"),
+    ("-1.0, 0.5, 2.0", "0.0, 0.0, 1.0", "camera 2 | its own position | target"),
+    ("-1.0, 0.5, 2.0", "-1000, 500, 2000", "camera 2 | 'mine' | 2291 m | at most 50 m | millimeters"),
+    (SECOND, SECOND + "target = [0.0,", "not a TOML file | end of document"),
+    ('"mine"', "3", "name is 3 | text in quotes"),
+    ("field_of_view = 50.0\n", "", "camera 1 | focal, K, field_of_view, horizontal_field_of_view"),
+    ("target", "targets", "camera 2 | 'targets' | 'target' | T_world_camera"),
+    ("target = [0.0, 0.0, 1.0]\n", "", "camera 2 has position | position and target, or T_world_camera"),
+    (POSE, POSE + "T_world_camera = [[1.0]]\n", "camera 2 has position and target and T_world_camera"),
+    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]\n", "camera 2 | four rows"),
+    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1]]\n", "camera 2 | [[1, 0, 0, 0], [0, 1]] | four rows"),
+    ("50.0", "0.87", "camera 1 | field_of_view is 0.87 degrees | 1 to 170"),
+    (TOP, TOP + "resolution = 640.5\n", "camera 1 | resolution is 640.5 | whole number of pixels"),
+    (TOP, TOP + "resolution = 0\n", "'camera1' | 0 x 0 pixels | 1 to 8192"),
+    (FIRST + SECOND, "camera = 3\n", "camera | [[camera]] table"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("case", MISTAKES)
-def test_mistakes_in_a_file_are_told(tmp_path, case):
+@pytest.mark.parametrize(("old", "new", "words"), MISTAKES)
+def test_mistakes_in_a_file_are_told(tmp_path, old, new, words):
     path = tmp_path / "rig.toml"
-    text, words = MISTAKES[case]
-    path.write_text(text)
+    assert old in FILE
+    path.write_text(new.join(FILE.rsplit(old, 1)))
     with error_names(RigError, f"{path} | {words}"):
         load_rig(path)
 
@@ -284,12 +222,8 @@ def test_cameras_in_the_hand_are_refused():
     with error_names(ArgumentError, "camera 3 of rig 'six' is 0.0 | m from the hand | at least 0.05 m"):
         check_outside(rig, np.concatenate([far, near]))
     with error_names(ArgumentError, "camera 3 of rig 'six' is | m from the pen, expected at least 3 m"):
-        check_outside(
-            CameraRig("six", [rig.cameras[number] for number in (3, 4, 0)]),
-            [2.0, 0.0, 3.5],
-            clearance=3.0,
-            what="pen",
-        )
+        three = CameraRig("six", [rig.cameras[number] for number in (3, 4, 0)])
+        check_outside(three, [2.0, 0.0, 3.5], clearance=3.0, what="pen")
 
 
 def test_cameras_in_the_volume_are_refused():
@@ -419,7 +353,7 @@ def test_what_is_written_is_read(tmp_path_factory, position, focal, coefficients
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "words"),
     [
         ('name = "above"', 'name = "left"', "two cameras are called 'left'"),
         ('name = "above"', 'name = "a/b"', "expected up to 64 letters"),
@@ -428,19 +362,16 @@ def test_what_is_written_is_read(tmp_path_factory, position, focal, coefficients
         ('lens = "brown"', 'lens = "brow"', "did you mean 'brown'"),
         ("-0.002, 0.01]", "-0.002]", "expected 5 finite numbers"),
         ("focal = [500, 500]", "focal = [500]", "camera 2: focal is"),
-        ("focal = [500, 500]\n", "", "camera 2 has no focal length, expected one of focal, K, field_of_view"),
         ("focal = [500, 500]", "focal = 500\nfield_of_view = 60", "camera 2 has focal and field_of_view"),
         ("focal = [500, 500]", "K = [[500, 0, 9], [0, 500, 9], [1, 0, 1]]", "K is not a matrix"),
         ("size = [800, 600]", "size = [800, 600]\nresolution = 800", "size and resolution are given"),
         ("[0, 0, -1, 1]", "[0, 0, -1, 1000]", "are these millimeters"),
         ("[0, 0, -1, 1]", "[0, 0, 1, 1]", "not a rigid transform"),
-        ("target = [0.0, 0.0, 0.1]", "target = [0.5, -0.1, 0.4]", "looks at its own position"),
         ('name = "desk"', "name = 3\nfov = 2", "unknown key 'fov'"),
     ],
 )
-def test_mistakes_are_told(tmp_path, old, new, message):
+def test_mistakes_about_a_camera_are_told(tmp_path, old, new, words):
     assert old in TWO
     path = written(tmp_path, TWO.replace(old, new))
-    with pytest.raises(RigError, match=message) as error:
+    with error_names(RigError, f"{path} | {words}"):
         load_cameras(path)
-    assert str(path) in str(error.value)

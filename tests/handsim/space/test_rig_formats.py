@@ -45,17 +45,14 @@ NAMES = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_known_rig(tmp_path, kind):
-    cameras = load_cameras(written(tmp_path)[kind])
-    check(cameras)
-    assert tuple(camera.name for camera in cameras) == NAMES[kind]
-    assert {camera.lens.kind for camera in cameras} == {"pinhole"}
-
-
 @pytest.mark.parametrize("kind", [*KINDS, "motive"])
-def test_the_known_rig_as_a_rig(tmp_path, kind):
+def test_the_known_rig(tmp_path, kind):
     path = written(tmp_path)[kind]
+    if kind != "motive":  # whose y is up
+        cameras = load_cameras(path)
+        check(cameras)
+        assert tuple(camera.name for camera in cameras) == NAMES[kind]
+        assert {camera.lens.kind for camera in cameras} == {"pinhole"}
     rig = CameraRig("lab", import_cameras(path))
     np.testing.assert_allclose(rig.positions, POSITIONS, atol=1e-6)
     np.testing.assert_allclose(rig.project(POINT), PIXELS, atol=1e-3)
@@ -68,13 +65,7 @@ def damaged(path, text, old, new, encoding="utf-8"):
 
 
 BAD = [
-    (
-        "a.xcp",
-        XCP,
-        'ORIENTATION="0.5 0.5 -0.5 0.5"',
-        'ORIENTATION="0 0 0 0"',
-        "quaternion of length 0, expected 1",
-    ),
+    ("a.xcp", XCP, '"0.5 0.5 -0.5 0.5"', '"0 0 0 0"', "quaternion of length 0, expected 1"),
     ("a.xcp", XCP, "4000 1000 2000", "nan 1000 2000", "POSITION is .*, expected 3 finite numbers"),
     ("a.xcp", XCP, "4000 1000 2000", "4000 1000", "POSITION is .*, expected 3 finite numbers"),
     ("a.xcp", XCP, "4000 1000 2000", "1e300 0 0", "POSITION is .*, expected 3 finite numbers"),
@@ -96,13 +87,7 @@ BAD = [
     ("a.xml", QUALISYS, "<transform x", "<transformed x", "lacks <transform>"),
     ("a.xml", QUALISYS, '<calibration source="by hand"', '<settings source="by hand"', "it is no XML"),
     ("a.mcal", MCAL, 'OrientMatrix4="1"', 'OrientMatrix4="-1"', "OrientMatrix is not a rotation matrix"),
-    (
-        "a.mcal",
-        MCAL,
-        'ImagerPixelWidth="1000"',
-        'ImagerPixelWidth="inf"',
-        "ImagerPixelWidth is .inf., expected",
-    ),
+    ("a.mcal", MCAL, 'PixelWidth="1000"', 'PixelWidth="inf"', "ImagerPixelWidth is .inf., expected"),
     ("a.mcal", MCAL, "<Attributes", "<Attribute", "lacks <Attributes>"),
 ]
 
@@ -362,10 +347,7 @@ BOMB = """<?xml version="1.0"?>
     [
         (BOMB, "has a document type"),
         ('<!DOCTYPE c SYSTEM "file:///etc/passwd"><Cameras/>', "has a document type"),
-        (
-            '<!DOCTYPE c [<!ENTITY x SYSTEM "file:///etc/passwd">]><Cameras>&x;</Cameras>',
-            "has a document type",
-        ),
+        ('<!DOCTYPE c [<!ENTITY x SYSTEM "/etc/passwd">]><Cameras>&x;</Cameras>', "has a document type"),
         ("<Cameras>&x;</Cameras>", "it is no XML"),
         ("<a>" * 100_000, "nested deeper than 64"),
         ("<Cameras>" + "<a/>" * 300_000 + "</Cameras>", "more than 200000 elements"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -84,8 +85,6 @@ def test_an_interrupted_finish_goes_on(make_frame, tmp_path: Path) -> None:
 
 
 def test_a_bent_lens_and_missing_colors_are_told(make_frame, camera, tmp_path: Path) -> None:
-    import dataclasses
-
     writer = FreihandWriter(tmp_path)
     fisheye = dataclasses.replace(camera, lens=Lens("fisheye", (0.1, 0.0, 0.0, 0.0)))
     with pytest.raises(HandSimError, match="'fisheye', which this format cannot hold"):

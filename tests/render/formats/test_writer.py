@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
+import resource
+import signal
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,16 +19,14 @@ from handsim.errors import DatasetError
 from handsim.files.outputs import save_json
 from render import Pictures, RenderedFrame, merge_renderings
 from render.formats.shards import BESIDE
-from render.formats.writer import CONFIG, FORMATS, FrameWriter, open_writer
+from render.formats.writer import CONFIG, FORMATS, open_writer
+from tests.programs import ROOT, run_python
 from tests.render.formats.reading import depth_of, exr_content
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
-    }
+    found = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
 
 
 def broken(frame: RenderedFrame) -> Iterator[RenderedFrame]:
@@ -74,11 +72,8 @@ def test_a_shard_may_be_written_anew(name: str, make_frame, tmp_path: Path) -> N
 def test_what_killed_writers_left_is_cleared(name: str, make_frame, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path)
     writer.write(0, [make_frame()])
-    (place,) = (
-        path.parent
-        for path in tmp_path.rglob("shard-00000*")
-        if path.relative_to(tmp_path).parts[0] not in BESIDE
-    )
+    shards = tmp_path.rglob("shard-00000*")
+    (place,) = (path.parent for path in shards if path.relative_to(tmp_path).parts[0] not in BESIDE)
     (place / ".shard-00000.tmp-1").mkdir()
     (place / ".shard-00000.tmp-1" / "rest.jpg").write_bytes(b"")
     (place / ".shard-00000.tmp-2.tar").write_bytes(b"")
@@ -92,22 +87,15 @@ def test_what_killed_writers_left_is_cleared(name: str, make_frame, tmp_path: Pa
 def test_a_place_that_takes_no_files_is_told(name: str, make_frame, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     writer = open_writer(name, tmp_path / "file" / "set")
-    with pytest.raises(
-        HandSimError,
-        match=r"writing shard 0 failed: (Not a directory|.*is a file, not a folder); shards that were",
-    ) as told:
+    words = r"writing shard 0 failed: (Not a directory|.*is a file, not a folder); shards that were"
+    with pytest.raises(HandSimError, match=words) as told:
         writer.write(0, [make_frame()])
     assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_full_disk_is_told_and_finished_shards_stay(
-    name: str, make_frame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_told_and_finished_shards_stay(name, make_frame, tmp_path):
     """The file system's own limit on a file's size stands for a full disk; both are an OSError."""
-    resource = pytest.importorskip("resource")
-    import signal
-
     writer = open_writer(name, tmp_path)
     writer.write(0, [make_frame(0)])
     before = files(tmp_path)
@@ -172,9 +160,8 @@ def test_images_name_their_files_of_depth_and_ids(name: str, make_frame, tmp_pat
     writer.finish()
     (file,) = (*tmp_path.glob("annotations.json"), *tmp_path.rglob("*_data.json"))
     (image,) = json.loads(file.read_text())["images"]
-    np.testing.assert_allclose(
-        depth_of((tmp_path / image["depth_file"]).read_bytes()), frame.ideal.depth, atol=1e-4
-    )
+    depth = depth_of((tmp_path / image["depth_file"]).read_bytes())
+    np.testing.assert_allclose(depth, frame.ideal.depth, atol=1e-4)
     ids = cv2.imread(str(tmp_path / image["ids_file"]))
     np.testing.assert_array_equal(ids[..., 1], frame.ideal.instances)
     assert (tmp_path / image["normals_file"]).is_file() and "depth_ideal_file" not in image
@@ -210,12 +197,9 @@ def test_png_and_exr_hold_the_pictures(make_frame, tmp_path: Path) -> None:
 @pytest.fixture
 def clip(make_frame, camera, tmp_path: Path) -> tuple[Path, list[RenderedFrame]]:
     other = dataclasses.replace(camera, name="other").at(look_at(np.array([0.1, -0.5, -0.3]), np.zeros(3)))
-    frames = [
-        make_frame(number, ("right", "left"), camera=view, noisy=True)
-        for number in (4, 5)
-        for view in (camera, other)
-    ]
-    writer: FrameWriter = open_writer("webdataset", tmp_path)
+    views = [(number, view) for number in (4, 5) for view in (camera, other)]
+    frames = [make_frame(number, ("right", "left"), camera=view, noisy=True) for number, view in views]
+    writer = open_writer("webdataset", tmp_path)
     writer.write(0, frames)
     writer.finish()
     return tmp_path / "shard-00000.tar", frames
@@ -229,18 +213,11 @@ def test_a_tar_holds_samples_and_the_hand(clip) -> None:
     assert {(member.mtime, member.uid, member.gid, member.uname) for member in members} == {(0, 0, 0, "")}
     names = [member.name for member in members]
     assert len(set(names)) == len(names)
-    assert {name.partition(".")[2] for name in names if name.startswith("000004.")} == {
-        *(f"image_{stream}.jpg" for stream in ("small", "other")),
-        *(
-            f"{kind}_{stream}.png"
-            for kind in ("depth", "depth_ideal", "normals", "ids")
-            for stream in ("small", "other")
-        ),
-        *(
-            f"{kind}.json"
-            for kind in ("cameras", "hands", "hand_crops", "objects", "markers", "choices", "info")
-        ),
-    }
+    pictures = ("image_{}.jpg", "depth_{}.png", "depth_ideal_{}.png", "normals_{}.png", "ids_{}.png")
+    tables = ("cameras", "hands", "hand_crops", "objects", "markers", "choices", "info")
+    expected = {name.format(stream) for name in pictures for stream in ("small", "other")}
+    expected |= {f"{kind}.json" for kind in tables}
+    assert {name.partition(".")[2] for name in names if name.startswith("000004.")} == expected
     assert len(shapes["umetrack"]["mesh_vertices"]) == len(HandModel.named("M").surface.vertices)
 
 
@@ -281,14 +258,15 @@ def test_what_a_clip_cannot_hold_is_told(make_frame, camera, tmp_path: Path) -> 
     assert writer.done() == frozenset()
 
 
-def test_writers_need_no_window() -> None:
+def test_writers_need_no_window():
     """Files can be written, and read, where nothing can be drawn."""
-    code = (
-        "import sys, render.formats.writer; "
-        "print([x for x in ('pyrender', 'OpenGL', 'torch') if x in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "[]"
+    code = "import sys, render.formats.writer; print({'pyrender', 'OpenGL', 'torch'} & set(sys.modules))"
+    assert run_python(code).stdout == "set()\n"
+
+
+def test_the_page_names_every_format():
+    page = (ROOT / "docs" / "formats.md").read_text("utf-8")
+    assert all(f"| `{name}` |" in page for name in FORMATS)
 
 
 def rendering(folder, make_frame, formats, *, frames=4, start=0):

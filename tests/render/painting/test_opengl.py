@@ -1,44 +1,17 @@
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from handsim import HandModel, join_qpos
-from poses.shapes import gesture
 from render import SkinLook
-from render.illustrations import view_along
 from render.painting import opengl as gl
-from render.painting.figures import shade_colors, skin_material
-from render.painting.opengl import (
-    OPENGL_FROM_OPENCV,
-    add_lights,
-    frame_with_z,
-    is_hardware,
-    load_pyrender,
-    offscreen_renderer,
-    pyrender_material,
-)
+from render.painting.opengl import frame_with_z, is_hardware
 from render.scenery.lights import STUDIO, Lamp, Lighting
-from render.skin.mesh import PosableSkin
 from render.skin.texture import skin_texture
-
-ROOT = Path(__file__).resolve().parents[3]
-
-
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        check=False,
-    )
+from tests.programs import run_python
+from tests.render.scenes import draw_back
 
 
 def test_no_driver_is_one_sentence_that_names_the_packages() -> None:
@@ -49,7 +22,7 @@ def test_no_driver_is_one_sentence_that_names_the_packages() -> None:
         "except HandSimError as error:\n    print(error)"
     )
     # A device that no machine has stands in for a missing driver.
-    result = python(code, PYOPENGL_PLATFORM="egl", EGL_DEVICE_ID="4711")
+    result = run_python(code, check=False, PYOPENGL_PLATFORM="egl", EGL_DEVICE_ID="4711")
     assert result.stdout.startswith("drawing without a screen failed (egl: "), result
     assert "apt-get install libegl1" in result.stdout
     assert result.stdout.count("\n") == 1
@@ -62,16 +35,20 @@ def test_one_renderer_a_process() -> None:
         "try:\n    print(r(8, 8) is r(16, 9))\n"
         "except HandSimError:\n    print(True)"
     )
-    assert python(code).stdout == "True\n"
+    assert run_python(code).stdout == "True\n"
 
 
-def test_glove_commands_that_draw_nothing_load_no_gl() -> None:
+def test_what_draws_nothing_loads_no_gl():
+    """Commands about gloves, and the look for hardware."""
     code = (
         "import sys\nfrom handsim.cli.main import main\n"
         "main(['glove', 'list']); main(['glove', 'show', 'dense19'])\n"
-        "print(sorted({'pyrender', 'OpenGL', 'torch', 'cv2'} & set(sys.modules)), file=sys.stderr)"
+        "assert not {'pyrender', 'OpenGL', 'torch', 'cv2'} & set(sys.modules)\n"
+        "from render.painting.painter import choose_painter\n"
+        "assert choose_painter() in ('compiled', 'opengl')\n"
+        "assert not {'pyrender', 'OpenGL'} & set(sys.modules)\n"
     )
-    assert python(code).stderr == "[]\n"
+    run_python(code)
 
 
 @pytest.mark.parametrize(
@@ -107,16 +84,6 @@ def test_a_device_without_a_working_driver_is_not_hardware(monkeypatch: pytest.M
     assert gl.opengl_has_hardware.__wrapped__() is False
 
 
-def test_the_check_loads_no_gl() -> None:
-    code = (
-        "import sys\nfrom render.painting.painter import choose_painter\n"
-        "assert choose_painter() in ('compiled', 'opengl')\n"
-        "print(sorted({'pyrender', 'OpenGL'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout == "[]\n"
-
-
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, -2.0, 0.5), (0.0, -3.0, 0.0)])
 def test_frame_with_z(direction: tuple[float, float, float]) -> None:
     frame = frame_with_z(np.array(direction))
@@ -125,28 +92,8 @@ def test_frame_with_z(direction: tuple[float, float, float]) -> None:
     assert np.linalg.det(frame) > 0.0
 
 
-def draw(lighting: Lighting) -> np.ndarray:
-    """A flat hand's back, (200, 200, 4)."""
-    pyrender = load_pyrender()
-    model = HandModel.named("M")
-    skin = PosableSkin(model).posed(join_qpos(gesture("flat")[None])[0])
-    view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, (200, 200))
-    scene = pyrender.Scene(bg_color=[0.0] * 4)
-    primitive = pyrender.Primitive(
-        positions=skin.vertices,
-        normals=skin.normals,
-        indices=skin.faces,
-        texcoord_0=skin.uv,
-        color_0=shade_colors(skin.shade),
-        material=pyrender_material(skin_material(skin_texture(SkinLook()))),
-    )
-    scene.add(pyrender.Mesh([primitive]))
-    camera = pyrender.PerspectiveCamera(np.deg2rad(24.0), znear=0.05, zfar=10.0)
-    scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
-    add_lights(pyrender, scene, lighting, view.T_world_camera)
-    flags = pyrender.RenderFlags
-    picture, _ = offscreen_renderer(200, 200).render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)
-    return np.asarray(picture)
+def draw(lighting):
+    return draw_back("right", skin_texture(SkinLook()), lighting, (200, 200))[0]
 
 
 @pytest.mark.usefixtures("drawing")
@@ -174,6 +121,5 @@ def test_a_white_surface_sends_back_what_a_lamp_gives() -> None:
     picture = draw(Lighting((Lamp((0.0, 0.0, -1.0), 1.0),), (0.0, 0.0, 0.0)))
     hand = picture[..., 3] == 255
     shown = np.median(picture[hand, :3], axis=0)
-    texture = skin_texture(look)
-    own = np.median(texture.color.reshape(-1, 3), axis=0)
+    own = np.median(skin_texture(look).color.reshape(-1, 3), axis=0)
     assert np.abs(shown - own).max() < 45.0

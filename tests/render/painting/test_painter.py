@@ -18,31 +18,18 @@ from handsim.space.camera import pinhole
 from poses.shapes import gesture
 from render.painting.figures import Drawn, HandFigure, Material, sample_people
 from render.painting.painter import Painter, paint, put_before
-from render.painting.rasterizer import Triangles, rasterize
+from render.painting.rasterizer import rasterize
 from render.scenery.lights import Lamp, Lighting, sample_lighting
 from render.skin.look import TONES
+from tests.render.scenes import plain, thing
 
 CAMERA = pinhole("small", (96, 72), 90.0)
 DARK = (0.0, 0.0, 0.0)
 
 
-def thing(mesh: trimesh.Trimesh, material: Material, smooth: bool = True) -> Drawn:
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    if not smooth:
-        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-    normals = np.array(mesh.vertex_normals if smooth else np.repeat(mesh.face_normals, 3, axis=0))
-    ids = np.ones(len(faces), dtype=np.uint8)
-    triangles = Triangles(vertices, faces, normals, ids, ids, ids)
-    return Drawn(triangles, np.ones((len(vertices), 4), dtype=np.float32), None, lambda: material)
-
-
 def ball(material: Material, place: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Drawn:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
     return thing(mesh.apply_translation(place), material)
-
-
-def plain(level: float = 0.5, roughness: float = 1.0) -> Material:
-    return Material(np.full(3, level), roughness)
 
 
 @settings(max_examples=20, deadline=None)

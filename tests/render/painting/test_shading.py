@@ -9,11 +9,11 @@ from scipy.ndimage import binary_dilation
 
 from handsim.space.camera import pinhole
 from render.painting import shading
-from render.painting.figures import Drawn, Material
-from render.painting.rasterizer import Triangles
+from render.painting.figures import Drawn
 from render.painting.shading import BUMP, COLOR, ROUGH, SPOT, TO_DISPLAY, TO_LINEAR, light_behind
 from render.scenery.backgrounds import SHARE, Backdrop, sample_backdrop
 from render.scenery.lights import Lamp, Lighting
+from tests.render.scenes import plain, thing
 
 
 def test_texels_are_mixed_from_the_four_around_a_point(rng):
@@ -53,23 +53,12 @@ SHARP = 1e-3
 
 def ball(place: tuple[float, float, float] = CENTER) -> tuple[trimesh.Trimesh, Drawn]:
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS).apply_translation(place)
-    ids = np.ones(len(mesh.faces), dtype=np.uint8)
-    triangles = Triangles(np.array(mesh.vertices), np.array(mesh.faces), mesh.vertex_normals, ids, ids, ids)
-    colors = np.ones((len(mesh.vertices), 4), dtype=np.float32)
-    return mesh, Drawn(triangles, colors, None, lambda: Material(np.full(3, 0.5), 1.0))
+    return mesh, thing(mesh, plain())
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    st.floats(-0.6, 0.6),
-    st.floats(-0.6, 0.6),
-    st.floats(-0.4, 0.4),
-    st.floats(-0.4, 0.4),
-    st.floats(0.0, 0.3),
-)
-def test_it_falls_where_the_lamp_is_hidden(
-    aside: float, above: float, right: float, down: float, gap: float
-) -> None:
+@given(*[st.floats(-0.6, 0.6)] * 2, *[st.floats(-0.4, 0.4)] * 2, st.floats(0.0, 0.3))
+def test_it_falls_where_the_lamp_is_hidden(aside, above, right, down, gap):
     mesh, drawn = ball()
     towards = np.array([aside, above, -1.0])
     lighting = Lighting((Lamp((aside, above, -1.0), 1.0),), (0.0, 0.0, 0.0))

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim import Camera, HandSimError, look_at
+from handsim import Camera, HandSimError, load_rig, look_at
 from handsim.space.camera import preset
-from handsim.space.rig import load_rig
 from render import Backgrounds, RenderConfig, RenderedFrame, ViewConfig, draw
 from render.frames import Geometry
 from render.scenery.backgrounds import (

@@ -74,11 +74,14 @@ def test_parts_follow_the_weights(model: HandModel) -> None:
             assert np.hypot(*local[1:]) < 0.006
 
 
-def test_left_hand_is_the_mirror_image() -> None:
-    right, left = (PosableSkin(HandModel.named("M", side=side), Forearm(flexion=0.2)) for side in SIDES[::-1])
+def test_left_hand_is_the_mirror_image(rng):
+    forearm = Forearm(flexion=0.2)
+    right, left = (PosableSkin(HandModel.named("M", side=side), forearm, bony=1.3) for side in SIDES[::-1])
     np.testing.assert_allclose(left.rest, right.rest @ MIRROR, atol=1e-9)
-    qpos = join_qpos(gesture("pinch_index")[None])[0]
-    np.testing.assert_allclose(left.posed(qpos).shade, right.posed(qpos).shade, atol=1e-5)
+    qpos = join_qpos(rng.uniform(0.0, 1.2, (1, 20)))[0]  # whose knuckles and tendons stand out
+    ours, mirrored = left.posed(qpos), right.posed(qpos)
+    np.testing.assert_allclose(ours.vertices, mirrored.vertices @ MIRROR, atol=1e-6)
+    np.testing.assert_allclose(ours.shade, mirrored.shade, atol=1e-5)
 
 
 def test_folds_are_darker_than_what_lies_open(model: HandModel) -> None:
@@ -211,13 +214,6 @@ def test_shapes_grow_with_the_angle_and_never_jump() -> None:
     heights = [rises("right", index_MCP_flexion=angle)[1].max() for angle in np.arange(0.0, 96.0, 4.0)]
     assert (np.diff(heights) > -1e-4).all()
     assert np.abs(np.diff(heights)).max() < 6e-4
-
-
-def test_both_hands_are_mirror_images(rng: np.random.Generator) -> None:
-    angles = rng.uniform(0.0, 1.2, 20)
-    right, left = (PosableSkin(HandModel.named("M", side=side), bony=1.3) for side in SIDES[::-1])
-    shaped = [one._flexion.shaped(one.rest, angles) for one in (right, left)]
-    np.testing.assert_allclose(shaped[1], shaped[0] @ MIRROR, atol=1e-9)
 
 
 def test_a_spread_hand_shows_tendons_between_wrist_and_knuckles() -> None:

@@ -3,22 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handsim import HandModel, join_qpos
+from handsim import HandModel
 from handsim.hand.shape import SIDES, Side
-from poses.shapes import gesture
 from render import SkinLook
-from render.illustrations import view_along
-from render.painting.figures import skin_material
-from render.painting.opengl import (
-    OPENGL_FROM_OPENCV,
-    add_lights,
-    load_pyrender,
-    offscreen_renderer,
-    pyrender_material,
-)
 from render.scenery.lights import Lamp, Lighting
 from render.skin.look import CUFF, Forearm
-from render.skin.mesh import PosableSkin, skin_atlas
+from render.skin.mesh import skin_atlas
 from render.skin.texture import (
     REFERENCE,
     GloveLook,
@@ -31,6 +21,7 @@ from render.skin.texture import (
     skin_texels,
     skin_texture,
 )
+from tests.render.scenes import draw_back
 
 SIZE = (400, 400)
 
@@ -64,31 +55,16 @@ def test_relief_stays_under_a_millimeter_and_off_the_palm() -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> None:
     """A ridge over the back of the hand, lengthwise or across, with a lamp to the left of it or above."""
-    pyrender, model = load_pyrender(), HandModel.named("M", side=side)
     texels, (width, rows) = skin_texels(), skin_atlas().size
     where = (0.05, 0.0)[axis]
     height = 0.0015 * np.exp(-(((texels.positions[:, axis] - where) / 0.004) ** 2)) * (texels.dorsal > 0.0)
     gray = np.full((rows, width, 3), 150, dtype=np.uint8)
     texture = SkinTexture(gray, np.full((rows, width), 255, dtype=np.uint8), normal_map(height, side))
     plain = texture._replace(normals=normal_map(0.0 * height, side))
-    skin = PosableSkin(model).posed(join_qpos(gesture("flat")[None])[0])
-    view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, SIZE)
     lamp = Lamp((-1.0, 0.0, -1.0) if axis == 1 else (0.0, -1.0, -1.0), 1.0)
     drawn = []
     for paint in (texture, plain):
-        scene = pyrender.Scene(bg_color=[0.0] * 4)
-        primitive = pyrender.Primitive(
-            positions=skin.vertices,
-            normals=skin.normals,
-            indices=skin.faces,
-            texcoord_0=skin.uv,
-            material=pyrender_material(skin_material(paint)),
-        )
-        scene.add(pyrender.Mesh([primitive]))
-        camera = pyrender.PerspectiveCamera(np.deg2rad(24.0), znear=0.05, zfar=10.0)
-        scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
-        add_lights(pyrender, scene, Lighting((lamp,), (0.1, 0.1, 0.1)), view.T_world_camera)
-        picture, _ = offscreen_renderer(*SIZE).render(scene, flags=pyrender.RenderFlags.NONE)
+        picture, view = draw_back(side, paint, Lighting((lamp,), (0.1, 0.1, 0.1)), SIZE)
         drawn.append(picture[..., 0].astype(float))
     change = drawn[0] - drawn[1]
     # Seen from the back with the fingers up, x is up in the picture; y is to the left on a right hand.

@@ -10,9 +10,8 @@ import pytest
 
 from gloves import Capture, write_capture
 from gloves.layout import starter_layout
-from handsim import HandModel, HandSimError
+from handsim import HandModel, HandSimError, load_rig
 from handsim.errors import ArgumentError, CaptureError
-from handsim.space.rig import load_rig
 from tests.rigs import mixed_rig
 from track import User
 from track.viewer.contents import ACCEPTED, open_content

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from gloves import load_layout
-from handsim.space.rig import ROOM_CENTER, load_rig
+from handsim import load_rig
+from handsim.space.rig import ROOM_CENTER
 from train.forecast.rig_forecast import light, sample_work
 from train.simulation.room import RoomConfig
 

@@ -8,10 +8,9 @@ import pytest
 from gloves import OpticsConfig, load_layout
 from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import reconstruct
-from handsim import look_at
+from handsim import load_rig, look_at
 from handsim.errors import CaptureError
 from handsim.hand.model import BodyMotion
-from handsim.space.rig import load_rig
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train import simulate_take

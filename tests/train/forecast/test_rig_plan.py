@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim import CameraRig
+from handsim import CameraRig, load_rig
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
-from handsim.space.rig import load_rig
 from train import plan_rig
 from train.forecast.rig_forecast import light
 from train.forecast.rig_plan import Planning, places, view_candidates

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim import look_at
-from handsim.space.rig import ROOM_CENTER, list_rigs, load_rig
+from handsim import load_rig, look_at
+from handsim.space.rig import ROOM_CENTER, list_rigs
 from tests.rigs import square_rig
 from train import CameraLoss
 from train.forecast.rig_score import (

@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 from gloves import load_layout
-from handsim import HandModel, Population, join_qpos
+from handsim import HandModel, Population, join_qpos, load_rig
 from handsim.errors import ArgumentError, DatasetError, HandSimWarning, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
-from handsim.space.rig import load_rig
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for

@@ -13,11 +13,10 @@ import trimesh
 from gloves import GlovedHand, OpticsConfig, Take, attach, load_layout
 from gloves.optics.ghosts import StrayConfig
 from gloves.optics.visibility import MAX_FACING
-from handsim import HandModel, RigidObject, look_at
+from handsim import HandModel, RigidObject, load_rig, look_at
 from handsim.errors import ArgumentError
 from handsim.hand.model import BodyMotion
 from handsim.space.objects import named_object
-from handsim.space.rig import load_rig
 from poses import sample_motion
 from tests.rigs import square_rig
 from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources

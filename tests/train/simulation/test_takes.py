@@ -11,10 +11,10 @@ import pytest
 
 from gloves import OpticsConfig, Take, load_layout, load_take
 from gloves.captures.capture import count_gaps
-from handsim import HandModel, HandSimError
+from handsim import HandModel, HandSimError, load_rig
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
-from handsim.space.rig import ROOM_CENTER, load_rig
+from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW

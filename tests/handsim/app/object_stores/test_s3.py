@@ -25,7 +25,14 @@ from handsim import HandSimError
 from handsim.app.output import open_output
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.cli.main import main
-from tests.handsim.app.object_stores.stored_set import ALONE, CONFIG, ROWS, contents, write_three
+from tests.handsim.app.object_stores.stored_set import (
+    ALONE,
+    CONFIG,
+    PRELOAD,
+    contents,
+    two_workers,
+    write_three,
+)
 from tests.waiting import wait_for
 from train.data.shards import MANIFEST
 from train.simulation import generation
@@ -35,10 +42,9 @@ pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made
 ROOT = Path(__file__).resolve().parents[4]
 RUN = f"""
 import sys
-from train.simulation import generation
+{PRELOAD}
 from train.simulation.training_frames import GenerateSettings, SceneMix
 
-generation.ROWS_PER_SHARD = {ROWS}
 config = GenerateSettings(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
 generation.make_dataset(config, sys.argv[1], workers=1)
 """
@@ -153,18 +159,9 @@ def test_s3_from_several_processes(s3):
 
 @pytest.mark.slow
 def test_workers_of_a_cluster_share_no_folder(s3, whole, tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
-    preload, here = tmp_path / "small_shards.py", tmp_path / "here"
-    preload.write_text(f"from train.simulation import generation\ngeneration.ROWS_PER_SHARD = {ROWS}\n")
+    here = tmp_path / "here"
     here.mkdir()
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        preload=[str(preload)],
-        silence_logs="CRITICAL",
-    ) as cluster:
+    with two_workers(tmp_path) as cluster:
         monkeypatch.chdir(here)
         # As on another machine: workers do not see the folder that the command runs in.
         monkeypatch.setattr("handsim.app.workers.Path.cwd", lambda: tmp_path / "nowhere")
