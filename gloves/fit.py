@@ -18,7 +18,7 @@ from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
 from handsim.hand.shape import BONE_NAMES, BONES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
-from handsim.hand.skin import HandSurface, vertex_normals
+from handsim.hand.skin import vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
@@ -172,12 +172,19 @@ def _put_on(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     feet = origins + distances[:, None] * directions
     points = feet + layout.heights[:, None] * normals
-    indices, shares = _blend_weights(surface, corners, bary)
+    full = np.zeros((len(corners), len(BONE_NAMES)))  # skin weights between three vertices each
+    for corner in range(3):
+        vertex = corners[:, corner]
+        shares = bary[:, corner, None] * surface.bone_weights[vertex]
+        np.add.at(full, (np.arange(len(corners))[:, None], surface.bone_indices[vertex]), shares)
+    indices = np.argsort(-full, axis=1, kind="stable")[:, :4]
+    weights = np.clip(np.take_along_axis(full, indices, axis=1), 0.0, None)
+    weights /= weights.sum(axis=1, keepdims=True)
     bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
     others = _other_digits(feet, points, bones, model)
     others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]
     astray = np.flatnonzero(missed | (np.array(others) != "")).tolist()
-    return Attachment(layout, points, normals, indices, shares), astray, others
+    return Attachment(layout, points, normals, indices, weights), astray, others
 
 
 def _other_digits(
@@ -359,21 +366,6 @@ def _cross(
     product[0] = first[1] * second[2] - first[2] * second[1]
     product[1] = first[2] * second[0] - first[0] * second[2]
     product[2] = first[0] * second[1] - first[1] * second[0]
-
-
-def _blend_weights(
-    surface: HandSurface, corners: NDArray[np.int64], bary: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Skin weights interpolated between three vertices each, cut to the strongest four."""
-    full = np.zeros((len(corners), len(BONE_NAMES)))
-    rows = np.arange(len(corners))[:, None]
-    for corner in range(3):
-        vertex = corners[:, corner]
-        shares = bary[:, corner, None] * surface.bone_weights[vertex]
-        np.add.at(full, (rows, surface.bone_indices[vertex]), shares)
-    indices = np.argsort(-full, axis=1, kind="stable")[:, :4]
-    weights = np.clip(np.take_along_axis(full, indices, axis=1), 0.0, None)
-    return indices, weights / weights.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ the file and meters in memory.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import textwrap
@@ -367,19 +368,14 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
         if key in optional and not optional[key]:
             continue
         value = quoted(marker.bone) if key == "bone" else written(numbers[key])
-        same = key != "bone" and _is_number(match[3], numbers[key])
+        same = False
+        with contextlib.suppress(ValueError):
+            same = key != "bone" and abs(float(match[3]) - numbers[key]) < _TOLERANCE
         result.append(line if same else f"{match[1]}{value}{match[4]}")
         last = len(result)
     new = [f"{key} = {written(value)}" for key, value in optional.items() if value and key not in met]
     result[last:last] = new
     return result
-
-
-def _is_number(text: str, value: float) -> bool:
-    try:
-        return abs(float(text) - value) < _TOLERANCE
-    except ValueError:
-        return False
 
 
 def _says(text: str, layout: MarkerLayout) -> bool:

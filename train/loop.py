@@ -19,6 +19,7 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
+from gloves.layout import stored_layout
 from handsim import __version__
 from handsim._checks import check_count, check_type
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
@@ -50,17 +51,17 @@ from train.labelers.networks import (
 )
 from train.labelers.pose_prior import learn_pose_prior
 from train.labelers.protocol import MOST_THREADS, Labeling, torch_threads
-from train.labelers.storage import save_network
+from train.labelers.storage import GLOVE, RUN_SETTINGS, save_network
 from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_page
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_SETTINGS: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
 _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
 _CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # those of the model card
+_FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # held-out frames at least; samples of a run for each of them
 _CURVE_POINTS: Final = 200  # entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
 _COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
@@ -157,7 +158,7 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
             check_corruption(settings.corruption, len(dataset.marker_names))
         # Older runs name their devices.
         claim(
-            out / _SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
+            out / RUN_SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
             error=WeightsError, grows="train.samples", free=("train.devices",),
         )  # fmt: skip
     seen = rows.span(0, len(rows) - held_out)
@@ -184,7 +185,10 @@ class _Run:
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
-        shown, saved = _few(self.held_out, _CURVE_FRAMES[settings.labeler]), time.monotonic()
+        shown, saved = (
+            self._shown(_CURVE_FRAMES[settings.labeler]),
+            time.monotonic(),
+        )
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
             if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):
@@ -233,20 +237,26 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, _few(self.held_out, _COST_FRAMES))
+            choose_costs(network, names, self._shown(_COST_FRAMES))
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
             rng = np.random.default_rng(settings.seed)
             network.prior = learn_pose_prior(right_hands(self.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
         on_step("held-out frames")
-        card, report = self._card(network, _few(self.held_out, _CARD_FRAMES[settings.labeler]))
+        card, report = self._card(network, self._shown(_CARD_FRAMES[settings.labeler]))
         on_step("weights and report")
         with written_together():
             save_network(self.out, network, card)
             write_run_page(self.out, card, self.state.history, report)
             write_model_card(self.out, card)
+            stored_layout(card["dataset"]["layout"]).save(self.out / GLOVE)
         return card
+
+    def _shown(self, count: int) -> NDArray[np.void]:
+        """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
+        count = min(count, max(_FEWEST_SHOWN, self.state.settings.samples // _SAMPLES_A_FRAME))
+        return self.held_out[np.arange(0, len(self.held_out), -(-len(self.held_out) // count))]
 
     def _card(self, network: nn.Module, rows: NDArray[np.void]) -> tuple[dict[str, Any], LabelingReport]:
         """The model card, and the evaluation on held-out frames with the paper's corruption."""
@@ -267,11 +277,6 @@ class _Run:
             "curve": self.state.history.accuracies,
         }
         return card, report
-
-
-def _few(rows: MappedRows, count: int) -> NDArray[np.void]:
-    """Every nth of these rows, at most `count`."""
-    return rows[np.arange(0, len(rows), -(-len(rows) // count))]
 
 
 class TrainingState:

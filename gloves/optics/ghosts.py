@@ -7,7 +7,6 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.settings import Limits, Settings
@@ -128,25 +127,15 @@ def sample_strays(
     local = middle + config.reach * np.cbrt(rng.random((count, 1))) * directions
     positions = np.einsum("tij,kj->tki", T_world_carrier[:, :3, :3], local) + T_world_carrier[:, None, :3, 3]
     shining = np.zeros((len(positions), count), dtype=bool)
-    for number in range(count):
-        shining[:, number] = _flashes(len(positions), config, rate, rng)
+    for number in range(count):  # exponentially distributed times of light and dark alternate
+        shown, at = rng.random() < config.shown / (config.shown + config.hidden), 0
+        while at < len(positions):
+            mean = config.shown if shown else config.hidden
+            steps = max(1, round(rng.exponential(mean) * rate)) if mean > 0.0 else 0
+            shining[at : at + steps, number] = shown
+            at, shown = at + steps, not shown
     lit = rng.random((count, num_cameras)) < config.camera_share
     return positions, shining[..., None] & lit
-
-
-def _flashes(
-    frames: int, config: StrayConfig, rate: float, rng: np.random.Generator
-) -> Bool[np.ndarray, "T"]:
-    """Alternating times of light and dark, exponentially distributed."""
-    shown = rng.random() < config.shown / (config.shown + config.hidden)
-    shining = np.empty(frames, dtype=bool)
-    at = 0
-    while at < frames:
-        mean = config.shown if shown else config.hidden
-        steps = max(1, round(rng.exponential(mean) * rate)) if mean > 0.0 else 0
-        shining[at : at + steps] = shown
-        at, shown = at + steps, not shown
-    return shining
 
 
 MAX_GHOSTS: Final = 4
@@ -193,37 +182,20 @@ def sample_ghosts(
     uniform = rng.uniform(-config.stray_margin / 2, 1 + config.stray_margin / 2, size=(frames, MAX_GHOSTS, 3))
     strays = low[:, None] + uniform * (high - low)[:, None]
     strays[np.arange(MAX_GHOSTS) >= count[:, None]] = np.nan
-    images = np.full(markers.shape, np.nan)
     shiny = np.flatnonzero(rng.random(frames) < config.mirror_rate)
-    images[shiny] = _mirror_images(
-        markers[shiny], rig, segments[shiny], radii, config, min_cameras=min_cameras, rng=rng
-    )
-    return keep_some(np.concatenate([strays, images], axis=1), rng=rng)
-
-
-def _mirror_images(
-    markers: NDArray[np.float64],
-    rig: CameraRig,
-    segments: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    config: GhostConfig,
-    *,
-    min_cameras: int,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Mirror images (T, M, 3) that enough cameras see in the shiny patch, NaN elsewhere."""
-    frames, count = markers.shape[:2]
-    normal = rng.standard_normal((frames, 3))
+    low, high = low[shiny], high[shiny]
+    normal = rng.standard_normal((len(shiny), 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    middle = (markers.min(axis=1) + markers.max(axis=1)) / 2
-    half = np.linalg.norm(markers.max(axis=1) - markers.min(axis=1), axis=1) / (2 * np.sqrt(3.0))
-    distance = half + rng.uniform(*config.mirror_distance, size=frames)
-    plane = middle - distance[:, None] * normal
-    images = reflect(markers, plane[:, None], normal[:, None])
-    images[rng.random((frames, count)) >= config.reflectance] = np.nan
-    seen = cameras_by_mirror(images, plane, normal, config.mirror_radius, rig, segments, radii)
-    images[seen.sum(axis=2) < min_cameras] = np.nan
-    return images
+    half = np.linalg.norm(high - low, axis=1) / (2 * np.sqrt(3.0))
+    distance = half + rng.uniform(*config.mirror_distance, size=len(shiny))
+    plane = (low + high) / 2 - distance[:, None] * normal
+    mirrored = reflect(markers[shiny], plane[:, None], normal[:, None])
+    mirrored[rng.random(mirrored.shape[:2]) >= config.reflectance] = np.nan
+    seen = cameras_by_mirror(mirrored, plane, normal, config.mirror_radius, rig, segments[shiny], radii)
+    mirrored[seen.sum(axis=2) < min_cameras] = np.nan
+    images = np.full(markers.shape, np.nan)
+    images[shiny] = mirrored
+    return keep_some(np.concatenate([strays, images], axis=1), rng=rng)
 
 
 def keep_some(

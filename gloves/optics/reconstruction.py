@@ -281,10 +281,8 @@ def _meet_by_chance(
                 _off(point, pair[c], T_world_camera[c]), _off(point, pair[k], T_world_camera[k])
             ) > gates[0]:  # fmt: skip
                 continue
-            column = _false_column(point, before, now)
-            fewest = min_rays[0] if column >= 0 else min_rays[1]
-            if column < 0:
-                column = _free_column(before, now)
+            column, is_old = _false_column(point, before, now)
+            fewest = min_rays[0] if is_old else min_rays[1]
             if column < 0 or _support(point, left, directions, usable, T_world_camera, gates[0]) < fewest:
                 continue
             if _new_and_near(point, sources, positions, gates[2]):
@@ -316,21 +314,16 @@ def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float)
 
 
 @kernel
-def _false_column(point: Any, before: Any, now: Any) -> int:
-    """The column whose false point of the frame before lies near, -1 for none."""
+def _false_column(point: Any, before: Any, now: Any) -> tuple[int, bool]:
+    """The column for a false point, -1 for none, and whether a near point of the frame before has it."""
+    free = -1
     for column in range(len(before)):
-        if np.isnan(now[column, 0]) and np.sum((before[column] - point) ** 2) < _FALSE_STEP * _FALSE_STEP:
-            return column
-    return -1
-
-
-@kernel
-def _free_column(before: Any, now: Any) -> int:
-    """A column that was empty in the frame before and is empty now, -1 for none."""
-    for column in range(len(before)):
-        if np.isnan(now[column, 0]) and np.isnan(before[column, 0]):
-            return column
-    return -1
+        if np.isnan(now[column, 0]):
+            if np.sum((before[column] - point) ** 2) < _FALSE_STEP * _FALSE_STEP:
+                return column, True
+            if free < 0 and np.isnan(before[column, 0]):
+                free = column
+    return free, False
 
 
 MAX_FALSE_POINTS: Final = 6
@@ -427,7 +420,13 @@ def reconstruct(
     positions = np.full((frames, count, 3), np.nan)
     rays = np.zeros((frames, count), dtype=np.int64)
     false_points = np.full((frames, MAX_FALSE_POINTS, 3), np.nan)
-    lost = _dropouts(frames, len(rig.positions), config, rng)
+    cameras = len(rig.positions)
+    begins = np.flatnonzero(rng.random(frames) < config.dropout)
+    lasts = rng.geometric(1.0 / config.dropout_length, size=len(begins))
+    lost = np.zeros((frames, cameras), dtype=bool)  # pictures of cameras that drop out together
+    for begin, last in zip(begins, lasts, strict=True):
+        together = rng.choice(cameras, min(cameras, config.dropout_cameras), replace=False)
+        lost[begin : begin + last, together] = True
     reconstruct_frames(
         np.ascontiguousarray(sources, dtype=np.float64),
         np.broadcast_to(np.asarray(radii, dtype=np.float64), count).copy(),
@@ -442,20 +441,6 @@ def reconstruct(
         false_points,
     )
     return Reconstruction(positions, rays, false_points)
-
-
-def _dropouts(
-    frames: int, cameras: int, config: OpticsConfig, rng: np.random.Generator
-) -> Bool[np.ndarray, "T C"]:
-    """Pictures that are lost: each dropout affects some cameras for a geometric number of frames."""
-    begins = np.flatnonzero(rng.random(frames) < config.dropout)
-    lasts = rng.geometric(1.0 / config.dropout_length, size=len(begins))
-    lost = np.zeros((frames, cameras), dtype=bool)
-    for begin, last in zip(begins, lasts, strict=True):
-        lost[
-            begin : begin + last, rng.choice(cameras, min(cameras, config.dropout_cameras), replace=False)
-        ] = True
-    return lost
 
 
 def number_runs(present: Bool[np.ndarray, "T S"]) -> Int[np.ndarray, "T S"]:

@@ -76,7 +76,11 @@ class GrowingArchive(Closing):
         self._points = self._block = self._written = 0
         self._due = math.inf
         text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
-        parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
+        parts = [json.dumps(text).encode()]
+        for array in arrays.values():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+            parts.append(buffer.getvalue())
         if max(map(len, parts)) > _MAX_HEADER:  # it could not be read again
             raise CaptureError(f"{path}: the settings take more than {_MAX_HEADER} bytes")
         make_folder_of(path)
@@ -156,7 +160,7 @@ class GrownArchive:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise ValueError("not a recording")
             self.header: dict[str, Any] = json.loads(_take_part(file))
-            self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
+            self._arrays = {str(name): _take_array(file) for name in self.header.pop("arrays")}
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._end = file.tell()
             self._blocks = list(self._scan(file, check))
@@ -262,14 +266,9 @@ def _take_part(file: io.BufferedReader) -> bytes:
     return content
 
 
-def _pack_array(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _unpack_array(content: bytes) -> NDArray[Any]:
-    """An array from bytes of the .npy format; a `ValueError` unless the sizes agree."""
+def _take_array(file: io.BufferedReader) -> NDArray[Any]:
+    """The next part as an array from its .npy format; a `ValueError` unless the sizes agree."""
+    content = _take_part(file)
     buffer = io.BytesIO(content)
     check_npy_header(buffer, len(content))
     buffer.seek(0)
@@ -341,39 +340,30 @@ def read_archive(
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of an archive."""
     check_regular(path, error=CaptureError)
-    if is_growing(path):
-        return _read_cut_off(path)
     if not path.exists() and growing_path(path).exists():
         raise CaptureError(
             f"{path}: no such file, but {growing_path(path)} is a recording that was cut off or is still "
             "running, and can be read"
         )
+    grown = None
     try:
-        arrays = read_npz(path)
-        array = arrays["header"]
-        if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
-            raise ValueError("not a text")
-        header = json.loads(str(array))
-        if not isinstance(header, dict):
-            raise ValueError("the header is not a table")
-    except CaptureError:
-        raise
+        if is_growing(path):
+            grown = GrownArchive(path)
+            header, arrays = grown.header, grown.read()
+        else:
+            arrays = read_npz(path)
+            array = arrays["header"]
+            if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
+                raise ValueError("not a text")
+            header = json.loads(str(array))
+            if not isinstance(header, dict):
+                raise ValueError("the header is not a table")
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
         raise CaptureError(_damaged(path)) from error
-    return header, arrays
-
-
-def _read_cut_off(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a growing archive."""
-    try:
-        grown = GrownArchive(path)
-        arrays = grown.read()
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
-        raise CaptureError(_damaged(path)) from error
+    if grown is None:
+        return header, arrays
     if grown.num_frames < 2:
         raise CaptureError(
             f"{path}: a recording that was cut off with {grown.num_frames} frames, expected two or more"
@@ -382,7 +372,7 @@ def _read_cut_off(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if grown.num_lost_bytes:
         told += f"; {grown.num_lost_bytes} bytes after them, an incomplete half second, are left out"
     warnings.warn(told, CutOffWarning, stacklevel=4)
-    return grown.header, arrays
+    return header, arrays
 
 
 def _damaged(path: Path) -> str:

@@ -235,11 +235,14 @@ class Take:
                         body_status=body_status, body_rms=body_rms, numbers=numbers,
                         angle_spread=angle_spread, keypoint_spread=keypoint_spread)  # fmt: skip
         tables = dict(points=points, ids=ids, labels=labels, confidence=confidence)
+        given = {name: table for name, table in tables.items() if table is not None}
         others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings)
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
         try:
-            object.__setattr__(self, "point_list", _with_tables(point_list, tables))
+            if given or point_list is None:  # all tables, or some that replace those of the list
+                point_list = PointList.of_tables(**(point_list.tables if point_list else {}) | given)
+            object.__setattr__(self, "point_list", point_list)
             sizes = {"T": len(self.times), "H": len(self.hands), "B": len(self.bodies)}
             for column in (*FRAMES, *self._known()):
                 object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
@@ -309,9 +312,8 @@ class Take:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
         """
         qpos, points = np.asarray(qpos), np.asarray(points)
-        poses = (
-            np.full((len(points), len(bodies), 7), np.nan) if body_poses is None else np.asarray(body_poses)
-        )
+        nowhere = np.full((len(points), len(bodies), 7), np.nan)
+        poses = nowhere if body_poses is None else np.asarray(body_poses)
         if not 0.0 < rate < np.inf:
             raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
         return cls(
@@ -477,13 +479,12 @@ class Take:
         Args:
             of: A hand's side, a body's name, or a range of labels.
         """
-        if isinstance(of, range):
-            return self.point_list.labeled(of)
-        names = [*self.sides, *(body.name for body in self.bodies)]
-        check_choice(of, names, noun="hand or body")
-        counts = [hand.layout.num_markers for hand in self.hands]
-        labels = spans([*counts, *(len(body.marker_names) for body in self.bodies)])
-        return self.point_list.labeled(labels[names.index(of)])
+        if not isinstance(of, range):
+            names = [*self.sides, *(body.name for body in self.bodies)]
+            check_choice(of, names, noun="hand or body")
+            counts = [hand.layout.num_markers for hand in self.hands]
+            of = spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(of)]
+        return self.point_list.labeled(of)
 
     def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
         """Markers of a hand that were not seen in a frame with a pose, which `markers` fills in."""
@@ -809,14 +810,6 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         **{column.name: arrays[column.name] for column in FRAMES},
         **{column.name: arrays[column.name] for column in OPTIONAL if column.name in arrays},
     )
-
-
-def _with_tables(points: PointList | None, tables: Mapping[str, ArrayLike | None]) -> PointList:
-    """The list of points after some of its tables (T, N, ...) are replaced, or a list of all tables."""
-    given = {name: table for name, table in tables.items() if table is not None}
-    if points is None:
-        return PointList.of_tables(**given)
-    return PointList.of_tables(**{**points.tables, **given}) if given else points
 
 
 def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:

@@ -93,7 +93,12 @@ def _do(job: Job, number: int) -> int:
     try:
         return job(number)
     except Exception as error:
-        raise portable(error) from None
+        told = f"{type(error).__name__}: {error}"
+        try:
+            same = pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise HandSimError(told) from None
+        raise (same if isinstance(same, type(error)) else HandSimError(str(error))) from None
 
 
 class LocalProcesses(ProcessPoolExecutor):
@@ -158,15 +163,6 @@ def without_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def portable(error: Exception) -> Exception:
-    """The error, or its text if it cannot be pickled."""
-    try:
-        same = pickle.loads(pickle.dumps(error))
-    except Exception:
-        return HandSimError(f"{type(error).__name__}: {error}")
-    return same if isinstance(same, type(error)) else HandSimError(str(error))
 
 
 LOCAL: Final = "local"

@@ -58,7 +58,6 @@ def run_command(
     prog: str,
     help_line: str = "",
     args: Sequence[str] | None = None,
-    is_silent: bool = False,
 ) -> Any:
     """Parse arguments for a function, or for one of several by name, and call it; help and mistakes exit."""
     if isinstance(command, PresetCommand):
@@ -68,9 +67,7 @@ def run_command(
         return tyro.extras.subcommand_cli_from_dict(
             table, prog=prog, description=help_line, args=args, registry=registry()
         )
-    return tyro.cli(
-        _with_hints(command), prog=prog, args=args, registry=registry(), console_outputs=not is_silent
-    )
+    return tyro.cli(_with_hints(command), prog=prog, args=args, registry=registry())
 
 
 def outline(table: Mapping[str, tuple[Any, str]]) -> dict[str, Command]:

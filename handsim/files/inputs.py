@@ -78,7 +78,7 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
     """The tables of a TOML file."""
     data = read_bytes(path, error=error, most=_MOST_TOML)
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")  # editors of Windows begin a file with a byte order mark
         deep = _DOTTED.search(text)
         if deep is not None:
             raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")

@@ -55,16 +55,11 @@ _PROBE: Final = 1 << 20  # bytes
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its name when the block ends well.
+    """A temporary path beside `path`, of the same suffix, that takes its name when the block ends well.
 
-    The temporary file has the same suffix, because some writers add one they miss. If the block raises,
-    whatever the reason, the temporary file is removed, an older file at `path` stays as it was, and the error
-    goes on to the caller; one of the system that names no file names `path` then. Folders that are missing on
-    the way to `path` are made. The finished file has the mode that the umask asks for, whatever its writer
-    chose. What a killed process left of the same file is removed first.
-
-    Yields:
-        The path to write to.
+    If the block raises, the temporary file is removed and an older file at `path` stays as it was. Missing
+    folders are made, and what a killed process left of the same file is removed first. The finished file has
+    the mode that the umask asks for, whatever its writer chose.
     """
     check_type("path", path, (str, os.PathLike), "a path")
     final = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
@@ -109,9 +104,7 @@ _TOGETHER: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", d
 def written_together() -> Iterator[None]:
     """Files of `atomic_write` within the block take their names at its end, all of them or none.
 
-    If the block raises, or one file cannot take its name, older files stay as they were, and those that were
-    not there before are not there. Signals to end wait for the renames. Only a process that is killed between
-    two of them leaves new files beside older ones.
+    Only a process that is killed between two of the renames leaves new files beside older ones.
     """
     if _TOGETHER.get() is not None:
         yield
@@ -143,7 +136,12 @@ def _name(files: Mapping[Path, Path]) -> None:
                 named.append(final)
         except BaseException:
             for final in reversed(named):
-                _put_back(final, older.pop(final, None))
+                with suppress(OSError):  # where undoing fails, the older file stays under its second name
+                    if final in older:
+                        os.replace(older[final], final)
+                    else:
+                        final.unlink()
+                older.pop(final, None)
             raise
         finally:
             for kept in older.values():
@@ -158,15 +156,6 @@ def _keep(final: Path, older: Path) -> None:
     except OSError:  # the file system has no hard links
         with _errors_name(final, older):
             shutil.copy2(final, older)
-
-
-def _put_back(final: Path, older: Path | None) -> None:
-    """Undo a rename; where that fails too, the older file stays under its second name."""
-    with suppress(OSError):
-        if older is None:
-            final.unlink()
-        else:
-            os.replace(older, final)
 
 
 def unwritten(path: Path) -> OSError:
@@ -278,8 +267,9 @@ def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *end
         if there is not None and not os.access(there, os.W_OK | os.X_OK):
             raise ArgumentError(f"the output {output} cannot be written: {there} is closed to this user")
         for source in read:
-            if _same(source, output):
-                raise ArgumentError(f"the output {output} is the input {source}, expected another file")
+            with suppress(OSError, ValueError):  # one of them does not exist
+                if os.path.samefile(source, output):
+                    raise ArgumentError(f"the output {output} is the input {source}, expected another file")
 
 
 def _check_links(output: Path) -> None:
@@ -314,13 +304,6 @@ def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
         raise error(f"{file} exists already and is left as it is; name a new file")
     with atomic_write(file) as temporary:
         temporary.write_text(text, "utf-8")
-
-
-def _same(source: Path, output: Path) -> bool:
-    try:
-        return os.path.samefile(source, output)
-    except (OSError, ValueError):  # one of them does not exist
-        return False
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
@@ -397,8 +380,7 @@ def claim(
     """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
 
     The setting `grows`, written like `train.samples`, may be larger than in the file, which then takes the
-    new settings; the file `result`, which is true for the old ones only, is removed before. Settings that are
-    `free` may differ. `shown` is the name of the folder in messages.
+    new settings; the old ones' file `result` is removed before. Settings that are `free` may differ.
     """
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():

@@ -64,12 +64,7 @@ def signals_wait() -> Iterator[None]:
 
 @contextmanager
 def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> Iterator[InterruptFlag]:
-    """Within the block the first signal to end raises nothing, but sets the flag that is yielded.
-
-    Args:
-        flag: The flag to set; a new one when None.
-        again: Whether a second signal raises, as in `signals_raise`.
-    """
+    """Within the block the first signal to end sets a flag; a second one raises if `again`."""
     flag, block = flag or InterruptFlag(), _Block()
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -146,9 +141,8 @@ def interrupts_bare() -> Iterator[None]:
 def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
     """The interrupt that an error comes from, if one does.
 
-    Compiled code that is interrupted ends in a `SystemError`, and a module that loads in an `ImportError`,
-    wrapped again by each call that it passes. An error that was met while the interrupt was handled, such as
-    a full disk, counts as itself.
+    Interrupted compiled code ends in a `SystemError`, and a module that loads in an `ImportError`. An error
+    that was met while the interrupt was handled, such as a full disk, counts as itself.
     """
     below: BaseException | None = error
     while below is not None and not isinstance(below, KeyboardInterrupt):

@@ -20,9 +20,7 @@ from handsim.space.transforms import MIRROR
 
 FIRMNESS: Final = 0.8
 """Capsule radius over skin radius."""
-_CARPUS_SPREAD: Final = (
-    0.42  # where the metacarpals begin: their sideways position at the carpus over the knuckles'
-)
+_CARPUS_SPREAD: Final = 0.42  # sideways position of a metacarpal's near end, over that of its knuckle
 _CARPUS_RISE: Final = 0.28  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 
 
@@ -41,10 +39,7 @@ class Capsules:
 
     def posed(self, T_world_bone: Float[np.ndarray, "T L 4 4"]) -> NDArray[np.float64]:
         """Both ends of every axis in the world (T, K, 2, 3) [m]."""
-        posed: NDArray[np.float64] = _posed(
-            np.ascontiguousarray(T_world_bone), self.bones, self.starts, self.ends
-        )
-        return posed
+        return np.asarray(_posed(np.ascontiguousarray(T_world_bone), self.bones, self.starts, self.ends))
 
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs (P, 2) that may collide: of different bones without a common joint, MuJoCo's own rule."""
@@ -134,10 +129,7 @@ def penetration_depth(
     capsules: Capsules, T_world_bone: Float[np.ndarray, "T L 4 4"]
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap of any two capsules that may collide [m] in each frame; 0 where nothing touches."""
-    depth: NDArray[np.float64] = _deepest(
-        capsules.posed(T_world_bone), capsules.radii, capsules.touching_pairs()
-    )
-    return depth
+    return np.asarray(_deepest(capsules.posed(T_world_bone), capsules.radii, capsules.touching_pairs()))
 
 
 def overlap_between(
@@ -147,10 +139,9 @@ def overlap_between(
     T_world_second: Float[np.ndarray, "T L 4 4"],
 ) -> Float[np.ndarray, "T"]:
     """Deepest overlap of a capsule of one hand with one of another [m]; minus the gap where none touches."""
-    overlap: NDArray[np.float64] = _overlap(
-        first.posed(T_world_first), first.radii, second.posed(T_world_second), second.radii
+    return np.asarray(
+        _overlap(first.posed(T_world_first), first.radii, second.posed(T_world_second), second.radii)
     )
-    return overlap
 
 
 @kernel

@@ -98,10 +98,9 @@ def build_skeleton(shape: HandShape) -> Skeleton:
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
     """`T_world_bone` of every bone in every frame."""
-    transforms: NDArray[np.float64] = pose_bones(
-        np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN
+    return np.asarray(
+        pose_bones(np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN)
     )
-    return transforms
 
 
 FLESH_DENSITY: Final = 1100.0
@@ -354,23 +353,13 @@ NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 """MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
 
 
-def _moved_bones() -> NDArray[np.bool_]:
-    """Bones (J, L) that each joint moves: its own and its descendants."""
-    moved = np.zeros((NUM_JOINTS, NUM_BONES), dtype=bool)
-    for number, joint in enumerate(JOINTS):
-        for bone in range(NUM_BONES):
-            ancestor = bone
-            while ancestor >= 0 and ancestor != joint.bone:
-                ancestor = BONES[ancestor].parent
-            moved[number, bone] = ancestor == joint.bone
-    return moved
-
-
-_MOVED: Final = _moved_bones()
 # The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
 _FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
 _BONE: Final = np.array([joint.bone for joint in JOINTS])
 _PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
+_DIGIT: Final = np.array([bone.digit for bone in BONES])
+# A joint moves its own bone and those further out on its digit (J, L).
+_MOVED: Final = (_DIGIT == _DIGIT[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
 
 
 def joint_axes(
@@ -521,25 +510,20 @@ def between_poses(
 
     They are NaN beside a missing old pose, and between old frames more than a tenth of a second apart.
     """
-    longest = max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
-    before, share = _brackets(times - times[0], new - times[0], longest)
+    old, new = times - times[0], new - times[0]
+    # The old frame before each new time, and the weight of the next one, NaN in a gap.
+    before, share = np.zeros(len(new), dtype=np.intp), np.zeros(len(new))
+    if len(old) > 1:
+        before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
+        step = old[before + 1] - old[before]
+        share = np.clip((new - old[before]) / step, 0.0, 1.0)
+        exact = (share < 1e-6) | (share > 1.0 - 1e-6)
+        is_gap = step > max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
+        share = np.where(exact, np.round(share), np.where(is_gap, np.nan, share))
     between = np.empty((len(new), *poses.shape[1:]))
     for number in range(poses.shape[1]):
         between[:, number] = _between(poses[:, number], before, share)
     return between
-
-
-def _brackets(
-    old: NDArray[np.float64], new: NDArray[np.float64], longest: float
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """The old frame before each new time, and the weight of the next one; NaN in a gap."""
-    if len(old) == 1:
-        return np.zeros(len(new), dtype=np.intp), np.zeros(len(new))
-    before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
-    step = old[before + 1] - old[before]
-    share = np.clip((new - old[before]) / step, 0.0, 1.0)
-    exact = (share < 1e-6) | (share > 1.0 - 1e-6)
-    return before, np.where(exact, np.round(share), np.where(step > longest, np.nan, share))
 
 
 def _between(

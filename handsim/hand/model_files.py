@@ -37,7 +37,8 @@ def hand_urdf(model: HandModel) -> str:
     ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
     for number, bone in enumerate(BONES):
         hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == number]
-        links = [*(_middle_name(index) for index in hinges[:-1]), bone.name]
+        kinds = [JOINTS[index].name.rpartition("_")[2] for index in hinges[:-1]]
+        links = [*(f"{bone.name}_{kind}" for kind in kinds), bone.name]
         shares = [_SMALL_SHARE] * (len(links) - 1) + [1.0 - _SMALL_SHARE * (len(links) - 1)]
         for link, share in zip(links, shares, strict=True):
             _add_link(root, model, number, link, share)
@@ -46,12 +47,6 @@ def hand_urdf(model: HandModel) -> str:
             _add_joint(root, model, index, parent, links[step], at_rest=step == 0)
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _middle_name(joint: int) -> str:
-    """The link between a bone's first joint and its second."""
-    kind = JOINTS[joint].name.rpartition("_")[2]
-    return f"{BONE_NAMES[JOINTS[joint].bone]}_{kind}"
 
 
 def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: float) -> None:
@@ -163,21 +158,14 @@ def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
     for site in markers:
         for name in (site.name, f"{side}:{site.name}"):
             _add_marker(placed, name, side, site.bone, site.position)
-    for site in _keypoint_sites(model):
-        _add_marker(placed, f"{side}_{site.name}", side, site.bone, site.position)
+    # Joints and tips, each in the frame of the bone that begins, or ends, there.
+    at_rest = hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0]
+    frames = np.linalg.inv(model.rest_transforms)[list(KEYPOINT_BONES)]
+    local = np.einsum("kij,kj->ki", frames[:, :3, :3], at_rest) + frames[:, :3, 3]
+    for name, bone, position in zip(KEYPOINT_NAMES, KEYPOINT_BONES, local, strict=True):
+        _add_marker(placed, f"{side}_{name}", side, bone, position)
     ET.indent(document)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
-
-
-def _keypoint_sites(model: HandModel) -> list[Site]:
-    """Joints and tips, each in the frame of the bone that begins, or ends, there."""
-    at_rest = hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0]
-    bones = np.linalg.inv(model.rest_transforms)[list(KEYPOINT_BONES)]
-    local = np.einsum("kij,kj->ki", bones[:, :3, :3], at_rest) + bones[:, :3, 3]
-    return [
-        Site(name, bone, position, 0.0)
-        for name, bone, position in zip(KEYPOINT_NAMES, KEYPOINT_BONES, local, strict=True)
-    ]
 
 
 def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:

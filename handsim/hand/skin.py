@@ -182,9 +182,8 @@ _DEPTHS: Final = np.array(
         [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
     ]
 )
-_ROW_POSITIONS: Final = np.array(
-    [-0.26, -0.05, 0.16, 0.42, 0.70, 0.97]
-)  # along the metacarpals: 0 wrist, 1 joint
+# Position of each palm row along the metacarpals: 0 at the wrist, 1 at the joints.
+_ROW_POSITIONS: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])
 _WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
 _EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
 
@@ -536,9 +535,8 @@ def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
     """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
-    return _vertex_normals(
-        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64)
-    )
+    points = np.ascontiguousarray(vertices, dtype=np.float64)
+    return np.asarray(_vertex_normals(points, np.ascontiguousarray(faces, dtype=np.int64)))
 
 
 @kernel
@@ -571,9 +569,8 @@ def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
     weights = np.zeros((topology.num_vertices, NUM_BONES))
     for row, (on_finger, on_web) in _KNUCKLE_SHARES.items():
         for column in range(9):
-            fingers = (
-                [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
-            )
+            beside = (column // 2,) if column % 2 else (column // 2 - 1, column // 2)
+            fingers = [finger for finger in beside if 0 <= finger < 4]
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
             for index in (dorsal(column), palmar(column)):
                 weights[topology.palm[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)

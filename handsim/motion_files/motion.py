@@ -179,11 +179,7 @@ def corner_normals(
 def split_vertices(
     faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
 ) -> tuple[Int[np.ndarray, "W"], Float[np.ndarray, "W 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices with one normal each, from triangles with one at each corner.
-
-    Returns:
-        The old vertex of each new one, its normal, and the triangles of the new ones.
-    """
+    """Vertices with one normal each, from triangles with one at each corner: old indices, normals, faces."""
     keys = np.column_stack([faces.ravel(), np.round(normals.reshape(-1, 3), 4)])
     _, index, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return faces.ravel()[index], normals.reshape(-1, 3)[index], inverse.reshape(-1, 3)
@@ -315,9 +311,14 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the angles of all hands, in the take's axes whatever `up` is."""
-    hands = motion.hands
-    table = np.concatenate([motion.seconds[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
-    names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
+    columns, names = [motion.seconds[:, None]], ["time"]
+    for hand in motion.hands:
+        turns = np.unwrap(body_fixed_angles(quaternion_matrix(hand.qpos[:, 3:7])), axis=0)
+        angles = np.rad2deg(np.concatenate([turns, hand.qpos[:, 7:]], axis=1))
+        columns.append(np.concatenate([hand.qpos[:, :3], angles], axis=1))
+        columns[-1][~hand.present] = np.nan
+        names += coordinate_names(hand.side)
+    table = np.concatenate(columns, axis=1)
     header = [
         as_text(path.stem),
         "version=1",
@@ -330,16 +331,6 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(header) + "\n")
         np.savetxt(file, table, fmt="%.9f", delimiter="\t")
-
-
-def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
-    """Wrist position [m], its angles and the joint angles [deg]; NaN without a pose."""
-    qpos = hand.qpos
-    turns = np.unwrap(body_fixed_angles(quaternion_matrix(qpos[:, 3:7])), axis=0)
-    angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
-    coordinates: NDArray[np.float64] = np.concatenate([qpos[:, :3], angles], axis=1)
-    coordinates[~hand.present] = np.nan
-    return coordinates
 
 
 _BVH_ROOT: Final = "world_cm"
@@ -355,10 +346,16 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
     for hand in motion.hands:
         lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
-        columns.append(_hand_columns(hand, turn))
+        rest = np.swapaxes(hand.model.rest_transforms[:, :3, :3], -1, -2)
+        # In BVH all joints have the axes of the file at rest.
+        rotations = turn @ hand.model.forward_kinematics(hand.qpos)[..., :3, :3] @ rest @ turn.T
+        local = local_rotations(rotations)
+        columns.append(_CENTIMETERS * hand.qpos[:, :3] @ turn.T)
+        columns += [_degrees(local[:, bone]) for bone in _order(PALM)]
     for thing in motion.bodies:
         content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
-        lines += _indented([f"JOINT {_word(thing.name)}", "{", *_indented(content), "}"])
+        word = "".join(one if one.isascii() and one.isalnum() else "_" for one in thing.name) or "thing"
+        lines += _indented([f"JOINT {word}", "{", *_indented(content), "}"])
         poses = thing.T_world_body
         angles = _degrees(turn @ poses[:, :3, :3] @ turn.T)
         columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
@@ -367,17 +364,6 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         table = np.concatenate(columns, axis=1)
         file.write(f"MOTION\nFrames: {len(table)}\nFrame Time: {1.0 / motion.rate:.9f}\n")
         np.savetxt(file, table, fmt="%.6f")
-
-
-def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "T 51"]:
-    """Position of the palm [cm] and rotations of all bones [deg] from the flat hand, in the file's order."""
-    qpos = hand.qpos
-    rest = hand.model.rest_transforms[:, :3, :3]
-    # in BVH all joints have the axes of the file at rest
-    rotations = turn @ hand.model.forward_kinematics(qpos)[..., :3, :3] @ np.swapaxes(rest, -1, -2) @ turn.T
-    local = local_rotations(rotations)
-    position = _CENTIMETERS * qpos[:, :3] @ turn.T
-    return np.concatenate([position, *(_degrees(local[:, bone]) for bone in _order(PALM))], axis=1)
 
 
 def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
@@ -421,11 +407,6 @@ def _indented(lines: list[str]) -> list[str]:
     return [f"\t{line}" for line in lines]
 
 
-def _word(name: str) -> str:
-    """A name as one word."""
-    return "".join(one if one.isascii() and one.isalnum() else "_" for one in name) or "thing"
-
-
 OPENXR_JOINTS: Final[tuple[str, ...]] = (
     "PALM",
     "WRIST",
@@ -457,13 +438,17 @@ def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         "joints": OPENXR_JOINTS,
         "radius": {hand.side: np.round(joint_radii(hand.model), 7).tolist() for hand in tracks},
     }
-    poses = [_pose_rows(hand, file_axes(up)) for hand in tracks]
+    turn, rows_of = file_axes(up), []  # positions and quaternions (xyzw) of each hand in the file's axes
+    for hand in tracks:
+        poses = joint_poses(hand.model, hand.qpos)
+        quaternions = np.roll(smooth_quaternions(turn @ poses[..., :3, :3]), -1, axis=-1)
+        rows_of.append(np.round(np.concatenate([poses[..., :3, 3] @ turn.T, quaternions], axis=-1), 8))
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.write(json.dumps(header, indent=1)[:-2] + ',\n "frames": [')
         for frame, time in enumerate(motion.times.tolist()):
             hands = {
                 hand.side: rows[frame].tolist() if hand.present[frame] else None
-                for hand, rows in zip(tracks, poses, strict=True)
+                for hand, rows in zip(tracks, rows_of, strict=True)
             }
             file.write((",\n" if frame else "\n") + json.dumps({"time": time, "hands": hands}))
         file.write("\n ]\n}\n")
@@ -513,11 +498,3 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
         joint[:3, :3] = np.stack([along, np.cross(back, along), back], axis=1) @ _AXES
         joint[:3, 3] = start
     return joints
-
-
-def _pose_rows(hand: PosedHand, turn: NDArray[np.float64]) -> Float[np.ndarray, "T 26 7"]:
-    """Positions and quaternions (xyzw) in the file's axes."""
-    poses = joint_poses(hand.model, hand.qpos)
-    quaternions = smooth_quaternions(turn @ poses[..., :3, :3])
-    rows = np.concatenate([poses[..., :3, 3] @ turn.T, np.roll(quaternions, -1, axis=-1)], axis=-1)
-    return np.round(rows, 8)

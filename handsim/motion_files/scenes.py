@@ -247,7 +247,8 @@ class GlbBuffer:
         if bounds:
             for name, values in (("min", content.min(axis=0)), ("max", content.max(axis=0))):
                 accessor[name] = np.atleast_1d(values).tolist()
-        self._append(content.tobytes())
+        self._parts.append(content.tobytes() + bytes(-content.nbytes % 4))
+        self._size += len(self._parts[-1])
         self._views.append(view)
         self._accessors.append(accessor)
         return len(self._accessors) - 1
@@ -264,11 +265,6 @@ class GlbBuffer:
             raise ArgumentError(f"a .glb of {size} bytes, expected at most {_MOST}; export at a lower rate")
         head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON")
         return b"".join([head, text, _CHUNK.pack(self._size, b"BIN\0"), *self._parts])
-
-    def _append(self, content: bytes) -> None:
-        content += b"\0" * (-len(content) % 4)
-        self._parts.append(content)
-        self._size += len(content)
 
 
 _AROUND: Final = 0.03  # [m] of skin around keypoints
@@ -408,7 +404,7 @@ def _add_mesh(
     material: Material,
 ) -> Any:
     """Triangles of one material, not subdivided."""
-    from pxr import Gf, UsdGeom, UsdShade, Vt
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = vertices.astype(np.float32)
@@ -418,23 +414,16 @@ def _add_mesh(
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
     mesh.CreateDisplayColorAttr([Gf.Vec3f(*material.color)])  # for programs that look at no material
-    beside = f"{path.rpartition('/')[0]}/{material.name}"
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_add_material(stage, beside, material))
-    return mesh
-
-
-def _add_material(stage: Any, path: str, material: Material) -> Any:
-    """A material by USD's own shader."""
-    from pxr import Gf, Sdf, UsdShade
-
-    made, shader = UsdShade.Material.Define(stage, path), UsdShade.Shader.Define(stage, f"{path}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    kinds = Sdf.ValueTypeNames
+    beside, kinds = f"{path.rpartition('/')[0]}/{material.name}", Sdf.ValueTypeNames
+    made = UsdShade.Material.Define(stage, beside)
+    shader = UsdShade.Shader.Define(stage, f"{beside}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")  # USD's own
     shader.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(*material.color))
     shader.CreateInput("roughness", kinds.Float).Set(material.roughness)
     shader.CreateInput("metallic", kinds.Float).Set(0.0)
     made.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    return made
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(made)
+    return mesh
 
 
 def _set_visibility(prim: Any, present: NDArray[np.bool_], codes: NDArray[np.float64]) -> None:

@@ -92,8 +92,7 @@ class Lens:
             return np.concatenate([along * np.sin(theta)[..., None], np.cos(theta)[..., None]], axis=-1)
         flat = points if self.kind == "pinhole" else self._undistort_brown(points)
         rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
-        unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        return unit
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     @property
     def _radial(self) -> tuple[float, ...]:
@@ -286,7 +285,17 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
-        object.__setattr__(self, "size", _checked_size(self.name, self.size))
+        sides = np.asarray(self.size)
+        if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
+            raise ArgumentError(
+                f"camera '{self.name}': size is {self.size}, expected width and height in whole pixels"
+            )
+        if not ((sides >= 1) & (sides <= _MAX_SIZE)).all():
+            raise ArgumentError(
+                f"camera '{self.name}' has pictures of {sides[0]} x {sides[1]} pixels, "
+                f"expected 1 to {_MAX_SIZE} each way"
+            )
+        object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
         rest = self.K.copy()
         rest[0, 0] = rest[1, 1] = rest[0, 2] = rest[1, 2] = 0.0
         if not (self.K[0, 0] > 0.0 and self.K[1, 1] > 0.0) or np.abs(rest - np.diag([0, 0, 1])).max() > 0.0:
@@ -336,14 +345,12 @@ class Camera:
 
     def local(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """World points in the camera's axes [m]."""
-        local: NDArray[np.float64] = (points - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3]
-        return local
+        return np.asarray((points - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3])
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels of world points [m], inside the picture or not [px]; NaN where the lens does not see."""
         normalized = self.lens.distort(self.local(points))
-        pixels: NDArray[np.float64] = normalized * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
-        return pixels
+        return np.asarray(normalized * self.K[[0, 1], [0, 1]] + self.K[:2, 2])
 
     def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions of pixels [px] in the camera's axes; NaN for pixels without a ray."""
@@ -368,19 +375,6 @@ class Camera:
             "T_world_camera": self.T_world_camera.tolist(),
             "lens": {"kind": self.lens.kind, "coefficients": list(self.lens.coefficients)},
         }
-
-
-def _checked_size(name: str, size: object) -> tuple[int, int]:
-    """Width and height [px] as whole numbers."""
-    sides = np.asarray(size)
-    if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
-        raise ArgumentError(f"camera '{name}': size is {size}, expected width and height in whole pixels")
-    if not ((sides >= 1) & (sides <= _MAX_SIZE)).all():
-        raise ArgumentError(
-            f"camera '{name}' has pictures of {sides[0]} x {sides[1]} pixels, "
-            f"expected 1 to {_MAX_SIZE} each way"
-        )
-    return int(sides[0]), int(sides[1])
 
 
 def brown_lens(*coefficients: float) -> Lens:

@@ -42,21 +42,6 @@ class Part:
 Solid = tuple[list[Part], Any]
 
 
-def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
-    """Parts and mesh of one entry of `data/objects.json` (millimeters and degrees there, meters here)."""
-    import trimesh
-
-    return _SOLIDS[kind](np.asarray(numbers, dtype=np.float64), trimesh)
-
-
-def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
-    """The convex hull of some points [m] as a part."""
-    import trimesh
-
-    hull = trimesh.convex.convex_hull(np.asarray(vertices))
-    return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
-
-
 def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDArray[np.float64]) -> Part:
     return Part(kind, np.asarray(size, dtype=np.float64), pose, np.empty((0, 3)))
 
@@ -292,20 +277,20 @@ def _read_mesh(path: Path) -> Any:
 
 
 def _close(mesh: Any, path: Path) -> Part:
-    """Join the seams of a mesh, turn its inside in, and give its hull; an `ObjectError` if it is open."""
+    """The convex hull of a mesh whose seams are joined and whose inside is turned in; refuse an open one."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
         closed = bool(mesh.is_watertight)
         if closed and mesh.volume < 0.0:
             mesh.invert()
-        hull = hull_part(mesh.vertices) if closed else None
+        hull = mesh.convex_hull if closed else None
     except Exception as error:  # odd triangles fail in many ways
         raise ObjectError(
             f"{path}: not a closed surface ({shortened(' '.join(str(error).split()), 80)})"
         ) from error
     if hull is None:
         raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
-    return hull
+    return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -323,7 +308,7 @@ def _build(name: str, entry: dict[str, Any]) -> RigidObject:
     parts: list[Part] = []
     surfaces: list[Any] = []
     for kind, numbers in entry["solids"]:
-        solid_parts, surface = build_solid(kind, numbers)
+        solid_parts, surface = _SOLIDS[kind](np.asarray(numbers, dtype=np.float64), trimesh)
         parts += solid_parts
         surfaces.append(surface)
     mesh = trimesh.util.concatenate(surfaces)

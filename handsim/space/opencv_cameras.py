@@ -1,7 +1,7 @@
 """Cameras as OpenCV calibrates them: a YAML or JSON file of one camera, a stereo pair, or many.
 
-They are flat tables of numbers, which are parsed here because OpenCV's parser may never return from a damaged
-file.
+They are flat tables of numbers, which are parsed here: OpenCV's parser may never return from a damaged file,
+and the fast one of PyYAML ends the process where lists are nested deeply.
 """
 
 from __future__ import annotations

@@ -102,6 +102,12 @@ def test_markers_sit_on_the_bones_their_names_tell() -> None:
             assert segments[marker.name.removeprefix(prefix)] == segment
 
 
+def test_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "glove.toml"
+    file.write_text(starter_layout(), encoding="utf-8-sig")
+    assert load_layout(file).num_markers >= 5
+
+
 def test_starter_loads(tmp_path: Path) -> None:
     path = tmp_path / "my_glove.toml"
     path.write_text(starter_layout())

@@ -63,6 +63,10 @@ _BYTES_PER_WEIGHT: Final = 4
 _MAX_CARD_BYTES: Final = 1 << 24
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
+GLOVE: Final = "glove.toml"
+"""The file of a run that holds its marker layout."""
+RUN_SETTINGS: Final = "train.json"
+"""The file in which a run keeps its settings from the beginning."""
 _FEW_POSES: Final = 6000  # poses that describe a layout to the labeler without a minute of learning
 _EXPECTED: Final = (
     "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
@@ -237,6 +241,10 @@ def _files(name: str) -> tuple[Path, Path]:
         return _SHIPPED / f"{name}.safetensors", _SHIPPED / f"{name}.json"
     weights, card = Path(name) / WEIGHTS, Path(name) / CARD
     if not weights.is_file() or not card.is_file():
+        if (Path(name) / RUN_SETTINGS).is_file():
+            raise WeightsError(
+                f"{name} is an unfinished run without weights; the same handsim train command goes on with it"
+            )
         unknown = choices(name, shipped_labelers(), noun="labeler or glove")
         raise WeightsError(
             f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "

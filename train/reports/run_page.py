@@ -14,6 +14,7 @@ from gloves.layout import MarkerLayout, stored_layout
 from handsim.files.outputs import atomic_write
 from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
 from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
+from train.labelers.storage import GLOVE
 from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
 
 if TYPE_CHECKING:
@@ -273,7 +274,7 @@ On held-out simulated frames, in percent:
 ## Use
 
 ```
-handsim label take.c3d --glove {layout} --labeler THIS_FOLDER --out labeled.c3d
+handsim label take.c3d --glove THIS_FOLDER/{glove} --labeler THIS_FOLDER --out labeled.c3d
 handsim export THIS_FOLDER --out labeler.onnx
 ```
 
@@ -315,6 +316,7 @@ def model_card(card: dict[str, Any]) -> str:
     return _CARD.format(
         license=card["license"],
         layout=dataset["layout"]["name"],
+        glove=GLOVE,
         kind=_CARD_KINDS[card["train"]["labeler"]],
         version=card["handsim"],
         count=len(card["marker_names"]),

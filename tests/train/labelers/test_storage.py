@@ -404,3 +404,9 @@ def test_an_unknown_name_is_told():
         load_labeler("dense18")
     with pytest.raises(LayoutError, match="unknown glove 'dense18'"):
         load_labeler("dense18", "dense19")
+
+
+def test_an_unfinished_run_is_named(tmp_path):
+    (tmp_path / "train.json").write_text("{}")
+    with pytest.raises(WeightsError, match=r"is an unfinished run .* same handsim train command"):
+        load_labeler(tmp_path)

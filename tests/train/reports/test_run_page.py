@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from gloves import MarkerLayout, MarkerPlace
+from gloves import MarkerLayout, MarkerPlace, load_layout
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
 from handsim.hand.shape import BONES
 from handsim.pages import picture
@@ -108,6 +108,8 @@ def test_a_run_has_a_model_card_of_what_was_trained(run):
     out, _ = run
     text = (out / MODEL_CARD).read_text("utf-8")
     assert text.startswith("---\nlicense: unknown\n")
+    assert "--glove THIS_FOLDER/glove.toml --labeler THIS_FOLDER" in text
+    assert load_layout(out / "glove.toml").names == load_labeler(out).marker_names
     assert "400 of them, from `handsim generate` with\nseed 3, of which training saw 2,560 clouds" in text
 
 
