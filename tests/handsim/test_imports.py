@@ -46,7 +46,7 @@ def test_every_sibling_counts_as_a_stranger_from_another_home(tmp_path: Path) ->
 
 def test_a_script_called_train_is_told_before_the_confusing_error(tmp_path: Path) -> None:
     (tmp_path / "train.py").write_text("")
-    result = import_in(tmp_path, "import track, train.presets")
+    result = import_in(tmp_path, "import handsim\nimport track, train.presets")
     assert result.returncode == 1
     told, _, error = result.stderr.partition("'train' is not a package")
     assert "ShadowedPackageWarning" in told and error
