@@ -20,6 +20,10 @@ def no_step(name: str) -> None:
     """The `OnStep` of work that nobody watches."""
 
 
+before_compiling: list[Callable[[], None]] = []
+"""What is called before the next kernel is compiled that the cache lacks: the last one, once."""
+
+
 class Closing:
     """A base of classes with `close`: the end of a `with` block closes them, whatever ended it."""
 

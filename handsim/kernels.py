@@ -7,6 +7,7 @@ array. Orientations are quaternions (wxyz, MuJoCo's order) or 3x3 matrices.
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, overload
 
@@ -14,6 +15,8 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
+
+from handsim.callbacks import before_compiling
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -40,11 +43,39 @@ def kernel(function: Callable[P, R] | None = None, /, *, inline: bool = False) -
 
 
 def _compiled(function: Callable[P, R], *, inline: bool) -> Any:
-    compiled = numba.njit(cache=True, error_model="numpy", inline="always" if inline else "never")(function)
-    kept = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
-    if kept is not None:
+    compiled = numba.njit(
+        cache=True,
+        error_model="numpy",
+        inline="always" if inline else "never",
+        no_cfunc_wrapper=True,  # no kernel is called from C
+    )(function)
+    cache = getattr(compiled, "_cache", None)
+    kept = getattr(cache, "_cache_file", None)
+    if cache is not None and kept is not None:
+        cache.load_overload = functools.partial(_load_or_prepare, cache.load_overload)
         kept._load_index = functools.partial(_known_kernels, kept._load_index)
+        kept.save = functools.partial(_save_by_types, kept, kept.save)
     return compiled
+
+
+def _load_or_prepare(load: Callable[..., Any], types: object, target: object) -> Any:
+    """Load a kernel from the cache, after what `before_compiling` holds if it is not there."""
+    found = load(types, target)
+    while found is None and before_compiling:
+        before_compiling.pop()()
+        found = load(types, target)
+    return found
+
+
+def _save_by_types(kept: Any, save: Callable[..., None], key: object, data: object) -> None:
+    """Keep a kernel in a file that is named for its types.
+
+    numba counts the files of a kernel. Two processes that compile it for different types at once would write
+    to the same file, and the index of one would name the code of the other.
+    """
+    first = int(hashlib.sha256(repr(key).encode()).hexdigest()[:12], 16)
+    kept._data_name = lambda number: kept._data_name_pattern.format(number=first + number)
+    save(key, data)
 
 
 def _known_kernels(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:

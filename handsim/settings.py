@@ -39,7 +39,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What errors say of a field of several types: `Annotated[A | str, Expected("an A, or its name")]`."""
+    """Words of errors for a field of several types: `Annotated[A | str, Expected("an A, or its name")]`."""
 
     words: str
     names: Callable[[], Iterable[str]] = tuple
@@ -217,7 +217,7 @@ def _suits(value: Any, hint: Any) -> bool:
 
 
 def _members(protocol: Any) -> list[str]:
-    """What an object must have to be taken for a protocol."""
+    """The members that an object needs to fulfill a protocol."""
     return [name for name in vars(protocol) if not name.startswith("_")] or ["__call__"]
 
 

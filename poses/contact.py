@@ -387,7 +387,7 @@ def path_between(
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one pose to another through a rest [s] with hands apart; None if not valid."""
+    """Frames from one pose to another, with a rest [s] of hands apart between them; None if not valid."""
     roll = rng.uniform(0.0, np.pi)  # from hands side by side to palms that face each other
     rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
     direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])

@@ -52,7 +52,7 @@ _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)
 _GUIDE_TIME: Final = (0.03, 1.0)  # of the soft constraint that holds the object while fingers close
-_MAX_DISTANCE: Final = 0.5  # [m] of a capsule from the object that is measured
+_MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
 
 
 class GraspScene:
@@ -188,7 +188,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
 
 
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
-_SLIDE: Final = 0.15  # [m] below the palm: start of an object that is raised to it
+_SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
 _SLIDE_HALVINGS: Final = 12
 _ANY: Final = "any"  # the entry of objects without one of their own
 _ROUNDS: Final = 12

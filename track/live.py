@@ -12,12 +12,11 @@ from time import monotonic
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from rich.console import Console
 
 from gloves.fit import GloveFit
 from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take, load_take
-from handsim.app.messages import LiveStatus
+from handsim.app.messages import LiveStatus, named_steps
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
 from track.frames import FARTHEST, StreamedFrame, TrackedFrame
@@ -98,7 +97,7 @@ def track_live(
     """
     if out is not None:
         check_unused(growing_path(out))
-    with Console(stderr=True).status("getting ready"):
+    with named_steps("getting ready"):
         warm_up(setup.user, setup.labeler)
     until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()

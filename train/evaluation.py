@@ -29,7 +29,7 @@ from gloves.takes.take import Take, load_take
 from handsim._checks import check_rng, check_type
 from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
-from train.data.batches import Cloud, Corruption, OwnCorruption, draw_cloud, paper_corruption
+from train.data.batches import Cloud, Corruption, OwnCorruption, corrupt, draw_cloud, paper_corruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
@@ -219,6 +219,11 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
 
 
 _CHUNK: Final = 4096
+_BOOTSTRAPS: Final = 1000  # draws of people for an interval
+CLEAN: Final = Corruption(occlude=0, ghosts=0)
+"""No corruption but the order of points."""
+SEEN: Final = "as the rig sees them"
+"""Name of the figures of markers and ghosts as a rig saw them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,6 +243,22 @@ class LabelingReport:
     """Whether that label is right."""
     numbers: dict[str, int] = field(default_factory=dict)
     """Slots, points, occlusions and ghosts counted."""
+    right_slots: Float[np.ndarray, "T"] = field(default_factory=lambda: np.zeros(0))
+    """Share of each frame's slots that are right."""
+
+    def interval(self, people: Int[np.ndarray, "T"]) -> tuple[float, float]:
+        """The 95 % interval of the slot accuracy by a bootstrap over people, two at least.
+
+        Args:
+            people: The person of each frame, as numbers.
+        """
+        _, person = np.unique(people, return_inverse=True)
+        frames = np.bincount(person)
+        right = np.bincount(person, weights=self.right_slots)
+        drawn = np.random.default_rng(0).integers(len(frames), size=(_BOOTSTRAPS, len(frames)))
+        shares = right[drawn].sum(axis=1) / frames[drawn].sum(axis=1)
+        low, high = np.quantile(shares, (0.025, 0.975))
+        return float(low), float(high)
 
 
 Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
@@ -248,12 +269,14 @@ def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport
     """Label points whose truth is known, and count errors."""
     num_labels = len(labeler.marker_names)
     counts = LabelCounts(confusion=np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64))
-    right_by_marker = np.zeros(num_labels)
+    right_by_marker, right_slots = np.zeros(num_labels), list[float]()
     confidences: list[NDArray[np.float64]] = [np.zeros(0)]
     right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     for clouds, truths in parts:
         for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True):
-            right_by_marker += counts.add(labeling.labels, truth, num_labels)
+            slots = counts.add(labeling.labels, truth, num_labels)
+            right_by_marker += slots
+            right_slots.append(slots.mean())
             confidences.append(labeling.confidence)
             right.append(labeling.labels == truth)
     confidence, is_right = np.concatenate(confidences), np.concatenate(right)
@@ -264,8 +287,9 @@ def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport
     }
     by_marker = right_by_marker / max(1, counts.frames)
     return LabelingReport(
-        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers()
-    )
+        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers(),
+        np.array(right_slots),
+    )  # fmt: skip
 
 
 def evaluate_markers(
@@ -286,6 +310,16 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
     return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
+
+
+def rig_report(labeler: Labeler, rows: NDArray[np.void], *, rng: np.random.Generator) -> LabelingReport:
+    """Evaluation of a labeler on the points and ghosts of these rows, as their rig saw them."""
+    parts = (rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK))
+    clouds = (
+        corrupt(part["observed"].astype(np.float64), CLEAN, ghosts=part["ghosts"].astype(np.float64), rng=rng)
+        for part in parts
+    )
+    return evaluate_frames(labeler, map(cloud_frames, clouds))
 
 
 def cloud_frames(cloud: Cloud) -> Frames:
@@ -325,8 +359,6 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
     return distance
 
 
-CLEAN: Final = Corruption(occlude=0, ghosts=0)
-"""No corruption but the order of points."""
 Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
 """Markers whose labels are known: [m] in the labeler's order, a training set, a take with its truth, a
 labeled capture, the path of one of the three, or a folder of captures."""
@@ -342,6 +374,8 @@ def evaluate_labeler(
     **options: Any,
 ) -> LabelingReport:
     """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
+
+    Training sets without any corruption are counted as their rig saw them, with its gaps and ghosts.
 
     Args:
         labeler: The labeler to evaluate, its name or path, or a glove whose labeler it is.
@@ -385,6 +419,9 @@ def evaluate_labeler(
             )
         simulated = [_simulated_take(one, network.marker_names) for one in takes]
         report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
+    elif corruption == CLEAN and all(map(_is_set, given)):
+        rows = [_rows(load_dataset(one), network.marker_names)[:: settings.every] for one in given]
+        report = rig_report(network, np.concatenate(rows), rng=rng)
     else:
         markers = _markers(given, network.marker_names)[:: settings.every]
         report = evaluate_markers(network, markers, corruption, rng=rng)
@@ -424,10 +461,8 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
             parts.append(one.astype(np.float64))
         elif isinstance(one, Capture):
             parts += select_hands(one, names)
-        elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
-            dataset = load_dataset(one)
-            _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
-            parts.append(dataset.rows()["markers"].astype(np.float64))
+        elif _is_set(one):
+            parts.append(_rows(load_dataset(one), names)["markers"].astype(np.float64))
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)
@@ -435,6 +470,19 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
     if not parts:
         raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
     return np.concatenate(parts)
+
+
+def _is_set(given: Any) -> bool:
+    """Whether a truth is a training set, or the path of one."""
+    at = Path(given) / MANIFEST if isinstance(given, str | Path) else None
+    return isinstance(given, Dataset) or (at is not None and at.is_file())
+
+
+def _rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:
+    """The rows of a set whose markers the labeler knows."""
+    _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
+    rows: NDArray[np.void] = dataset.rows()
+    return rows
 
 
 def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:

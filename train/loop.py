@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
@@ -29,7 +30,6 @@ from handsim.files.outputs import atomic_write, claim, written_together
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from train.data.batches import (
     Batch,
-    Corruption,
     Part,
     check_corruption,
     draw_batch,
@@ -37,7 +37,15 @@ from train.data.batches import (
     right_hands,
 )
 from train.data.shards import Dataset, Manifest, MappedRows, load_dataset
-from train.evaluation import History, LabelingReport, evaluate_markers, paper_report
+from train.evaluation import (
+    CLEAN,
+    SEEN,
+    History,
+    LabelingReport,
+    evaluate_markers,
+    paper_report,
+    rig_report,
+)
 from train.fabric import lost_peers_told, start_fabric
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
@@ -56,11 +64,11 @@ from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
-_MAX_HELD_OUT: Final = 8192
+_HELD_OUT: Final = 0.02  # share of people, from the end, whom training never sees
+_LEAST_PEOPLE: Final = 20  # held-out people of a set of two hundred or more
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
-_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # those of the model card
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": 8192, "cnn": 1024}  # those of the model card
 _FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # held-out frames at least; samples of a run for each of them
 _CURVE_POINTS: Final = 200  # entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
@@ -143,9 +151,9 @@ def train_labeler(
 
 def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabric) -> _Run:
     """Claim the folder of the run, or check that the run there is this one, and restore its checkpoint."""
-    rows = dataset.mapped_rows()
+    rows, people = dataset.mapped_rows(), dataset.people()
     settings = settings.for_set(len(dataset.marker_names), len(rows))
-    held_out = min(_MAX_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
+    held_out = len(rows) - _first_held_out(people)
     if len(rows) - held_out < settings.batch:
         raise DatasetError(
             f"{dataset.path} has {len(rows)} frames, expected at least {settings.batch + held_out + 1}"
@@ -165,7 +173,21 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
     torch.manual_seed(settings.seed)
     state = TrainingState(settings, fabric, seen)
     state.restore(out / CHECKPOINT)
-    return _Run(state, dataset.manifest, seen, rows.span(len(seen), len(rows)), out)
+    unseen = people[len(seen) :] if people[len(seen)] != people[len(seen) - 1] else people[:0]
+    return _Run(state, dataset.manifest, seen, rows.span(len(seen), len(rows)), unseen, out)
+
+
+def _first_held_out(people: Int[np.ndarray, "T"]) -> int:
+    """The first row of the last people of a set, whom training never sees.
+
+    They are 2 % of the people and no fewer than twenty, but a tenth of a small set's. Of a set of one person
+    the last 2 % of the rows are held out.
+    """
+    firsts = np.flatnonzero(np.diff(people, prepend=-1))
+    if len(firsts) == 1:
+        return len(people) - max(1, int(_HELD_OUT * len(people)))
+    count = max(int(_HELD_OUT * len(firsts)), min(_LEAST_PEOPLE, len(firsts) // 10), 1)
+    return int(firsts[-count])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +198,8 @@ class _Run:
     manifest: Manifest
     rows: MappedRows
     held_out: MappedRows
+    people: Int[np.ndarray, "T"]
+    """The person of each held-out row; empty in a set of one person, who is seen in training."""
     out: Path
 
     def do_steps(self, flag: InterruptFlag, progress: Progress, on_step: OnStep, save_every: float) -> None:
@@ -186,7 +210,7 @@ class _Run:
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
         shown, saved = (
-            self._shown(_CURVE_FRAMES[settings.labeler]),
+            self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])],
             time.monotonic(),
         )
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
@@ -237,7 +261,7 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, self._shown(_COST_FRAMES))
+            choose_costs(network, names, self.held_out[self._shown(_COST_FRAMES)])
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
@@ -253,19 +277,24 @@ class _Run:
             stored_layout(card["dataset"]["layout"]).save(self.out / GLOVE)
         return card
 
-    def _shown(self, count: int) -> NDArray[np.void]:
+    def _shown(self, count: int) -> Int[np.ndarray, "R"]:
         """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
         count = min(count, max(_FEWEST_SHOWN, self.state.settings.samples // _SAMPLES_A_FRAME))
-        return self.held_out[np.arange(0, len(self.held_out), -(-len(self.held_out) // count))]
+        return np.arange(0, len(self.held_out), -(-len(self.held_out) // count))
 
-    def _card(self, network: nn.Module, rows: NDArray[np.void]) -> tuple[dict[str, Any], LabelingReport]:
+    def _card(self, network: nn.Module, shown: Int[np.ndarray, "R"]) -> tuple[dict[str, Any], LabelingReport]:
         """The model card, and the evaluation on held-out frames with the paper's corruption."""
         settings, names = self.state.settings, self.manifest.marker_names
         labeler, paper = labeler_of(network, names), paper_corruption(len(names))
-        markers = rows["markers"].astype(np.float64)
-        clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
+        rows, people = self.held_out[shown], self.people[shown] if len(self.people) else self.people
         report = paper_report(labeler, rows)
-        recipe = f"occlude {paper.occlude}, ghosts {paper.ghosts}"
+        reports = {
+            SEEN: rig_report(labeler, rows, rng=np.random.default_rng(0)),
+            f"occlude {paper.occlude}, ghosts {paper.ghosts}": report,
+            "clean": evaluate_markers(
+                labeler, rows["markers"].astype(np.float64), CLEAN, rng=np.random.default_rng(0)
+            ),
+        }
         card = {
             "marker_names": list(names),
             "trained_on": "simulated frames only",
@@ -273,7 +302,11 @@ class _Run:
             "license": UNKNOWN_LICENSE,
             "dataset": self.manifest.config,
             "train": settings.record() | {"devices": self.state.fabric.world_size},
-            "held_out_simulated": {"clean": clean.figures, recipe: report.figures},
+            "held_out_simulated": {name: one.figures for name, one in reports.items()},
+            "held_out_people": len(np.unique(people)),
+            "held_out_intervals": {
+                name: one.interval(people) for name, one in reports.items() if len(np.unique(people)) > 1
+            },
             "curve": self.state.history.accuracies,
         }
         return card, report

@@ -172,7 +172,7 @@ def labeled_columns(
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
 AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
-"""What is wrong with such clouds."""
+"""What errors say of clouds for which `all_at_origin` is true."""
 _MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
 _MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
 _MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
@@ -200,7 +200,7 @@ def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
 
 
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
-    """What tells that clouds are not in meters, if anything does."""
+    """The sign that clouds are not in meters, None without one."""
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
     step = -(-len(shown) // _SAMPLED) or 1
     shown = shown[::step]

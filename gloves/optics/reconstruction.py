@@ -113,8 +113,8 @@ def cast_rays(
                 directions[s, c, i] = (pose[i, 0] * u + pose[i, 1] * v + pose[i, 2]) / length
 
 
-_FALSE_REACH = 0.25  # [m] farther than this from every source is outside the capture volume
-_FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same
+_FALSE_REACH = 0.25  # a point farther than this from every source is outside the capture volume [m]
+_FALSE_STEP = 0.015  # a false point that moved at most this far since the last frame is the same one [m]
 
 
 @kernel

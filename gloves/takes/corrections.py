@@ -27,7 +27,7 @@ SUFFIX: Final = ".corrections.toml"
 NO_MARKER: Final = "none"
 """The label of a point that is no marker; a marker's has a colon in it."""
 FREE: Final = -2
-"""What stands for a point that no correction is about."""
+"""The label of a point without a correction."""
 _KEYS: Final = ("frames", "place_mm", "label")
 _SAME_PLACE: Final = 0.002  # [m] between a point and its place in the file; formats round differently
 _LONGEST_STEP: Final = 0.02  # [m] of a point without an ID, from where it is expected in the next frame
@@ -41,7 +41,7 @@ class Correction:
     first: int
     """The first frame of the span, from 0."""
     last: int
-    """The last one, which belongs to it."""
+    """The last frame of the span, which belongs to it."""
     place: tuple[float, float, float]
     """Where the point is in the first frame [m]."""
     label: str
@@ -51,7 +51,7 @@ class Correction:
         return f"{self.label} in frames {self.first} to {self.last}"
 
     def record(self) -> dict[str, Any]:
-        """Itself as the file and a take's settings hold it."""
+        """The correction as a record of its file and of a take's settings."""
         place = [round(1e3 * value, 6) for value in self.place]
         return {"frames": [self.first, self.last], "place_mm": place, "label": self.label}
 
@@ -124,10 +124,10 @@ def find_pins(corrections: Sequence[Correction], points: PointList, label_names:
 
 
 def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]:
-    """The points (K,) that are the point of a correction, one for each frame in which it is there.
+    """Indices (K,) of a corrected point, one for each frame that holds it; none without a point at its place.
 
-    There are none where no point is at its place. A point with an ID is what has that ID, also after a gap.
-    One without is the nearest to where its last two places lead, until there is none.
+    A point is followed by its ID, across gaps too. A point without an ID is followed to the nearest point to
+    where its last two positions lead, until no point is near.
     """
     first, last = correction.first, correction.last
     start = _nearest(points, first, np.array(correction.place), _SAME_PLACE)

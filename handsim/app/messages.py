@@ -138,25 +138,52 @@ _COUNTS: Final = re.compile(r"[\d.,]+")
 EVERY: Final = 10.0
 """Time between two lines where there is no terminal [s]."""
 _PERIOD: Final = 600.0  # [s] that speeds and the time left are means over
+_tellers: list[Callable[[str], None]] = []  # of the bars and steps that are shown, the innermost last
+
+
+def tell_state(line: str) -> None:
+    """Show a line where the running command shows its state, else on standard error.
+
+    On a terminal an empty line shows the state again; elsewhere it is not printed.
+    """
+    if _tellers and (line or sys.stderr.isatty()):
+        _tellers[-1](line)
+    elif line:
+        print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _telling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Let `tell_state` tell this within the block."""
+    _tellers.append(tell)
+    try:
+        yield
+    finally:
+        _tellers.remove(tell)
 
 
 class ProgressBar:
     """A bar for one task: called with what is done and all there is to do, it shows both."""
 
     def __init__(self, bar: Progress, task: TaskID) -> None:
-        self._bar, self._task = bar, task
+        self._bar, self._task, self._step = bar, task, ""
 
     def __call__(self, done: int, total: int) -> None:
         """Show what is done; this is a `handsim.callbacks.Progress`."""
-        self._bar.update(self._task, completed=done, total=total)
+        self._bar.update(self._task, completed=done, total=total, description=self._step)
 
     def advance(self, count: int = 1) -> None:
         """Show that more is done."""
-        self._bar.advance(self._task, count)
+        self._bar.update(self._task, advance=count, description=self._step)
 
     def step(self, name: str) -> None:
         """Show the name of what is being done; this is a `handsim.callbacks.OnStep`."""
+        self._step = name
         self._bar.update(self._task, description=name)
+
+    def tell(self, line: str) -> None:
+        """Show a line until more is done."""
+        self._bar.update(self._task, description=line or self._step)
 
     def say(self, line: str) -> None:
         """Print a line above the bar, on standard error."""
@@ -198,11 +225,13 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
         speed_estimate_period=_PERIOD,
     ) as bar:
         task = bar.add_task("", total=1)
+        shown = ProgressBar(bar, task)
         if console.is_terminal:
-            yield ProgressBar(bar, task)
+            with _telling(shown.tell):
+                yield shown
         else:
-            with _lines(console, bar.tasks[0], unit):
-                yield ProgressBar(bar, task)
+            with _lines(console, bar.tasks[0], unit), _telling(shown.say):
+                yield shown
 
 
 @contextmanager
@@ -212,20 +241,28 @@ def named_steps(first: str) -> Iterator[Callable[[str], None]]:
 
     console = Console(stderr=True)
     if console.is_terminal:
-        with console.status(first) as status:
-            yield status.update
+        step = first
+
+        def show(line: str) -> None:
+            nonlocal step
+            step = line
+            status.update(line)
+
+        with console.status(first) as status, _telling(lambda line: status.update(line or step)):
+            yield show
         return
     last, due = "", 0.0
 
-    def tell(step: str) -> None:
+    def tell(step: str, *, always: bool = False) -> None:
         nonlocal last, due
         name, now = _COUNTS.sub("", step), time.monotonic()
-        if name != last or now >= due:
+        if always or name != last or now >= due:
             last, due = name, now + EVERY
             console.print(step, soft_wrap=True, markup=False, highlight=False)
 
     tell(first)
-    yield tell
+    with _telling(lambda line: tell(line, always=True)):
+        yield tell
 
 
 @contextmanager

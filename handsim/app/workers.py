@@ -115,7 +115,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
-        with _one_thread(), without_signals():  # submit starts a process if none is idle
+        with one_thread(), without_signals():  # submit starts a process if none is idle
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -141,7 +141,7 @@ def _end_with(channel: Connection) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Let processes started in the block use one thread each, unless the user chose otherwise."""
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))

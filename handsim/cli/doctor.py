@@ -54,13 +54,24 @@ class Finding:
     """Whether commands fail without the remedy."""
 
 
-def doctor() -> int:
+def doctor(compile: bool = False) -> int:
     """Say what is missing on this machine, and how to get it.
+
+    Args:
+        compile: Compile all kernels instead, so that no command has to wait for that.
 
     Returns:
         0 when everything that the commands need is there, else 1.
     """
-    from handsim.app.messages import named_steps
+    from handsim.app.messages import named_steps, print_line
+
+    if compile:
+        from handsim.app.compiling import compile_kernels
+
+        with named_steps("looking for kernels"):
+            compiled, missing = compile_kernels()
+        print_line(f"{compiled} kernels compiled, {missing} missing; they are kept in {kernel_cache()[0]}")
+        return int(missing > 0)
 
     with named_steps("drawing a picture and looking for a GPU"):
         findings = examine()

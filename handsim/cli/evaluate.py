@@ -24,8 +24,9 @@ def evaluate(
     """Measure a labeler on labeled captures, corrupted as in the paper.
 
     Args:
-        captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, or the .truth.npz of
-            takes. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
+        captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, the .truth.npz of takes,
+            or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
+            a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         settings: What is evaluated.
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when

@@ -14,11 +14,13 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 from handsim import __version__
 from handsim.app.messages import told_warnings
+from handsim.callbacks import before_compiling
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
@@ -227,7 +229,8 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
         if isinstance(target, Mapping) and args and args[0] in target:
             (target, help_line), prog, args = target[args[0]], f"{prog} {args[0]}", args[1:]
         command = load(target) if isinstance(target, str) else outline(target)
-        result = run_command(command, prog=prog, help_line=help_line, args=args)
+        with _compiled_ahead("-".join(prog.split()[1:])):
+            result = run_command(command, prog=prog, help_line=help_line, args=args)
         return result if isinstance(result, int) else 0
     else:
         noun = "option" if name.startswith("-") else "command"
@@ -235,6 +238,22 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
         print(f"handsim: {choices(name, valid, noun=noun)}", file=sys.stderr)
         return 2
     return 0
+
+
+@contextmanager
+def _compiled_ahead(command: str) -> Iterator[None]:
+    """Compile all kernels of a command when the first one is missing within the block."""
+
+    def compile_them() -> None:
+        from handsim.app.compiling import compile_kernels
+
+        compile_kernels(command)
+
+    before_compiling.append(compile_them)
+    try:
+        yield
+    finally:
+        before_compiling.clear()
 
 
 def _print_overview(commands: Table) -> None:

@@ -31,9 +31,9 @@ def _train(
         preset: A published recipe, which replaces the defaults; options given beside it hold.
         threads: Threads on a CPU; when not given, one for the set labeler and all for the paper's network.
     """
-    from train.evaluation import print_figures
+    from train.evaluation import percent, print_figures
     from train.loop import train_labeler
-    from train.reports.run_page import PAGE
+    from train.reports.run_page import PAGE, held_out_people
 
     del preset  # it is in `settings`
     if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # the first process tells
@@ -41,7 +41,10 @@ def _train(
         return
     with progress_bar("samples") as bar:
         card = train_labeler(dataset, out, settings, threads=threads, progress=bar, on_step=bar.step)
-    print_figures(card["held_out_simulated"], title="Held-out simulated frames")
+    title = held_out_people(card)
+    print_figures(card["held_out_simulated"], title=title[0].upper() + title[1:])
+    for name, (low, high) in card["held_out_intervals"].items():
+        print_line(f"slots right {name}: {percent(low)} to {percent(high)} % (95 %, over people)")
     print_line(f"weights and model card in {out}")
     print_line(f"report in {out / PAGE}")
 

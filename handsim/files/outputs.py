@@ -182,7 +182,7 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _prefix(path: Path) -> str:
-    """How such names begin on this machine: another one that shares the folder has its own processes."""
+    """The beginning of temporary names, with a number of this machine, since process numbers are its own."""
     return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
 
 
@@ -203,7 +203,7 @@ def _remove(leftover: Path) -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove what was to become `final`, or was it before, and whose process is gone."""
+    """Remove temporary files of `final`, its new or its older content, whose process has ended."""
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
@@ -329,7 +329,7 @@ def check_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def available_bytes() -> int:
-    """Memory to be had without swapping [bytes]; all that is built in where the system tells no more."""
+    """Memory that is free without swapping [bytes], or all memory where the system does not tell."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

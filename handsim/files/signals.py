@@ -39,7 +39,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """Whether a signal to end came; called, it answers."""
+    """A flag that a signal to end sets; a call tells whether one came."""
 
     def __init__(self) -> None:
         self.number = 0

@@ -210,7 +210,7 @@ def _add_osim_capsule(
 
 
 def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
-    """What moves a bone that is no palm: one hinge, or two in turn."""
+    """Add the joint of a bone other than the palm: one hinge, or two in turn."""
     side, skeleton = model.shape.side, model.skeleton
     hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == bone]
     names = [f"{side}_{JOINTS[index].name}" for index in hinges]
@@ -231,7 +231,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
 def _add_osim_joint(
     joints: ET.Element, name: str, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
-    """A custom joint that lets the child lie so in its parent when all its coordinates are zero."""
+    """Add a custom joint whose child has this pose in its parent when all coordinates are zero."""
     joint = ET.SubElement(joints, "CustomJoint", name=name)
     _add(joint, "socket_parent_frame", "at_rest")
     _add(joint, "socket_child_frame", f"/bodyset/{child}")

@@ -92,7 +92,7 @@ JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS: Final = len(JOINTS)
 NUM_QPOS: Final = 7 + NUM_JOINTS
 NUM_KEYPOINTS: Final = 1 + 4 * len(DIGITS)
-"""Of the wrist, and of three joints and the tip of each digit."""
+"""Number of keypoints: the wrist, and three joints and the tip of each digit."""
 
 
 def bones_of(digit: str) -> tuple[int, int, int]:
@@ -150,7 +150,7 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
-_SHORTEST, _LONGEST = 1e-4, 1.0  # [m] of anything in a hand; far from any, but not from what can be computed
+_SHORTEST, _LONGEST = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
         ("left", "?"),
@@ -221,7 +221,7 @@ class HandShape:
 
 
 def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
-    """Refuse measures [m] that no hand has, of which models would be without a shape."""
+    """Refuse measures [m] beyond those of any hand, from which no model can be built."""
     wrong = np.extract((np.asarray(values) < low) | (np.asarray(values) > high), values)
     if len(wrong):
         raise ArgumentError(f"{name} of a hand: {wrong[0]:g} m, expected {low:g} to {high:g} m")

@@ -65,7 +65,7 @@ def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 class _Scene:
-    """The document while it grows."""
+    """A glTF document, built hand by hand and thing by thing."""
 
     def __init__(self, motion: Motion, up: UpAxis) -> None:
         self._times = motion.seconds
@@ -267,7 +267,7 @@ class GlbBuffer:
         return b"".join([head, text, _CHUNK.pack(self._size, b"BIN\0"), *self._parts])
 
 
-_AROUND: Final = 0.03  # [m] of skin around keypoints
+_AROUND: Final = 0.03  # thickness of skin around keypoints in a hand's extent [m]
 
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:

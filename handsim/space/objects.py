@@ -92,7 +92,7 @@ def _ellipsoid(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
 
 
 def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    """A hollow cup to cameras, a full cylinder to fingers."""
+    """A cup, which cameras see hollow and fingers touch as a full cylinder."""
     low, high, radius, wall, depth = 1e-3 * numbers
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
@@ -102,7 +102,7 @@ def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
 
 
 def _arc(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    """A bent tube: a chain of capsules to fingers."""
+    """A bent tube, which fingers touch as a chain of capsules."""
     center, radius, tube = 1e-3 * numbers[:3], 1e-3 * numbers[9], 1e-3 * numbers[10]
     first, second = (axis / np.linalg.norm(axis) for axis in (numbers[3:6], numbers[6:9]))
     angles = np.deg2rad(np.linspace(numbers[11], numbers[12], int(numbers[13]) + 1))

@@ -38,17 +38,21 @@ def encode_png(
     bits, kind = (8, _COLORS) if picture.ndim == 3 else (16, _GRAY)
     content = picture if bits == 8 else picture.astype(">u2")  # the high byte comes first
     rows = np.ascontiguousarray(content).view(np.uint8).reshape(height, -1)
-    words = np.zeros(-(-height * (1 + rows.shape[1]) // 8), np.uint64)
-    data = words.view(np.uint8)[: height * (1 + rows.shape[1])]
+    size = height * (1 + rows.shape[1])
+    words = np.empty(size // 8 + 1, np.uint64)
+    words[-1] = 0  # it may have bytes behind the last one
+    data = words.view(np.uint8)[:size]
     _subtract_above(rows, data.reshape(height, -1))
     tokens = np.empty(len(data) + 1, np.uint16)
     tokens = tokens[: _tokenize(data, words, tokens)]
-    counts = np.bincount(tokens, minlength=_TOKENS)
+    counts = _counts(tokens)
     lengths = _code_lengths(_symbol_counts(counts))
     codes, sizes = _codes(lengths)
     block = np.empty(_HEADER_WORDS + int(counts @ sizes.astype(np.int64)) // 32, np.uint32)
-    size = _write_block(tokens, lengths, codes | sizes << np.uint64(32), block)
-    packed = _ZLIB + block.astype("<u4", copy=False).tobytes()[:size] + struct.pack(">I", zlib.adler32(data))
+    length = _write_block(tokens, lengths, codes | sizes << np.uint64(32), block)
+    packed = (
+        _ZLIB + block.astype("<u4", copy=False).tobytes()[:length] + struct.pack(">I", zlib.adler32(data))
+    )
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))]
     chunks += [(b"tEXt", f"{word}\0{line}".encode("latin-1")) for word, line in (text or {}).items()]
     return _SIGNATURE + b"".join(_chunk(*chunk) for chunk in (*chunks, (b"IDAT", packed), (b"IEND", b"")))
@@ -101,6 +105,15 @@ def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16]
             count += 1
     tokens[count] = _END
     return count + 1
+
+
+@kernel
+def _counts(tokens: NDArray[np.uint16]) -> Any:
+    """How often each token (515,) comes; in two tables, because equal tokens often follow one another."""
+    counts = np.zeros((2, _TOKENS), np.int64)
+    for n in range(len(tokens)):
+        counts[n & 1, tokens[n]] += 1
+    return counts[0] + counts[1]
 
 
 @kernel

@@ -356,15 +356,16 @@ class PosableSkin:
         )
         self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
         self._rest_occluded = self._rest_occlusion()
+        middles = self._rings(self.rest).mean(axis=1)
+        ahead = middles[-1] - middles[-2]
+        self._ahead: Doubles = ahead / np.linalg.norm(ahead)  # direction of the forearm at rest
+        beyond = self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()
+        self._elbow_at: Doubles = middles[-1] + beyond * self._ahead
 
     def forearm_line(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
         """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world."""
-        middles = self._rings(self.rest).mean(axis=1)
-        ahead = middles[-1] - middles[-2]
-        ahead /= np.linalg.norm(ahead)
-        elbow = middles[-1] + (self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()) * ahead
         rotation = quaternion_matrix(qpos[3:7])
-        return qpos[:3] + rotation @ elbow, rotation @ ahead
+        return qpos[:3] + rotation @ self._elbow_at, rotation @ self._ahead
 
     def _rings(self, rest: Doubles) -> Doubles:
         """The arm's rings (K, R, 3)."""

@@ -16,6 +16,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from handsim import HandModel, join_qpos
+from handsim.callbacks import before_compiling
 from handsim.hand.shape import DIGITS, SIDES, bones_of
 from handsim.kernels import (
     align_rigid,
@@ -210,3 +211,29 @@ def test_kernels_that_an_earlier_version_kept_are_compiled_anew(tmp_path, monkey
     index.write_bytes(stale)
     assert kernel(twice)(1.5) == 3.0
     assert index.read_bytes() != stale
+
+
+def test_two_processes_keep_a_kernel_for_other_types_in_other_files(tmp_path, monkeypatch):
+    """Neither sees the other's index; numba would let both write to file number one."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    def twice(x):
+        return x + x
+
+    one, other = kernel(twice), kernel(twice)
+    monkeypatch.setattr(other._cache._cache_file, "_load_index", dict)
+    assert (one(1.5), other(1)) == (3.0, 2)
+    assert len(list(tmp_path.rglob("*.nbc"))) == 2
+    assert isinstance(kernel(twice)(1), int), "the index tells the newest"
+
+
+def test_what_prepares_kernels_is_called_once_before_one_is_compiled(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    called = []
+    before_compiling.append(lambda: called.append(1))
+
+    def twice(x):
+        return x + x
+
+    compiled = kernel(twice)
+    assert (compiled(1.5), compiled(1), called) == (3.0, 2, [1])

@@ -29,7 +29,7 @@ from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutErro
 from handsim.files.arrays import check_npy_header
 from handsim.files.inputs import checksum, load_json
 from handsim.files.outputs import atomic_write
-from handsim.hand.shape import HAND_DTYPE, NUM_QPOS, HandShape, unpack_hand
+from handsim.hand.shape import HAND_DTYPE, NUM_QPOS, SIDES, HandShape, unpack_hand
 from handsim.settings import Limits, Settings
 
 SCHEMA: Final = 2
@@ -245,6 +245,14 @@ class Dataset:
     def mapped_rows(self) -> MappedRows:
         """All T rows in order, left where they are; processes that read them share one copy."""
         return MappedRows(self.shards)
+
+    def people(self) -> Int[np.ndarray, "T"]:
+        """The person of each row, numbered from 0 through the set; a person's rows follow each other."""
+        parts, known = [], 0
+        for number, shard in enumerate(self.shards):
+            parts.append(known + shard["hand"].astype(np.int64) // len(SIDES))
+            known += len(_load_records(self.path / hands_name(number), HAND_DTYPE)) // len(SIDES)
+        return np.concatenate(parts)
 
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""

@@ -13,7 +13,16 @@ from jaxtyping import Int
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.files.outputs import atomic_write
 from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
-from train.evaluation import BINS, LEAST_SURE, History, LabelingReport, Reliability, percent, reliability
+from train.evaluation import (
+    BINS,
+    LEAST_SURE,
+    SEEN,
+    History,
+    LabelingReport,
+    Reliability,
+    percent,
+    reliability,
+)
 from train.labelers.storage import GLOVE
 from train.reports.hand_plot import HAND_CAPTION, hand_picture, mistakes, short
 
@@ -25,6 +34,7 @@ PAGE: Final = "report.html"
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
 """License in the card of weights whose owner has named none, in the word that hubs of models know."""
+_IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
 _MIN_SHARE: Final = 0.01  # lower end of the confusions' scale [%]
 _MAX_WRITTEN: Final = 30  # number of classes up to which a cell has room for a number
@@ -68,7 +78,11 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: La
 def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
     """The run's settings and its two main figures, in words."""
     train = card["train"]
-    clean, (recipe, corrupted) = _columns(card)
+    shown = [
+        f"{percent(column['slot_accuracy'])} %{_interval(card, name)} of the slots are right "
+        f"{_IN_WORDS.get(name, f'with the paper recipe ({name})')}"
+        for name, column in card["held_out_simulated"].items()
+    ]
     average = f", weights averaged with decay {train['average']:g}" if train["average"] else ""
     return (
         f"{_KINDS[train['labeler']]} for glove {layout.name} ({layout.num_markers} markers), trained on "
@@ -76,31 +90,42 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
         f"batches of {train['batch']}: {100 * train['rig_share']:g} % of them as the simulated rig saw them, "
         f"the others through random drops and ghosts. Optimizer {train['optimizer']}, learning rate from "
         f"{train['learning_rate']:g}, schedule {train['schedule']}{average}, seed {train['seed']}. On "
-        f"held-out frames {percent(clean['slot_accuracy'])} % of the slots are right when every marker is "
-        f"seen, and {percent(corrupted['slot_accuracy'])} % with the paper's recipe ({recipe})."
+        f"{held_out_people(card)}, {', '.join(shown[:-1])}, and {shown[-1]}."
     )
 
 
-def _columns(card: dict[str, Any]) -> tuple[dict[str, float], tuple[str, dict[str, float]]]:
-    """Held-out figures without corruption; then the paper's recipe, and the figures with it."""
-    columns = dict(card["held_out_simulated"])
-    clean = columns.pop("clean")
-    ((recipe, corrupted),) = columns.items()
-    return clean, (recipe, corrupted)
+def held_out_people(card: dict[str, Any]) -> str:
+    """Whose frames the figures of a card are of, in words."""
+    count = card.get("held_out_people")
+    if count is None:
+        return "held-out frames"
+    if count == 0:
+        return "held-out frames of the only person of the set, who was seen in training"
+    return f"frames of {count} {'person' if count == 1 else 'people'} whom training did not see"
+
+
+def _interval(card: dict[str, Any], name: str) -> str:
+    """The interval of a column's slot accuracy over people in brackets, if there is one."""
+    interval = card.get("held_out_intervals", {}).get(name)
+    return "" if interval is None else f" ({percent(interval[0])} to {percent(interval[1])})"
 
 
 def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     """A table of all figures."""
-    clean, (recipe, corrupted) = _columns(card)
-    table = [["figure [%]", "clean", recipe]]
-    table += [[name.replace("_", " "), percent(clean[name]), percent(corrupted[name])] for name in corrupted]
+    columns = card["held_out_simulated"]
+    (recipe,) = set(columns) - {SEEN, "clean"}
+    table = [["figure [%]", *columns]]
+    table += [
+        [name.replace("_", " "), *(percent(column[name]) for column in columns.values())]
+        for name in columns[recipe]
+    ]
     text = (
-        f"On {report.num_frames:,} frames that training never saw, as they are and with the paper's recipe: "
-        f"{recipe} at most, drawn at random. The pictures below show the latter."
+        f"On {report.num_frames:,} {held_out_people(card)}. The pictures below show the figures with the "
+        f"paper's recipe: {recipe} at most, drawn at random. Intervals of 95 % are over people."
     )
     notes = [
         f"The last line is the share of points labeled wrongly without the {100 * LEAST_SURE:g} % that the "
-        f"labeler is least sure of; with them it is {percent(1.0 - corrupted['point_accuracy'])} %."
+        f"labeler is least sure of; with them it is {percent(1.0 - columns[recipe]['point_accuracy'])} %."
     ]
     return Section("In figures", text, table=table, notes=notes)
 
@@ -267,7 +292,7 @@ every setting.
 
 ## Figures
 
-On held-out simulated frames, in percent:
+On {people}, in percent, with the 95 % interval over people:
 
 {figures}
 
@@ -287,6 +312,7 @@ In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
 - Markers of this layout only; moved by more than a centimeter they want a labeler of their own.
 - Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
 """
+_CARD_IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
 _CARD_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
 _CARD_FIGURES: Final = {
     "slot_accuracy": "labels and gaps that are right",
@@ -310,7 +336,12 @@ def model_card(card: dict[str, Any]) -> str:
     dataset, columns = card["dataset"], card["held_out_simulated"]
     figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     figures += [
-        f"| {words} | {' | '.join(percent(column[name]) for column in columns.values())} |"
+        f"| {words} | "
+        + " | ".join(
+            percent(column[name]) + (_interval(card, recipe) if name == "slot_accuracy" else "")
+            for recipe, column in columns.items()
+        )
+        + " |"
         for name, words in _CARD_FIGURES.items()
     ]
     return _CARD.format(
@@ -325,5 +356,6 @@ def model_card(card: dict[str, Any]) -> str:
         num_frames=dataset["num_frames"],
         seed=dataset["seed"],
         samples=card["train"]["samples"],
+        people=held_out_people(card),
         figures="\n".join(figures),
     )

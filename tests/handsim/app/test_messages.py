@@ -16,7 +16,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from handsim.app import messages
-from handsim.app.messages import LiveStatus, _line, _lines, _speed, named_steps, progress_bar
+from handsim.app.messages import (
+    LiveStatus,
+    ProgressBar,
+    _line,
+    _lines,
+    _speed,
+    named_steps,
+    progress_bar,
+    tell_state,
+)
 from tests.waiting import wait_for
 
 LINE = "frame 1234: right tracked, left tracked, controller tracked, 12 missing; Ctrl-C ends it"
@@ -107,3 +116,29 @@ def test_a_log_gets_a_line_a_step_and_not_one_a_count(capsys):
         assert capsys.readouterr().err.splitlines() == [
             "starting", "generating frames: 0 of 1,000", "drawing"
         ]  # fmt: skip
+
+
+def test_a_line_of_state_goes_where_the_command_shows_its_own(capsys):
+    tell_state("alone")
+    with progress_bar("frames") as bar:
+        tell_state("compiling")
+        tell_state("")
+        bar(1, 2)
+    with named_steps("first"):
+        tell_state("compiling 2 kernels: 1 done")
+        tell_state("compiling 2 kernels: 2 done")
+    lines = ["alone", "compiling", "first", "compiling 2 kernels: 1 done", "compiling 2 kernels: 2 done"]
+    assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_a_bar_shows_a_line_of_state_until_more_is_done():
+    with Progress(disable=True) as progress:
+        bar = ProgressBar(progress, progress.add_task(""))
+        bar.step("drawing")
+        bar.tell("compiling")
+        assert progress.tasks[0].description == "compiling"
+        bar(1, 2)
+        assert progress.tasks[0].description == "drawing"
+        bar.tell("compiling")
+        bar.tell("")
+        assert progress.tasks[0].description == "drawing"

@@ -33,7 +33,7 @@ def config_of(dataset, tmp_path, monkeypatch):
 
         def keep(rows, out, settings, *, threads, progress, on_step):
             configs.append(settings.for_set(19, FRAMES))
-            return {"held_out_simulated": {"random": {"accuracy": 1.0}}}
+            return {"held_out_simulated": {"random": {"accuracy": 1.0}}, "held_out_intervals": {}}
 
         monkeypatch.setattr(train.loop, "train_labeler", keep)
         assert main(["train", str(dataset), "--out", str(tmp_path / "run"), *options]) == 0

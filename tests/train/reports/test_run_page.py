@@ -25,6 +25,7 @@ from train import (
     LabelingReport,
     SetLabelerConfig,
     TrainSettings,
+    evaluate_labeler,
     load_labeler,
     train_labeler,
 )
@@ -37,7 +38,7 @@ from train.evaluation import (
     reliability,
 )
 from train.labelers.storage import CARD, WEIGHTS
-from train.loop import CHECKPOINT, TrainingState
+from train.loop import CHECKPOINT, TrainingState, _first_held_out
 from train.reports.hand_plot import MAX_LETTERS, short
 from train.reports.run_page import (
     MODEL_CARD,
@@ -102,6 +103,30 @@ def test_the_page_says_what_the_card_says(run):
     for one in drawn:
         assert len(list(ElementTree.fromstring(one).iter())) > 100
     assert load_labeler(out).marker_names == tuple(card["marker_names"])
+
+
+def test_figures_are_of_people_whom_training_did_not_see(dataset, run):
+    out, card = run
+    people = dataset.people()
+    np.testing.assert_array_equal(people, np.arange(400) // 50)
+    first = _first_held_out(people)
+    assert set(people[:first]).isdisjoint(people[first:]) and card["held_out_people"] == 1
+    assert "frames of 1 person whom training did not see" in (out / PAGE).read_text("utf-8")
+    many = np.repeat(np.arange(400), 3)
+    assert len(set(many[_first_held_out(many) :])) == 20
+    assert _first_held_out(np.zeros(100, dtype=int)) == 98
+
+
+def test_a_set_is_evaluated_as_its_rig_saw_it(dataset):
+    seen, rows = evaluate_labeler("dense19", dataset), dataset.rows()
+    missing = np.isnan(rows["observed"][..., 0]).mean()
+    assert seen.figures["occlusion_ratio"] == pytest.approx(missing) and missing > 0.0
+    ghosts = np.isfinite(rows["ghosts"][..., 0]).sum()
+    assert seen.numbers["ghosts"] == ghosts > 0
+    clean = evaluate_labeler("dense19", rows["markers"].astype(np.float64))
+    assert clean.figures["slot_accuracy"] > seen.figures["slot_accuracy"] > 0.8
+    low, high = seen.interval(dataset.people())
+    assert low < seen.figures["slot_accuracy"] < high
 
 
 def test_a_run_has_a_model_card_of_what_was_trained(run):

@@ -1,0 +1,143 @@
+"""What the first run of each command costs, while the cache of kernels is empty, and the list of kernels.
+
+The clock runs from the start of a command to its end, and processor time is that of all its processes.
+With --record the commands run without the list and with one cache, the dearest kernels are printed, and the
+list is written anew: after a change to a kernel's arguments or to what calls it.
+
+python -m benchmarks.cold_start [--only label track ...] [--record]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.record import describe
+from handsim.app.compiling import LIST
+
+# In the order of the recording; a later command may read what an earlier one wrote.
+COMMANDS: Final = {
+    "simulate": "simulate --kind hand-hand --num-frames 240 --seed 3 --out hand.c3d",
+    "label": "label hand.c3d --out labeled.trc",
+    "track": "track hand.c3d --out take.npz",
+    "render": "render hand.truth.npz --num-frames 4 --workers 1 --seed 5 --out pictures",
+    "generate": "generate --num-frames 500 --workers 1 --seed 1 --out set",
+    "demo": "demo --num-frames 500 --out demo",
+    "evaluate": "evaluate hand.truth.npz",
+    "calibrate": "calibrate hand.c3d --size M --out user.json",
+}
+RUN: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
+RECORD: Final = """
+import gc, json, sys, time
+
+from numba.core import event
+from numba.core.registry import CPUDispatcher
+
+from handsim.app import compiling
+from handsim.cli.main import main
+
+compiling.compile_kernels = lambda command: (0, 0)
+compiling.plain_shape_errors()
+table, seconds, running = [], {}, []
+
+
+def row_of(kernel, types):
+    place = f"{kernel.py_func.__module__}:{kernel.py_func.__qualname__}"
+    try:
+        return json.dumps([place, [compiling.type_row(one, table) for one in types]])
+    except ValueError as error:
+        print(f"{place} is left out: {error}", file=sys.stderr)
+
+
+class Listener(event.Listener):
+    def on_start(self, found):
+        running.append([time.process_time(), 0.0])
+
+    def on_end(self, found):
+        began, inner = running.pop()
+        took = time.process_time() - began
+        if running:
+            running[-1][1] += took
+        kernel = found.data["dispatcher"]
+        if kernel.targetoptions.get("no_cfunc_wrapper"):
+            seconds[row_of(kernel, found.data["args"])] = took - inner
+
+
+table.extend(json.loads(sys.stdin.readline()))
+event.register("numba:compile", Listener())
+code = main(sys.argv[2:])
+ours = [one for one in gc.get_objects() if isinstance(one, CPUDispatcher)]
+ours = [one for one in ours if one.targetoptions.get("no_cfunc_wrapper")]
+calls = {row_of(one, types): sorted(compiling.needed_kernels(one)) for one in ours for types in one.overloads}
+calls.pop(None, None)
+seconds.pop(None, None)
+with open(sys.argv[1], "w") as file:
+    json.dump([table, seconds, calls], file)
+sys.exit(code)
+"""
+
+
+def measure(names: list[str], folder: Path) -> None:
+    """Print what each command costs with an empty cache of its own."""
+    print(f"{'command':12}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
+    for name in ["simulate", *(name for name in names if name != "simulate")]:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / f"cache-{name}")}
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        command = [sys.executable, "-c", RUN, *COMMANDS[name].split()]
+        subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, check=True)
+        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
+        busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        kernels = len(list((folder / f"cache-{name}").rglob("*.nbc")))
+        print(f"{name:12}{wall:9.1f}{busy:15.1f}{kernels:9}", flush=True)
+
+
+def record(names: list[str], folder: Path) -> None:
+    """Write the list, and print its dearest kernels."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
+    table: list[Any] = []
+    seconds: dict[str, float] = {}
+    users: dict[str, set[str]] = {}
+    for name in names:
+        command = [sys.executable, "-c", RECORD, "recorded.json", *COMMANDS[name].split()]
+        given = json.dumps(table) + "\n"
+        subprocess.run(command, cwd=folder, env=environment, input=given, text=True, check=True)
+        table, compiled, calls = json.loads((folder / "recorded.json").read_text())
+        seconds |= compiled
+        called = {place for places in calls.values() for place in places}
+        for row in seconds:
+            if row in calls or json.loads(row)[0] in called:
+                users.setdefault(row, set()).add(name)
+        kernels = [
+            [*json.loads(row), round(took, 2), " ".join(sorted(users.get(row, ())))]
+            for row, took in sorted(seconds.items())
+        ]
+        lines = (",\n  ".join(json.dumps(one) for one in rows) for rows in (table, kernels))
+        LIST.write_text('{{"types": [\n  {}\n], "kernels": [\n  {}\n]}}\n'.format(*lines), encoding="utf-8")
+        print(f"after {name}: {len(kernels)} kernels in {sum(seconds.values()):.0f} s", flush=True)
+    for place, _, took, commands in sorted(kernels, key=lambda one: -one[2])[:25]:
+        print(f"{took:7.2f} s  {place}  ({commands})")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--record", action="store_true")
+    options = parser.parse_args()
+    print(describe("numba"))
+    with tempfile.TemporaryDirectory() as folder:
+        if options.record:
+            record(options.only, Path(folder))
+        else:
+            measure(options.only, Path(folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,316 @@
+"""Kernels that a command needs are compiled ahead, by as many processes as there are cores.
+
+data/kernels.json lists the kernels of every command: the types of their arguments, by rows of a table in
+which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.cold_start --record`
+writes it. What the list lacks is compiled when it is called; what it holds in vain costs some time and
+nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import importlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from handsim.app.messages import tell_state
+from handsim.app.workers import one_thread, usable_cores, without_signals
+from handsim.callbacks import before_compiling
+
+if TYPE_CHECKING:
+    from numba.core.registry import CPUDispatcher
+
+LIST: Final = Path(__file__).parents[1] / "data" / "kernels.json"
+_FEW: Final = 4.0  # [s] of compiling that other processes are not worth
+_TOLD: Final = 2.0  # [s] between two lines
+_ENDING: Final = 5.0  # [s] that a process has to end
+_MOST: Final = 8  # processes; more would wait for one another
+_KNOWN: Final = 3.0  # factor of the rank of kernels in a package whose other kernels a process has compiled
+_GARBAGE: Final = 100_000  # new objects that Python's collector waits for: a twentieth of the time is its
+
+
+class ListedKernel(NamedTuple):
+    """A kernel on the list."""
+
+    name: str
+    """Its place, as module:name."""
+    types: list[int]
+    """Types of its arguments, as rows of the table of types."""
+    seconds: float
+    """Processor time that it took to compile [s]."""
+    commands: str
+    """Commands that need it, with spaces between them."""
+
+
+def compile_kernels(command: str | None = None) -> tuple[int, int]:
+    """Compile the kernels of a command, by default those of all, that the cache lacks.
+
+    Returns:
+        How many were compiled, and how many are missing still, which are compiled when they are called.
+    """
+    listed = {row: one for row, one in enumerate(read_list()) if command in (None, *one.commands.split())}
+    missing = missing_kernels(listed)
+    if command is not None:  # what is missing after all of this
+        before_compiling.append(functools.partial(tell_state, "compiling what is new, once on this machine"))
+    if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _FEW):
+        return 0, len(missing)
+    with _Compilers(missing) as compilers:
+        compilers.run()
+    rest = len(missing_kernels(missing))
+    return len(missing) - rest, rest
+
+
+def read_list(path: Path = LIST) -> list[ListedKernel]:
+    """All kernels on the list."""
+    return [ListedKernel(*row) for row in json.loads(path.read_text(encoding="utf-8"))["kernels"]]
+
+
+@functools.cache
+def known_types() -> list[Any]:
+    """The types of the list's table, as numba has them; None where a type is gone."""
+    known: list[Any] = []
+    for row in json.loads(LIST.read_text(encoding="utf-8"))["types"]:
+        try:
+            known.append(_type_of(row, known))
+        except (AttributeError, ImportError, ValueError):
+            known.append(None)
+    return known
+
+
+def _type_of(row: str | list[Any], known: list[Any]) -> Any:
+    """The type that a row tells: a number, a literal, an array, or a tuple of earlier rows."""
+    from numba import types
+
+    if isinstance(row, list):
+        kind = _found(row[0]) if row[0] else None
+        return types.BaseTuple.from_types([known[part] for part in row[1:]], kind)
+    name, *array = row.split()
+    if name.startswith("="):
+        return types.literal(json.loads(name[1:]))
+    if ":" in name:
+        return types.Dispatcher(_found(name))
+    scalar = getattr(types, name)
+    return types.Array(scalar, int(array[0]), array[1], readonly="const" in array) if array else scalar
+
+
+def type_row(kind: Any, table: list[Any]) -> int:
+    """The row of a type in a table, which gets it if it is not there; for the list's author.
+
+    Raises:
+        ValueError: The list has no words for the type.
+    """
+    from numba import types
+
+    row: str | list[Any] = kind.name
+    if isinstance(kind, types.BaseTuple):
+        place = getattr(kind, "instance_class", None)
+        name = "" if place is None else f"{place.__module__}:{place.__qualname__}"
+        row = [name, *(type_row(part, table) for part in kind)]
+    elif isinstance(kind, types.Array):
+        row = f"{kind.dtype.name} {kind.ndim} {kind.layout}" + " const" * (not kind.mutable)
+    elif isinstance(kind, types.Literal):
+        row = f"={json.dumps(kind.literal_value)}"
+    elif isinstance(kind, types.Dispatcher):
+        row = f"{kind.dispatcher.py_func.__module__}:{kind.dispatcher.py_func.__qualname__}"
+    elif getattr(types, kind.name, None) is not kind:
+        row = next((name for name, one in vars(types).items() if one is kind), "")
+        if not row:
+            raise ValueError(f"no words for the type {kind}")
+    if row not in table:
+        table.append(row)
+    return table.index(row)
+
+
+def _found(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def missing_kernels(listed: Mapping[int, ListedKernel]) -> dict[int, ListedKernel]:
+    """Those kernels, by their rows in the list, that the cache lacks."""
+    from numba.core.registry import cpu_target
+
+    codegen, known = cpu_target.target_context.codegen(), known_types()
+    missing = {}
+    for row, one in listed.items():
+        arguments = tuple(known[number] for number in one.types)
+        try:
+            cache = _found(one.name)._cache
+            there = cache._index_key(arguments, codegen) in cache._cache_file._load_index()
+        except (AttributeError, ImportError, OSError):  # the kernel is gone, or needs what is not installed
+            continue
+        if not there and None not in arguments:
+            missing[row] = one
+    return missing
+
+
+def needed_kernels(kernel: CPUDispatcher) -> set[str]:
+    """All kernels that a kernel calls, directly or through others, as module:name."""
+    from numba.core.registry import CPUDispatcher
+
+    names, open_ones, seen = set(), [kernel], {kernel}
+    while open_ones:
+        function = open_ones.pop().py_func
+        for name in function.__code__.co_names:
+            one = function.__globals__.get(name)
+            if isinstance(one, CPUDispatcher) and one not in seen:
+                seen.add(one)
+                open_ones.append(one)
+                names.add(f"{one.py_func.__module__}:{one.py_func.__qualname__}")
+    return names
+
+
+class _Compilers:
+    """Processes that compile kernels, each after those that it calls; they end with the block."""
+
+    def __init__(self, listed: Mapping[int, ListedKernel]) -> None:
+        self._todo, self._now, self._done = dict(listed), dict[int, ListedKernel](), 0.0
+        self._total, self._count = sum(one.seconds for one in listed.values()), len(listed)
+        self._needs = {one.name: needed_kernels(_found(one.name)) for one in listed.values()}
+        # Kernels that others wait for come first: those with the most to compile along one line of calls.
+        self._rank: dict[str, float] = {}
+        for one in sorted(listed.values(), key=lambda one: -len(self._needs[one.name])):
+            after = (self._rank[name] for name in self._rank if one.name in self._needs[name])
+            self._rank[one.name] = max(self._rank.get(one.name, 0.0), one.seconds + max(after, default=0.0))
+        self._changed = threading.Condition()
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def __enter__(self) -> _Compilers:
+        home = str(Path(__file__).parents[2])
+        path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
+        command = [sys.executable, "-P", "-m", __name__]
+        with one_thread(), without_signals(), contextlib.suppress(OSError):  # if it has no room for more
+            for _ in range(min(usable_cores(), self._count, _MOST)):
+                self._processes.append(
+                    subprocess.Popen(
+                        command,
+                        stdin=subprocess.PIPE,
+                        stdout=subprocess.PIPE,
+                        stderr=subprocess.DEVNULL,
+                        text=True,
+                        env={**os.environ, "PYTHONPATH": path},
+                    )
+                )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait(_ENDING)
+            for pipe in (process.stdin, process.stdout):
+                with contextlib.suppress(OSError):
+                    pipe.close()  # type: ignore[union-attr]
+
+    def run(self) -> None:
+        """Compile, and tell how far it is."""
+        began = time.monotonic()
+        threads = [threading.Thread(target=self._feed, args=(one,), daemon=True) for one in self._processes]
+        tell_state(f"compiling {self._count} kernels, once on this machine")
+        for thread in threads:
+            thread.start()
+        told, first = began, (began, 0.0)  # the first kernel waits until the process is there
+        while any(thread.is_alive() for thread in threads):
+            with self._changed:
+                self._changed.wait(_TOLD / 10.0)
+                done = self._count - len(self._todo) - len(self._now)
+            now = time.monotonic()
+            if not first[1]:
+                first = now, self._done
+            if now >= told + _TOLD:
+                told = now
+                speed = (self._done - first[1]) / (now - first[0]) if now > first[0] else 0.0
+                rest = f", about {(self._total - self._done) / speed:.0f} s left" if speed else ""
+                tell_state(f"compiling {self._count} kernels, once on this machine: {done} done{rest}")
+        tell_state("")
+
+    def _feed(self, process: subprocess.Popen[str]) -> None:
+        """Hand kernels to a process until none is left or it dies."""
+        assert process.stdin is not None and process.stdout is not None
+        packages: set[str] = set()
+        while (row := self._take(packages)) is not None:
+            alive = False
+            with contextlib.suppress(OSError, ValueError):
+                process.stdin.write(f"{row}\n")
+                process.stdin.flush()
+                alive = process.stdout.readline() != ""
+            with self._changed:
+                self._done += self._now.pop(row).seconds
+                self._changed.notify_all()
+            if not alive:
+                return
+
+    def _take(self, packages: set[str]) -> int | None:
+        """The next kernel, when what it calls is there; None if no more are left.
+
+        Each process compiles what kernels need of numba itself. So it keeps to few packages if it can.
+        """
+
+        def rank(row: int) -> float:
+            name = self._todo[row].name
+            return self._rank[name] * (_KNOWN if name.rpartition(".")[0] in packages else 1.0)
+
+        with self._changed:
+            while self._todo:
+                busy = {one.name for one in self._now.values()}
+                waited_for = busy | {one.name for one in self._todo.values()}
+                ready = [
+                    row
+                    for row, one in self._todo.items()
+                    if one.name not in busy and not self._needs[one.name] & waited_for - {one.name}
+                ]
+                if ready:
+                    row = max(ready, key=rank)
+                    self._now[row] = self._todo.pop(row)
+                    packages.add(self._now[row].name.rpartition(".")[0])
+                    return row
+                if not self._now:  # kernels that call one another
+                    break
+                self._changed.wait()
+            return None
+
+
+def plain_shape_errors() -> None:
+    """Let kernels say that shapes of a slice and of what it is set to differ, but not which shapes they are.
+
+    Ours have no such slices, and the words that numba would compile into each kernel with a slice are up to
+    half of its code.
+    """
+    from numba.core.extending import overload
+    from numba.np import arrayobj
+
+    def complain(source: Any, target: Any) -> None:
+        raise NotImplementedError
+
+    @overload(complain)
+    def compiled(source: Any, target: Any) -> Any:
+        def raise_plainly(source: Any, target: Any) -> None:
+            raise ValueError("cannot assign slice from input of different size")
+
+        return raise_plainly
+
+    arrayobj.raise_with_shape_context = complain
+
+
+def _work(rows: Iterable[str]) -> None:
+    """Compile kernels by their rows in the list, and print each row when its kernel is in the cache."""
+    gc.set_threshold(_GARBAGE)
+    plain_shape_errors()
+    listed, known = read_list(), known_types()
+    for row in rows:
+        one = listed[int(row)]
+        with contextlib.suppress(Exception):  # what is wrong with a kernel is told where it is called
+            _found(one.name).compile(tuple(known[number] for number in one.types))
+        print(row.strip(), flush=True)
+
+
+if __name__ == "__main__":
+    _work(sys.stdin)
