@@ -46,7 +46,12 @@ def digit_model(solver, qpos, missing):
     variance = np.full(19, SPREAD**2)
     seen = predict_markers(solver.hand, solver.on_part, qpos, target, prior, (0.01, 0.1), variance, SPREAD)
     return DigitModel(
-        prior, seen, variance, peak_log_odds(variance, STRAYS), np.zeros(19), digit_ranges(solver.hand)
+        prior,
+        seen,
+        variance,
+        peak_log_odds(variance, STRAYS),
+        np.zeros(19),
+        digit_ranges(attach(load_layout("dense19"), HandModel.named("M"))),
     )
 
 
@@ -142,7 +147,7 @@ def test_odds_decide_between_points_that_fit_as_well(hand):
 
 def test_ranges_hold_the_poses_of_the_hand(hand):
     solver, model = hand
-    ranges = digit_ranges(hand_arrays(attach(load_layout("dense19"), model)))
+    ranges = digit_ranges(attach(load_layout("dense19"), model))
     angles = sample_valid_angles(model, 50, rng=np.random.default_rng(1))
     for qpos in join_qpos(angles):
         markers = solver.marker_positions(qpos)[MARKERS]

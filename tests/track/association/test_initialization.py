@@ -123,10 +123,11 @@ def test_exchanged_hands_are_exchanged_back(initializer, states):
     clouds = markers(states, 0)
     points, labels = shuffled(clouds, 0, np.random.default_rng(0))
     of_hands = [np.where(labels // 19 == hand, labels % 19, -1) for hand in (0, 1)]
-    right = [initializer._fit(hand, points, of_hands[hand]) for hand in (0, 1)]
-    wrong = [initializer._fit(1 - hand, points, of_hands[hand]) for hand in (0, 1)]
-    assert initializer._sides_checked(right, points) is right
-    for hand in initializer._sides_checked(wrong, points):
+    initializer._points = points
+    right = [initializer._fit(hand, of_hands[hand]) for hand in (0, 1)]
+    wrong = [initializer._fit(1 - hand, of_hands[hand]) for hand in (0, 1)]
+    assert initializer._sides_checked(right) is right
+    for hand in initializer._sides_checked(wrong):
         seen = hand.labels >= 0
         assert (hand.labels[seen] == of_hands[hand.index][seen]).all() and seen.sum() >= 17
 
