@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
-from benchmarks.people import right_hands
+from benchmarks.people import displace_markers, right_hands
 from benchmarks.record import Figures, describe, run, save_figures
 from gloves import GloveFit, MarkerLayout, Take, load_layout
 from gloves.fit import attach_markers, nominal_fit
@@ -37,9 +37,7 @@ from handsim import HandModel, HandShape, join_qpos, sample_shape
 from handsim.hand.shape import BONES, SIDES, SIZES, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, is_touching, thumb_contact
-from track.calibration.energy import contact_geometry, initialize_contacts
-from track.calibration.hand_parameters import SkinPatch, displace_markers
-from track.calibration.user_calibration import calibrate_hand
+from track.calibration.user_calibration import calibrate_hand, contact_gaps
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
@@ -120,10 +118,7 @@ def held_out_gaps(hand: GloveFit, true: GloveFit, take: Take) -> np.ndarray:
 def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
     """Distance [m] of the skins of thumb and finger; angles alone decide, so right hands will do."""
     model = HandModel(model.shape.with_side("right"))
-    bones = model.forward_kinematics(join_qpos(qpos[:, 7:]))
-    contacts = initialize_contacts(model, [(frame, finger) for frame in range(len(qpos))], bones)
-    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
-    return contact_geometry(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
+    return contact_gaps(model, [(frame, finger) for frame in range(len(qpos))], join_qpos(qpos[:, 7:]))
 
 
 def tell(name: str, hand: GloveFit, true: GloveFit, held_out: Take) -> list[float]:

@@ -1,4 +1,4 @@
-"""Labeled captures of several people, one sub-folder each."""
+"""Labeled captures of several people, one sub-folder each, and gloves that sit as on people."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from gloves.captures.formats import read_markers
+from gloves.fit import Attachment
+from handsim.hand.shape import HandShape
+from track.calibration.hand_parameters import (
+    attachment_at,
+    build_skin,
+    nearest_coordinates,
+    project_onto_skin,
+)
 
 
 def right_hands(captures: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -16,3 +24,17 @@ def right_hands(captures: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]
         for person in sorted(captures.iterdir())
         if person.is_dir()
     }
+
+
+def displace_markers(
+    worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
+) -> Attachment:
+    """A glove on a right hand with every marker displaced along the skin, as on a real glove."""
+    steps = rng.normal(size=worn.points.shape)
+    steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
+    steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)
+    coordinates = project_onto_skin(
+        nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
+    )
+    heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
+    return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)

@@ -42,11 +42,9 @@ class _Search(NamedTuple):
 def fit_inliers(
     positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
 ) -> tuple[int, float]:
-    """Fit the pose to the assigned points that agree tightly, and keep those within the gate of it.
-
-    Several wrong points together can bias a fit until the right ones look like outliers. Therefore the point
-    without which the others fit best is removed, one at a time, until all agree.
-    """
+    """Fit the pose to the assigned points that agree tightly, and keep those within the gate of it."""
+    # Several wrong points together can bias a fit until the right ones look like outliers. Therefore the
+    # point without which the others fit best is removed, one at a time, until all agree.
     core, fitted = assignment.copy(), np.empty(7)
     count, _, worst = _fit_pose(positions, points, core, fitted)
     while count > FEWEST and worst > tight * tight:
@@ -92,10 +90,7 @@ def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats)
 
 @kernel
 def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple[int, bool]:
-    """The marker without which the others fit best, and whether they do ten times better than otherwise.
-
-    `assignment` (Q,) is changed and restored.
-    """
+    """The marker without which the others fit best, and whether they do ten times better than otherwise."""
     outlier, least, second, pose = -1, np.inf, np.inf, np.empty(7)
     for marker in range(len(positions)):
         if assignment[marker] >= 0:
@@ -113,10 +108,7 @@ def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple
 def assign_remaining(
     positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
 ) -> tuple[int, float]:
-    """Assign to the other markers of a known pose the free points nearby, and fit again.
-
-    Arguments and result are those of `fit_inliers`; `pose` is the known pose.
-    """
+    """Assign to the other markers of a known pose the free points nearby, and fit again, as `fit_inliers`."""
     predicted = transform_markers(positions, pose)
     for marker in range(len(positions)):
         if assignment[marker] < 0:
@@ -146,11 +138,7 @@ def track_by_ids(
     gate: float,
     assignment: Ints,
 ) -> tuple[int, float]:
-    """Assign points by the IDs of the last frame, fit the pose, and assign the rest from it.
-
-    `last_ids` (Q,) are -1 for markers that had no point. The other arguments and the result are those of
-    `fit_inliers`; the assignment is filled.
-    """
+    """Assign points by the IDs of the last frame, -1 for none; fit as `fit_inliers`, and assign the rest."""
     found = 0
     for marker in range(len(last_ids)):
         assignment[marker] = -1
@@ -234,11 +222,8 @@ def _try_triangles(search: _Search, a: int, b: int, i: int, j: int) -> None:
 
 @kernel
 def _keep_better(search: _Search, trial: Ints) -> None:
-    """Keep a trial assignment if it has more markers than the best so far, or as many that fit better.
-
-    Points that do not fit are removed from the trial. One that shares three pairs with the best assignment is
-    not another one.
-    """
+    """Keep a trial of more markers than the best so far, or as many that fit better, without its outliers."""
+    # One that shares three pairs with the best assignment is not another one.
     pose, score = np.empty(7), search.score
     count, rms = fit_inliers(search.positions, search.points, trial, pose, search.gate, search.gate)
     if count < max(score[0], FEWEST):
@@ -257,10 +242,7 @@ def _keep_better(search: _Search, trial: Ints) -> None:
 def _extend_triangle(
     positions: Floats, points: Floats, slack: float, assignment: Ints, a: int, b: int, c: int
 ) -> int:
-    """Assign to the other markers the free points where a triangle of markers predicts them.
-
-    Returns how many markers have a point; 0 where the triangle is too flat.
-    """
+    """Assign to other markers the free points where a triangle predicts them; how many, 0 if it is flat."""
     model, seen = np.empty((3, 3)), np.empty((3, 3))
     if not _triangle_axes(positions[a], positions[b], positions[c], model):
         return 0

@@ -15,7 +15,7 @@ from gloves.takes.corrections import FREE, Correction, applied_corrections, find
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
 from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
-from track.kinematics.pose_solver import FEWEST_MARKERS, AnglePrior, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.kinematics.pose_spread import SpreadModel
 from track.user import hand_origin
 
@@ -103,8 +103,7 @@ def _solved(
     """Poses (T, 27) of a hand whose markers are shifted by biases; each starts from the pose near it."""
     solver = PoseSolver(worn)
     solver.hand.positions[:, 0] -= bias
-    prior = AnglePrior(near[:, 7:], _ANGLE_SPREAD)
-    fit = solver.solve(targets, near, prior=prior)
+    fit = solver.solve(targets, near, prior=(near[:, 7:], _ANGLE_SPREAD))
     qpos, bad = fit.qpos.copy(), np.flatnonzero(fit.rms > _BAD_RMS)
     if len(bad):
         other = solver.solve(targets[bad])  # a wrong label may have bent the pose too far

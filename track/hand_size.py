@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -29,8 +29,8 @@ from handsim.hand.shape import SIZES, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
-from track.calibration.energy import Estimate, Problem, levenberg_marquardt, shared_covariance, user_hand
-from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, nearest_coordinates
+from track.calibration.energy import first_estimate, levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.hand_parameters import LENGTH
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
@@ -89,12 +89,9 @@ _MOST_OWN: Final = 16  # gloves of the working folder that are tried
 class SizeFit(NamedTuple):
     """Hands as measured."""
 
-    hand: GloveFit
-    """The right one; a left hand is its mirror image."""
-    rms: float
-    """Median RMS distance of the markers from this hand [m]."""
-    spread: float
-    """Standard deviation of its length [m]."""
+    hand: GloveFit  # the right one; a left hand is its mirror image
+    rms: float  # median RMS distance of the markers from this hand [m]
+    spread: float  # standard deviation of its length [m]
 
     def __str__(self) -> str:
         """Length and breadth [mm], and by how much the length may be off, with 95 %."""
@@ -153,25 +150,21 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """The hands that are found as hands of a length [m]."""
-    start = _hand(length, usual_breadth(length), layout)
-    markers = _label(frames, start, sides, labeler, config)
-    if not markers:
-        return None
-    search = _Search(markers, start)
-    found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    if abs(found - length) > _FAR:  # the labels are better with its own size
-        start = _hand(found, usual_breadth(found), layout)
+    markers: list[NDArray[np.float64]] = []
+    for _ in range(2):  # the labels are better with hands of about their own size
+        start = _hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
-        search = _Search(markers, start)
-        found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-    return _fit_proportions(_as_right(markers), _hand(*search.measures(found), layout))
+        if not markers:
+            return None
+        search, before = _Search(markers, start), length
+        length = search.length(usual_breadth, _SHORTEST, _LONGEST)
+        if abs(length - before) <= _FAR:
+            break
+    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
-    """Whether hands that were measured by weak evidence are found by the usual one.
-
-    In most frames; or in some of them, where most of their markers are there and fit well.
-    """
+    """Whether measured hands are found in most frames, or in some where most markers fit well."""
     tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
@@ -211,11 +204,8 @@ def _label(
     sides: Sequence[Side],
     labeler: Labeler,
     config: TrackerConfig,
-) -> dict[Side, Float[np.ndarray, "F M 3"]]:
-    """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them.
-
-    Hands that few frames show are left out.
-    """
+) -> list[Float[np.ndarray, "F M 3"]]:
+    """Labeled markers [m] of each hand that enough frames show, as a right one's, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
@@ -229,11 +219,11 @@ def _label(
                 markers = seen.markers.copy()
                 markers[seen.filled] = np.nan
                 some.append(markers)
-    return {
-        side: _spread_out(np.array(some), _PROPORTION_FRAMES)
+    return [
+        _spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
-    }
+    ]
 
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
@@ -244,26 +234,16 @@ def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return chosen
 
 
-def _as_right(markers: Mapping[Side, Float[np.ndarray, "F M 3"]]) -> Float[np.ndarray, "F M 3"]:
-    """The markers of all hands as those of right hands [m]."""
-    return np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
-
-
 class _Search:
-    """The likeliest length and breadth of hands of mean proportions.
+    """The likeliest length and breadth of hands of mean proportions, as which some frames were labeled."""
 
-    Few markers fit hands of many sizes, so that the sizes of people count too.
+    # Few markers fit hands of many sizes, so that the sizes of people count too.
 
-    Args:
-        markers: Labeled markers of each hand [m]; NaN where missing.
-        start: The right hand as which they were labeled.
-    """
-
-    def __init__(self, markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
-        few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
-        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few.values()])
+    def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
+        few = [_spread_out(some, _FRAMES) for some in markers]
+        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few])
         self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
-        self._markers, self._layout = _as_right(few), start.layout
+        self._markers, self._layout = np.concatenate(few), start.layout
         self._poses = PoseSolver(start).solve(self._markers).qpos
 
     def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
@@ -287,33 +267,17 @@ class _Search:
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
     """The argument between two bounds [m] with the least value of a function."""
-    from scipy.optimize import (
-        minimize_scalar,  # a quarter of a second, which a user's known hands do not need
-    )
+    # A quarter of a second, which a user's known hands do not need.
+    from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
     return float(found.x)
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
-    """One shape for all hands of a user, by a calibration without touches.
-
-    `seen` are labeled markers of right hands, at least four in every frame; `start` is a right hand of about
-    the right size in the glove as designed. What the frames do not tell stays as it was.
-    """
-    worn, shape = start.attachment, start.model.shape
-    coordinates = nearest_coordinates(worn.points, shape)
-    problem = Problem(
-        shape,
-        coordinates,
-        worn.layout.heights,
-        seen,
-        noise=_FIT_NOISE,
-        robust_scale=_ROBUST_SCALE,
-        relinearize=_RELINEARIZE,
-    )
-    poses = PoseSolver(start).solve(seen).qpos
-    estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
+    """One shape for right hands in some frames, by a calibration without touches."""
+    options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
+    problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
@@ -324,26 +288,20 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
 class _Fit(NamedTuple):
     """How well hands fit some frames."""
 
-    log_odds: float = 0.0
-    """Mean over the frames of the hands' log-odds, less penalties."""
+    log_odds: float = 0.0  # mean over the frames of the hands' log-odds, less penalties
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
-    shown: int = 0
-    """Number of frames in which any hand is found."""
-    is_good: bool = False
-    """Whether the hands fit well enough not to look for others."""
-    is_whole: bool = False
-    """Whether each marker is seen at times; otherwise the glove worn may have fewer markers."""
+    shown: int = 0  # number of frames in which any hand is found
+    is_good: bool = False  # whether the hands fit well enough not to look for others
+    is_whole: bool = False  # whether each marker is seen at times; if not, the glove may have fewer
 
 
 class _Other(NamedTuple):
     """A glove or scale that may fit better."""
 
-    name: str
-    """Name of the glove, or path of its file."""
+    name: str  # name of the glove, or path of its file
     layout: MarkerLayout
-    scale: float
-    """Factor that makes the points ones in meters."""
+    scale: float  # factor that makes the points ones in meters
     fit: _Fit
 
 
@@ -359,10 +317,7 @@ class _AtOnce:
 
 
 def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Refuse points that fit hands at another scale, which distances between neighbors tell.
-
-    `check_hands` finds that too, after all else that may be wrong.
-    """
+    """Refuse points that fit hands at another scale, which distances between neighbors tell."""
     some = _compared(frames)
     if not some:
         return
@@ -384,11 +339,8 @@ def check_hands(
     *,
     options: Collection[str] = ("--hands", "--glove"),
 ) -> None:
-    """Tell of hands that do not fit, where another side, glove or unit fits clearly better.
-
-    That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
-    the working folder.
-    """
+    """Tell of hands that do not fit, where another side, glove or unit fits clearly better."""
+    # That takes seconds, where something is wrong; gloves of .toml files in the working folder are tried too.
     some = _compared(frames)
     if not some:
         return

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -69,15 +69,15 @@ class RigidTemplate(RigidBody):
     """A rigid body whose markers determine its pose: the markers in its own frame.
 
     Raises:
-        ArgumentError: `positions` have another shape, or `template_fault` finds a fault.
+        ArgumentError: `positions` have another shape, or do not tell the body's pose.
     """
 
     def __post_init__(self) -> None:
         positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")
         object.__setattr__(self, "positions", positions)
-        fault = template_fault(self.name, self.marker_names, positions)
+        fault = self._fault()
         if fault is not None:
-            raise ArgumentError(fault)
+            raise ArgumentError(f"{self.name}: {fault}")
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidTemplate:
@@ -91,48 +91,39 @@ class RigidTemplate(RigidBody):
     @property
     def distances(self) -> Float[np.ndarray, "Q Q"]:
         """Distances between markers [m]."""
-        return _distances_between(self.positions)
+        distances: NDArray[np.float64] = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
+        return distances
 
-
-def template_fault(
-    name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
-) -> str | None:
-    """Why these markers [m] are not a body that can be tracked, as a sentence; None if they are."""
-    if len(positions) < FEWEST:
-        return f"{name}: {len(positions)} markers, expected at least {FEWEST}, which determine a pose"
-    if len(set(marker_names)) < len(marker_names):
-        return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
-    distances = _distances_between(positions)
-    apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
-    if apart.min() < _LEAST_MARKER_DISTANCE:
-        first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
-        return (
-            f"{name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
-            f"{1e3 * _LEAST_MARKER_DISTANCE:.0f} mm"
-        )
-    off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
-    if off_line < _LEAST_WIDTH * np.sqrt(len(positions)):
-        return f"{name}: its markers lie on one line, expected three that do not"
-    order = _symmetry(positions, distances)
-    if order is not None:
-        moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
-        return (
-            f"{name}: its markers look the same from two sides ({', '.join(moved)}), expected positions "
-            "whose distances differ by some millimeters"
-        )
-    return None
-
-
-def _distances_between(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    distances: NDArray[np.float64] = np.linalg.norm(positions[:, None] - positions, axis=2)
-    return distances
+    def _fault(self) -> str | None:
+        """Why these markers are not a body that can be tracked; None if they are."""
+        positions, marker_names = self.positions, self.marker_names
+        if len(positions) < FEWEST:
+            return f"{len(positions)} markers, expected at least {FEWEST}, which determine a pose"
+        if len(set(marker_names)) < len(marker_names):
+            return f"a marker name is there twice: {', '.join(marker_names)}"
+        distances = self.distances
+        apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
+        if apart.min() < _LEAST_MARKER_DISTANCE:
+            first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
+            return (
+                f"{first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
+                f"{1e3 * _LEAST_MARKER_DISTANCE:.0f} mm"
+            )
+        off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
+        if off_line < _LEAST_WIDTH * np.sqrt(len(positions)):
+            return "its markers lie on one line, expected three that do not"
+        order = _symmetry(positions, distances)
+        if order is not None:
+            moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
+            return (
+                f"its markers look the same from two sides ({', '.join(moved)}), expected positions "
+                "whose distances differ by some millimeters"
+            )
+        return None
 
 
 def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
-    """Another order of all markers that fits the body after a rotation, if there is one.
-
-    A part of the markers may still be symmetric; then the body is not found while only these are seen.
-    """
+    """Another order of all markers that fits the body after a rotation, if there is one."""
     count = len(positions)
     orders: list[tuple[int, ...]] = [()]
     for marker in range(count):  # orders that keep all distances so far
@@ -158,20 +149,22 @@ class BodyFrame:
     status: Status
     """`found` in the first frame after it was lost, `tracked` from then on, `coasting` for a few frames where
     fewer than three markers are seen and the pose is a prediction, `lost`."""
-    T_world_body: Float[np.ndarray, "4 4"] | None
-    """The body's frame in the world [m]; None when lost."""
-    labels: Int[np.ndarray, "N"]
-    """Index of each point's marker in the template, -1 for all others."""
-    rms: float
-    """RMS distance of the labeled points from their markers [m]; NaN without any."""
+    T_world_body: Float[np.ndarray, "4 4"] | None  # the body's frame in the world [m]; None when lost
+    labels: Int[np.ndarray, "N"]  # index of each point's marker in the template, -1 for all others
+    rms: float  # RMS distance of the labeled points from their markers [m]; NaN without any
+
+
+class _Match(NamedTuple):
+    """Points that are a body's markers."""
+
+    num_points: int  # 0 where there is no unique match
+    rms: float  # their RMS distance from the markers [m]
+    pose: NDArray[np.float64]  # of the body (7,)
+    assignment: NDArray[np.int64]  # index of each marker's point, -1 for none
 
 
 class BodyTracker:
-    """Tracks one rigid body through a stream of points.
-
-    Args:
-        template: The body's markers.
-    """
+    """Tracks one rigid body through a stream of points."""
 
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
@@ -208,22 +201,21 @@ class BodyTracker:
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame | None:
         """The body by the IDs of its points, or near its predicted pose."""
-        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        pose, assignment = self._no_match
         count, rms = track_by_ids(
             self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
         )
+        match = _Match(count, rms, pose, assignment)
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
-            predicted = self._predict(elapsed)
-            count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
-        if count < FEWEST:
+            match = self._match(points, self._predict(elapsed), self._search_radius(elapsed))
+        if match.num_points < FEWEST:
             return None
-        if max(self._most_markers, count) <= FEWEST < len(self._positions):
+        if max(self._most_markers, match.num_points) <= FEWEST < len(self._positions):
             # Three points may match three markers by chance: a larger match elsewhere is the body.
-            other, other_assignment = np.empty(7), np.empty_like(assignment)
-            more, spread = self._match(points, None, np.inf, other_assignment, other)
-            if more > FEWEST:
-                return self._accept(Status.INITIALIZED, other, spread, other_assignment, ids, time)
-        return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
+            other = self._match(points)
+            if other.num_points > FEWEST:
+                return self._accept(Status.INITIALIZED, other, ids, time)
+        return self._accept(Status.TRACKED, match, ids, time)
 
     def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
         """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
@@ -243,27 +235,26 @@ class BodyTracker:
             else:
                 assignment[:] = -1
         self._status = Status.COASTING
-        return self._result(pose, rms, assignment, ids)
+        return self._result(_Match(len(seen), rms, pose, assignment), ids)
 
     def _initialize(
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame:
         """The body near its predicted pose, or anywhere."""
-        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
-            radius, predicted = self._search_radius(elapsed), self._predict(elapsed)
-            count, rms = self._match(points, predicted, radius, assignment, pose)
-            if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
-                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
-        count, rms = self._match(points, None, np.inf, assignment, pose)
-        if count >= FEWEST:
-            there = transform_markers(self._positions, pose)
+            radius = self._search_radius(elapsed)
+            match = self._match(points, self._predict(elapsed), radius)
+            if match.num_points > FEWEST or (match.num_points == FEWEST and radius <= _CONFIDENT_RADIUS):
+                return self._accept(Status.INITIALIZED, match, ids, time)
+        match = self._match(points)
+        if match.num_points >= FEWEST:
+            there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
             moved = np.linalg.norm(there - before, axis=1).max()
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
-            self._candidate = pose
-            if self._confirmed >= _frames_to_confirm(count, len(self._positions)):
-                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
+            self._candidate = match.pose
+            if self._confirmed >= _frames_to_confirm(match.num_points, len(self._positions)):
+                return self._accept(Status.INITIALIZED, match, ids, time)
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
@@ -279,72 +270,58 @@ class BodyTracker:
         return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
 
     def _match(
-        self,
-        points: NDArray[np.float64],
-        near: NDArray[np.float64] | None,
-        radius: float,
-        assignment: NDArray[np.int64],
-        pose: NDArray[np.float64],
-    ) -> tuple[int, float]:
-        """The unique match of the markers within a radius of a pose, or anywhere; fills the last two arrays.
-
-        Returns the number of markers that match, 0 if there is no unique match, and their RMS distance [m].
-        """
-        if len(points) > _MOST_SEARCHED_POINTS:
-            return 0, np.nan
+        self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
+    ) -> _Match:
+        """The unique match of the markers within a radius of a pose, or anywhere."""
+        pose, assignment = self._no_match
         expected = self._positions if near is None else transform_markers(self._positions, near)
+        if len(points) > _MOST_SEARCHED_POINTS:
+            return _Match(0, np.nan, pose, assignment)
         count, _, rival = search_constellation(
             self._positions, self._distances, points, expected, radius, _TIGHT, assignment, pose
         )
+        if count == FEWEST > rival:
+            count, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
         if count < FEWEST or rival >= count:
-            return 0, np.nan
-        if count == FEWEST:
-            kept, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
-            if kept < FEWEST:
-                return 0, np.nan
-        return assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+            return _Match(0, np.nan, pose, assignment)
+        fit = assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+        return _Match(*fit, pose, assignment)
 
-    def _accept(
-        self,
-        status: Status,
-        pose: NDArray[np.float64],
-        rms: float,
-        assignment: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        time: float,
-    ) -> BodyFrame:
+    @property
+    def _no_match(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """A pose and an assignment to be filled."""
+        return np.empty(7), np.full(len(self._positions), -1)
+
+    def _accept(self, status: Status, match: _Match, ids: NDArray[np.int64], time: float) -> BodyFrame:
         """Update pose and velocity by a fit."""
         elapsed = time - self._time
         if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _LONGEST_PREDICTION:
             weight = _VELOCITY_SMOOTHING if self._fits > 1 else 1.0
-            self._velocity += weight * (velocity_of(self._pose, pose, elapsed) - self._velocity)
+            self._velocity += weight * (velocity_of(self._pose, match.pose, elapsed) - self._velocity)
         self._fits += 1
-        self._pose, self._time, self._status = pose, time, status
-        self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
-        return self._result(pose, rms, assignment, ids)
+        self._pose, self._time, self._status = match.pose, time, status
+        self._most_markers = max(self._most_markers, int((match.assignment >= 0).sum()))
+        return self._result(match, ids)
 
-    def _result(
-        self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> BodyFrame:
+    def _result(self, match: _Match, ids: NDArray[np.int64]) -> BodyFrame:
         """The result of a fit; the IDs are kept for the next frame."""
-        seen, labels, transform = np.flatnonzero(assignment >= 0), np.full(len(ids), -1), np.eye(4)
-        labels[assignment[seen]] = seen
+        seen, labels = np.flatnonzero(match.assignment >= 0), np.full(len(ids), -1)
+        labels[match.assignment[seen]] = seen
         self._last_ids[:] = -1
-        self._last_ids[seen] = ids[assignment[seen]]
-        write_quaternion_matrix(transform, *pose[3:])
-        transform[:3, 3] = pose[:3]
-        return BodyFrame(self._status, transform, labels, rms)
+        self._last_ids[seen] = ids[match.assignment[seen]]
+        transform = np.eye(4)
+        write_quaternion_matrix(transform, *match.pose[3:])
+        transform[:3, 3] = match.pose[:3]
+        return BodyFrame(self._status, transform, labels, match.rms)
 
 
 def _frames_to_confirm(count: int, markers: int) -> float:
-    """Frames that a match of `count` of a body's markers must last before it is accepted without a pose.
-
-    Three markers of a larger body are never accepted: markers on the back of a hand keep their distances for
-    minutes, and in up to one of twenty frames some three markers of two hands match three of an object. Four
-    match in one of a thousand.
-    """
+    """Frames that a match of `count` markers must last before it is accepted without a pose."""
+    # Three markers of a larger body are never accepted: markers on the back of a hand keep their distances
+    # for minutes, and in up to one of twenty frames some three markers of two hands match three of an object.
+    # Four match in one of a thousand.
     if count == FEWEST:
         return 10 if markers == FEWEST else np.inf
     return 2 if count == FEWEST + 1 < markers else 1
@@ -359,10 +336,7 @@ class BodyError(HandSimError):
 
 
 def load_body(name_or_path: AnyBody) -> RigidTemplate:
-    """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
-
-    A body itself is given back.
-    """
+    """A body as it is, or the markers of handsim's object or `.toml` file of this name."""
     check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
     if isinstance(name_or_path, RigidTemplate):
         return name_or_path
@@ -438,11 +412,7 @@ def _printable(what: str, name: str) -> str:
 
 
 def learn_body(capture: Capture, name: str) -> RigidTemplate:
-    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers.
-
-    A first template is taken from one frame and tracked through all frames. Then each marker moves to its
-    median over the frames.
-    """
+    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers."""
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])

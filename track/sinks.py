@@ -51,14 +51,14 @@ GROUP: Final = "handsim.sinks"
 STATUSES: Final = tuple(reversed(Status))
 """Values of a status channel of LSL are indices of these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
-_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # options of an address
+_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # valid values of each option
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
-_LARGEST_INTEGER: Final = 0x7FFFFFFF  # of OSC
-_HEADER_PERIOD: Final = 1.0  # [s] between two headers, for receivers that begin to listen later
-_WAITING: Final = 256  # frames that may wait for a client
-_SEND_BUFFER: Final = 1 << 17  # bytes of the system's buffer for each client
-_LARGEST: Final = 1 << 10  # bytes of a client's message, which is ignored
-_FLUSH: Final = 1.0  # [s] for clients to read waiting frames at the end
+_LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
+_HEADER_PERIOD: Final = 1.0  # time between two headers, for receivers that begin to listen later [s]
+_WAITING: Final = 256  # largest number of frames that wait for a client
+_SEND_BUFFER: Final = 1 << 17  # size of the system's buffer for each client [bytes]
+_LARGEST: Final = 1 << 10  # largest size of a client's message, which is ignored [bytes]
+_FLUSH: Final = 1.0  # time for clients to read waiting frames at the end [s]
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 """Pages of this machine; any other page in its browser is refused."""
 _AXES: Final = ("x", "y", "z")

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
-"""What is told of a range of motion, as percentiles."""
+"""Columns of a range of motion, and the percentile in each."""
 _CHUNK: Final = 4096  # frames whose bones are posed at once
-_MOST_SPANS: Final = 100  # rows; with more a take is not worth reading line by line
-_BINS: Final = 750  # of a long take; the curve has the least and the largest value of each
+_MOST_SPANS: Final = 100  # doubtful spans in the page's table; the table beside it has all
+_BINS: Final = 750  # bins of a long take's curve, which shows the least and the largest value of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from the knuckle outwards."""
 _COASTING: Final = "#efd9c9"

@@ -22,9 +22,6 @@ def test_nobody_is_learned_from_and_tried_on(photos):
     labeled, others = training.split(photos, 100)
     assert len(labeled.crops) == 100 and len(others.crops) >= 200
     assert np.abs(labeled.sizes[:, None] - others.sizes).min() > 10  # a whole person between them
-
-
-def test_without_labeled_photographs_all_are_tried_on(photos):
     labeled, others = training.split(photos, 0)
     assert len(labeled.crops) == 0
     np.testing.assert_array_equal(others.sizes, photos.sizes)

@@ -169,33 +169,25 @@ def hands() -> tuple[GloveFit, ...]:
     return tuple(attach(load_layout("sparse13"), HandModel(shape)) for shape in shapes)
 
 
-def truth(folder: Path) -> list[Path]:
+def take_of_truth() -> Take:
     qpos = np.zeros((FRAMES, 2, 27))
     qpos[..., 3] = 1.0
     columns = np.tile(np.arange(COLUMNS), (FRAMES, 1))
     points = _rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3))
-    take = Take.of_truth(
+    return Take.of_truth(
         hands(), qpos, points, columns, columns, rate=120.0, settings={"kind": "single-hand"}
     )
-    take.save(folder / "take.truth.npz")
+
+
+def truth(folder: Path) -> list[Path]:
+    take_of_truth().save(folder / "take.truth.npz")
     return [folder / "take.truth.npz"]
 
 
 def tracked(folder: Path) -> list[Path]:
-    rng, worn = _rng(), hands()
-    qpos = np.zeros((FRAMES, 2, 27))
-    qpos[..., 3] = 1.0
-    take = Take(
-        rate=120.0,
-        times=np.arange(FRAMES) / 120.0,
-        hands=worn,
-        qpos=qpos,
-        status=np.full((FRAMES, 2), STATUSES.index("tracked"), dtype=np.int8),
+    take = dataclasses.replace(
+        take_of_truth(),
         rms=np.full((FRAMES, 2), 1e-3),
-        points=rng.uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
-        ids=np.tile(np.arange(COLUMNS, dtype=np.int32), (FRAMES, 1)),
-        labels=np.tile(np.arange(COLUMNS, dtype=np.int16), (FRAMES, 1)),
-        confidence=np.ones((FRAMES, COLUMNS)),
         bodies=(RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
         body_poses=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (FRAMES, 1, 1)),
         body_status=np.full((FRAMES, 1), STATUSES.index("tracked"), dtype=np.int8),
@@ -267,29 +259,27 @@ def photos(folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def weights(folder: Path) -> list[Path]:
+def small_network():
     import torch
 
     from train import SetLabelerConfig
     from train.labelers.networks import new_network
-    from train.labelers.storage import CARD, WEIGHTS, save_network
 
     torch.manual_seed(0)
-    network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
-    save_network(folder, network, {"marker_names": list("abcd")})
+    return new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
+
+
+def weights(folder: Path) -> list[Path]:
+    from train.labelers.storage import CARD, WEIGHTS, save_network
+
+    save_network(folder, small_network(), {"marker_names": list("abcd")})
     return [folder / WEIGHTS, folder / CARD]
 
 
 def onnx(folder: Path) -> list[Path]:
-    import torch
-
-    from train import SetLabelerConfig
-    from train.labelers.networks import new_network
     from train.labelers.storage import export_onnx
 
-    torch.manual_seed(0)
-    network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
-    export_onnx(network, tuple("abcd"), folder / "labeler.onnx")
+    export_onnx(small_network(), tuple("abcd"), folder / "labeler.onnx")
     return [folder / "labeler.onnx"]
 
 

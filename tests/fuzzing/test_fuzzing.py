@@ -8,21 +8,15 @@ from tests.fuzzing.engine import CORPUS, run, run_corpus
 from tests.fuzzing.targets import TARGETS
 
 CASES = 200
-OPEN: set[str] = set()
-"""Readers of `train` that still let some exceptions out."""
-NAMES = [
-    pytest.param(name, marks=pytest.mark.xfail(reason="lets exceptions out") if name in OPEN else ())
-    for name in TARGETS
-]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TARGETS)
 def test_a_damaged_file_ends_in_a_sentence(name, tmp_path):
     failures = [failure for failure in run(TARGETS[name], tmp_path, cases=CASES, seed=1) if failure]
     assert not failures, failures[0].what
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TARGETS)
 def test_what_failed_before_is_told(name, tmp_path):
     failures = [failure for failure in run_corpus(TARGETS[name], tmp_path) if failure]
     assert not failures, failures[0].what

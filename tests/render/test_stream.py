@@ -89,8 +89,8 @@ def test_own_poses_and_takes():
 
 def test_own_photographs_are_mixed_in(tmp_path):
     config = RenderConfig(passes=("rgb", "depth", "ids"))
-    qpos = join_qpos(np.full((40, 20), 0.2))
-    assert render_take(qpos, tmp_path, "coco", config, model="M", workers=1) == 40
+    qpos = join_qpos(np.full((10, 20), 0.2))
+    assert render_take(qpos, tmp_path, "coco", config, model="M", workers=1) == 10
     mixed = {"config": config, "photographs": tmp_path / "annotations.json", "photograph_share": 0.5}
     alone = taken(12, config=config, crop=64)
     pictures = taken(12, crop=64, **mixed)

@@ -1,8 +1,9 @@
-"""Messages of two hands and a body, without a tracker."""
+"""Messages of two hands and a body, without a tracker; sinks and sources of a user's own."""
 
 from __future__ import annotations
 
 import functools
+import sys
 
 import numpy as np
 import pytest
@@ -49,3 +50,13 @@ def make_message(number: int = 0, *, lost: bool = False, seed: int = 0, points: 
 def message():
     """Makes messages, see `make_message`."""
     return make_message
+
+
+@pytest.fixture
+def own(request, tmp_path, monkeypatch):
+    """A user's own module `own_code` in the working folder: `SOURCE` of the test's module."""
+    (tmp_path / "own_code.py").write_text(request.module.SOURCE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    sys.modules.pop("own_code", None)

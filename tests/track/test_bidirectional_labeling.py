@@ -31,10 +31,6 @@ def test_labels_that_change_together_are_one_event():
     assert len({exchange, events.numbers[4], events.numbers[5], later}) == 4
 
 
-def test_directions_that_agree_have_no_event():
-    assert not len(_events_of(np.arange(3), np.zeros(3, dtype=int), np.zeros(3, dtype=int)).numbers)
-
-
 def test_a_direction_that_has_lost_a_hand_does_not_outvote_the_other():
     labels, none, frames = np.array([0, 1, 2]), np.full(3, -1), np.zeros(3, dtype=int)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import pytest
 
 from gloves import Capture, GloveFit, Status, Take, load_take, read_capture, write_capture
 from gloves.takes.take import LOST, STATUSES, TRACKED
-from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track import (
@@ -25,7 +23,6 @@ from track import (
     open_source,
     track_capture,
 )
-from track.frames import capture_frames
 from track.recorder import TakeRecorder
 from train import evaluate_labeler, load_labeler, simulate_take
 
@@ -125,11 +122,6 @@ def test_a_mirrored_capture_has_the_other_sides():
     assert (straight.labels == swapped).mean() > 0.99
 
 
-def test_empty_frames_hold_no_hand():
-    labeled = label_capture(Capture(("*0",), np.full((3, 1, 3), np.nan), RATE))
-    assert (labeled.labels == -1).all()
-
-
 TRACKED_FRAMES = 60
 
 
@@ -210,14 +202,9 @@ def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler,
     take = track_capture(Capture(("a", "b", "c"), positions, 120.0), hands=user, labeler=labeler)
     assert (take.status == LOST).all() and (take.labels == -1).all()
     assert np.isnan(take.qpos).all() and np.isnan(take.markers("left")).all()
-    nothing = track_capture(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), hands=user, labeler=labeler)
-    assert nothing.num_frames == 2
-
-
-def test_millimeters_are_told(capture, user, labeler):
-    large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
-    with pytest.raises(ArgumentError, match="millimeters"):
-        track_capture(large, hands=user, labeler=labeler)
+    empty = Capture(("a",), np.full((2, 1, 3), np.nan), 120.0)
+    assert track_capture(empty, hands=user, labeler=labeler).num_frames == 2
+    assert (label_capture(empty).labels == -1).all()
 
 
 def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
@@ -241,19 +228,6 @@ def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
     np.testing.assert_allclose(take.qpos, tracked.qpos, atol=1e-3)
     there = np.isfinite(take.points[..., 0])
     assert (take.ids[there] >= 0).all() and (take.ids[~there] == -1).all()
-
-
-def test_too_few_frames_have_no_rate(user, capture, labeler):
-    tracker = Tracker(user, labeler)
-    recorder = TakeRecorder(tracker)
-    with pytest.raises(CaptureError, match="0 frames came, expected two or more"):
-        recorder.take()
-    for frame in itertools.islice(capture_frames(capture), 2):
-        recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
-        if recorder.num_frames == 1:
-            with pytest.raises(CaptureError, match="1 frames came"):
-                recorder.take()
-    assert recorder.take().rate == pytest.approx(capture.rate)
 
 
 def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):

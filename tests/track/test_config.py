@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -11,11 +10,6 @@ import pytest
 from handsim.errors import ArgumentError
 from track import TrackerConfig
 from track.association.initialization import HandInitializer
-
-
-def test_settings_are_json():
-    settings = dataclasses.asdict(TrackerConfig())
-    assert json.loads(json.dumps(settings)) == settings
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "4", None, True])

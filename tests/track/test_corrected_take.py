@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import Take, load_layout
+from gloves import Take, load_layout, load_take
 from gloves.fit import nominal_fit
 from gloves.takes.corrections import NO_MARKER, Correction
-from gloves.takes.take import LOST, TRACKED
+from gloves.takes.take import LOST
 from handsim import join_qpos
 from handsim.errors import CaptureError
 from poses import sample_poses
@@ -39,23 +39,11 @@ def right() -> Take:
     markers = np.stack([hand.markers(qpos[:, number])[0] for number, hand in enumerate(hands)], axis=1)
     points = np.concatenate([markers.reshape(FRAMES, -1, 3), np.full((FRAMES, 1, 3), 0.9)], axis=1)
     columns = np.arange(2 * COUNT + 1)
-    return Take(
-        rate=120.0,
-        times=np.arange(FRAMES) / 120.0,
-        hands=hands,
-        qpos=qpos,
-        status=np.full((FRAMES, 2), TRACKED, dtype=np.int8),
-        rms=np.full((FRAMES, 2), 1e-4),
-        points=points,
-        ids=np.tile(100 + columns, (FRAMES, 1)).astype(np.int32),
-        labels=np.tile(np.where(columns < 2 * COUNT, columns, -1), (FRAMES, 1)).astype(np.int16),
-        confidence=np.full((FRAMES, len(columns)), 0.9),
-        bodies=(),
-        body_poses=np.empty((FRAMES, 0, 7)),
-        body_status=np.empty((FRAMES, 0), dtype=np.int8),
-        body_rms=np.empty((FRAMES, 0)),
-        settings={"user": "L"},
-    )
+    ids = np.tile(100 + columns, (FRAMES, 1)).astype(np.int32)
+    labels = np.tile(np.where(columns < 2 * COUNT, columns, -1), (FRAMES, 1)).astype(np.int16)
+    take = Take.of_truth(hands, qpos, points, ids, labels, rate=120.0, settings={"user": "L"})
+    confidence = np.full((FRAMES, len(columns)), 0.9)
+    return dataclasses.replace(take, rms=np.full((FRAMES, 2), 1e-4), confidence=confidence)
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +69,7 @@ def keypoint_error(one, other) -> float:
 def test_corrected_labels_bring_the_pose_back(right, wrong):
     assert keypoint_error(wrong, right) > 0.005
     names = wrong.label_names
-    both = [
-        correction(wrong, SWAPPED[0], names[SWAPPED[0]]),
-        correction(wrong, SWAPPED[1], names[SWAPPED[1]]),
-    ]
+    both = [correction(wrong, column, names[column]) for column in SWAPPED]
     result = correct_take(wrong, both)
     assert (result.labels, result.frames, result.unfitting) == (22, 11, ())
     np.testing.assert_array_equal(result.take.labels, right.labels)
@@ -98,8 +83,6 @@ def test_corrected_labels_bring_the_pose_back(right, wrong):
 
 
 def test_the_file_says_what_was_corrected_and_again_is_the_same(wrong, tmp_path):
-    from gloves import load_take
-
     one = [correction(wrong, 3, NO_MARKER)]
     once = correct_take(wrong, one).take
     once.save(tmp_path / "a.npz")

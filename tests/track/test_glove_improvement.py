@@ -58,8 +58,8 @@ def test_markers_are_added_and_dropped():
 def test_places_are_found_with_a_ruler_and_names_say_the_bone():
     layout = load_layout("tips8")
     search = search_of(layout)
-    search.resize(11)
-    search.search(3.0, lambda worth: None)
+    search.resize(9)
+    search.search(2.0, lambda worth: None)
     found, old = search.layout, {marker.name: marker for marker in layout.markers}
     model = HandModel.named("M")
     for marker in found.markers:

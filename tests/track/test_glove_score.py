@@ -49,25 +49,6 @@ def test_slots_are_right_more_often_where_all_is_seen(tips, tips_score):
     assert tips_score.sides_right > 0.9
 
 
-def test_joints_are_known_less_without_a_marker(tips, tips_score):
-    assert tips_score.joints_without.shape == (tips.num_markers, 20)
-    assert (tips_score.joints_without >= tips_score.joints - 0.01).all()
-
-
-def test_a_blind_rig_sees_fewer_markers(tips):
-    rig = load_rig("six")
-    pair = dataclasses.replace(rig, cameras=rig.cameras[:2])
-    shares = [
-        np.isfinite(
-            np.concatenate(
-                [hand.frames.observed for hand in observe_poses(tips, one, 120, rng=np.random.default_rng(2))]
-            )
-        ).mean()
-        for one in (rig, pair)
-    ]
-    assert shares[1] < 0.7 * shares[0]
-
-
 def test_the_hands_of_a_take_wear_the_layout(tips):
     take = simulate_take("hand-hand", num_frames=60)
     hands = observe_motion(take, tips, load_rig("figure5"), 20, rng=np.random.default_rng(3))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import msgpack
@@ -15,9 +14,7 @@ from hypothesis import strategies as st
 
 from gloves import load_layout
 from gloves.fit import nominal_fit
-from handsim.errors import ArgumentError
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
-from tests.sentences import error_names
 from track.live_message import FORMATS, document_format, frame_document, header_document
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
@@ -59,19 +56,10 @@ def test_the_header_names_everything(name, message):
         assert document[key] == list(getattr(header, key))
 
 
-def test_points_are_left_out_unless_asked_for(message):
+def test_a_frame_of_two_hands_takes_three_kilobytes_and_has_points_only_if_asked_for(message):
     assert not {"points", "labels"} & set(frame_document(message()))
-
-
-def test_a_frame_of_two_hands_takes_three_kilobytes(message):
     assert len(document_format("msgpack").frame(message())) < 3000
     assert len(document_format("json").frame(message())) < 3500
-
-
-def test_a_missing_package_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "msgpack", None)
-    with error_names(ArgumentError, "format=msgpack needs the package msgpack | pip install 'handsim[send]'"):
-        document_format("msgpack")
 
 
 def test_the_page_shows_what_is_sent(message):

@@ -23,11 +23,12 @@ from train import simulate_take
 NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0
 NOISE = 0.0002  # [m]
+FRAMES = 240
 
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(kind="hand-controller", num_frames=240, seed=5)
+    return simulate_take(kind="hand-controller", num_frames=FRAMES, seed=5)
 
 
 def frames(take: Take):
@@ -258,13 +259,6 @@ def test_a_mirrored_constellation_is_another_one(rng):
     assert BodyTracker(body).step(points, np.arange(4), 0.0).status == Status.LOST
 
 
-def test_mistakes_of_the_caller_are_told():
-    with pytest.raises(ArgumentError, match="pen: 1 markers"):
-        template("pen")
-    with pytest.raises(ArgumentError, match="twice: a, b, a"):
-        RigidTemplate("thing", ("a", "b", "a"), np.eye(3))
-
-
 NUMBERS = st.sampled_from([0.0, 0.01, -0.02, 0.05, 1e-300, 999.0]) | st.floats(-1.0, 1.0)
 TIMES = st.sampled_from([0.0, STEP, 2 * STEP, -1.0, 1e9, np.nan, np.inf])
 
@@ -362,7 +356,6 @@ def test_objects_of_handsim_have_names():
         ("name = ", "not a TOML file"),
         ("", "the file lacks the key 'name'"),
         ('name = "wand"', "wand: 0 markers, expected at least 3"),
-        (text(count=2), "wand: 2 markers, expected at least 3"),
         (text(head="name = 3"), "name is 3, expected text in quotes"),
         (text(head='name = " wand"'), "the body's name ' wand': expected printable characters"),
         (text(head='name = "wand"\ndescription = 3'), "description is 3, expected text in quotes"),
@@ -377,7 +370,6 @@ def test_objects_of_handsim_have_names():
         (text(place_mm="[50, 0, nan]"), "marker 'm1': place_mm is [50, 0, NaN], expected three numbers"),
         (text(place_mm='"50 0 0"'), "marker 'm1': place_mm is \"50 0 0\", expected three numbers"),
         (text(place_mm="[0.05, 0, 0]"), "m0 and m1 are 0.1 mm apart, expected at least 6 mm"),
-        (text(place_mm="[80, 0, 0]"), "its markers look the same from two sides (m1 at m2, m2 at m1)"),
     ],
 )
 def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
@@ -392,10 +384,6 @@ def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
 def test_unknown_bodies_are_told(tmp_path):
     with error_names(ArgumentError, "unknown body 'mugg' (did you mean 'mug'?); valid names: contr"):
         load_body("mugg")
-    with pytest.raises(ArgumentError, match="pen: 1 markers, expected at least 3"):
-        load_body("pen")
-    with pytest.raises(BodyError, match=r"nowhere.toml: cannot be read: No such file"):
-        load_body(tmp_path / "nowhere.toml")
     with pytest.raises(BodyError, match="cannot be written"):
         save_body(tmp_path, load_body("mug"))
 
@@ -409,14 +397,6 @@ def test_bodies_that_are_tracked_together_have_names_of_their_own(tmp_path):
             load_bodies([other, path])
 
 
-FRAMES = 240
-
-
-@functools.cache
-def twin_take() -> Take:
-    return simulate_take(kind="hand-controller", num_frames=FRAMES)
-
-
 def capture_of(points: np.ndarray) -> Capture:
     points = points[:, np.isfinite(points[..., 0]).any(axis=0)]
     return Capture(tuple(f"*{number}" for number in range(points.shape[1])), points, 120.0)
@@ -424,7 +404,7 @@ def capture_of(points: np.ndarray) -> Capture:
 
 def controller(rng, ghosts: float = 0.0) -> Capture:
     """The controller alone, as the room saw it in a hand: columns end where markers are hidden."""
-    take = twin_take()
+    take = twin()
     body = np.where((take.labels >= take.hand_labels[-1].stop)[..., None], take.points, np.nan)
     false = rng.uniform(-0.2, 0.2, (FRAMES, 2, 3)) + np.nanmean(body, axis=(0, 1))
     false[rng.random((FRAMES, 2)) >= ghosts] = np.nan
@@ -449,15 +429,8 @@ def test_all_markers_are_where_they_are(ghosts, rng):
     np.testing.assert_allclose(body.positions.mean(axis=0), 0.0, atol=1e-12)
 
 
-def test_one_frame_is_not_enough_to_be_so_right(rng):
-    """What averaging over the frames is for."""
-    capture = controller(rng)
-    whole = capture.positions[np.isfinite(capture.positions[..., 0]).sum(axis=1) == 6][0]
-    assert off(whole[np.isfinite(whole[:, 0])], named_object("controller").markers) > 0.0001
-
-
 def test_captures_of_anything_else_are_told(rng):
-    take = twin_take()
+    take = twin()
     hands = np.where(((take.labels >= 0) & (take.labels < 38))[..., None], take.points, np.nan)
     with error_names(CalibrationError, "points per frame, expected 3 to 20: one body and nothing else"):
         learn_body(capture_of(hands), "wand")

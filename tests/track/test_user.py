@@ -132,11 +132,6 @@ def test_other_files_are_told(text, tmp_path):
         load_user(path)
 
 
-def test_a_missing_file_is_told(tmp_path):
-    with pytest.raises(UserError, match="cannot be read"):
-        load_user(tmp_path / "nobody.json")
-
-
 def test_a_pipe_is_no_user(tmp_path):
     os.mkfifo(tmp_path / "user.json")
     with pytest.raises(UserError, match="this is a pipe, expected a regular file"):

@@ -1,4 +1,4 @@
-"""What tests of labelers share: pages without pictures, and gloves learned from little, in an own cache."""
+"""What tests of labelers share: a training set, pages without pictures, gloves learned from little."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ from collections.abc import Iterator
 
 import pytest
 
+from train import Dataset, generate_dataset
 from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """300 frames of hands alone."""
+    out = tmp_path_factory.mktemp("sets") / "small"
+    return generate_dataset(out, num_frames=300, frames_per_hand=20, scenes={"alone": 1.0}, workers=1)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -17,8 +17,6 @@ from train.evaluation import (
     LabelCounts,
     error_without,
     expected_calibration_error,
-    macro_f1,
-    percent,
     print_figures,
     reliability,
 )
@@ -54,11 +52,14 @@ def test_a_frame_counted_by_hand():
     assert figures["ghost_precision"] == 1.0
 
 
-def test_an_empty_frame_is_all_occluded():
+def test_an_empty_frame_is_all_occluded_and_figures_are_printed_in_percent(capsys):
     counts = LabelCounts()
     counts.add(np.zeros(0, dtype=int), np.zeros(0, dtype=int), num_labels=19)
-    assert counts.figures()["slot_accuracy"] == 1.0
-    assert counts.figures()["occlusion_recall"] == 1.0
+    figures = counts.figures()
+    assert figures["slot_accuracy"] == figures["occlusion_recall"] == 1.0
+    print_figures({"clean": {**figures, "macro_f1": 0.98765}}, title="Figures")
+    said = capsys.readouterr().out
+    assert "macro f1" in said and "98.77" in said and "100.00" in said and " -\n" in said
 
 
 def test_confusion_and_macro_f1_by_hand():
@@ -93,22 +94,6 @@ def test_confusion_agrees_with_the_counts(frames):
         assert confusion[-1].sum() == (true < 0).sum() and confusion[:, -1].sum() == (given < 0).sum()
     if len(true):
         assert (figures["macro_f1"] == 1.0) == (figures["point_accuracy"] == 1.0)
-
-
-def test_macro_f1_of_nothing_and_of_chance():
-    assert np.isnan(macro_f1(np.zeros((4, 4), dtype=int)))
-    assert macro_f1(np.full((4, 4), 3)) == pytest.approx(0.25)
-    assert macro_f1(np.diag([5, 0, 1])) == 1.0
-
-
-def test_percent():
-    assert percent(0.98765) == "98.77" and percent(float("nan")) == "-"
-
-
-def test_figures_are_printed_in_percent(capsys):
-    print_figures({"clean": {"macro_f1": 0.98765, "ghost_recall": float("nan")}}, title="Figures")
-    said = capsys.readouterr().out
-    assert "macro f1" in said and "98.77" in said and "-" in said
 
 
 class ByHeight:
@@ -184,18 +169,14 @@ def test_a_calibrated_source_has_no_error(rng):
     np.testing.assert_allclose(bins.confidence, (np.arange(BINS) + 0.5) / BINS, atol=0.005)
 
 
-def test_always_sure_and_half_wrong():
-    right = np.arange(1000) % 2 == 0
-    assert expected_calibration_error(np.ones(1000), right) == 0.5
-    assert expected_calibration_error(np.zeros(1000), right) == 0.5
-    assert expected_calibration_error(np.full(1000, 0.5), right) == 0.0
-    assert reliability(np.ones(1000), right).count.tolist() == [0] * (BINS - 1) + [1000]
-
-
 def test_bins_are_weighted_by_their_points():
     # Three points are said 0.9 and right, one is said 0.1 and right: 3/4 x 0.1 + 1/4 x 0.9.
     error = expected_calibration_error(np.array([0.9, 0.1, 0.9, 0.9]), np.ones(4, dtype=bool))
     assert error == pytest.approx(0.3)
+    half = np.arange(1000) % 2 == 0
+    errors = [expected_calibration_error(np.full(1000, said), half) for said in (0.0, 0.5, 1.0)]
+    assert errors == [0.5, 0.0, 0.5]
+    assert reliability(np.ones(1000), half).count.tolist() == [0] * (BINS - 1) + [1000]
 
 
 @given(points)
@@ -210,19 +191,9 @@ def test_the_error_is_at_least_the_mean_gap_and_at_most_one(drawn):
 
 def test_leaving_the_least_sure_out():
     confidence, right = np.array([0.9, 0.2, 0.8, 0.4, 0.6]), np.array([True, False, True, True, False])
-    assert error_without(confidence, right, 0.0) == pytest.approx(2 / 5)
-    assert error_without(confidence, right, 0.2) == pytest.approx(1 / 4)  # without the one of 0.2
-    assert error_without(confidence, right, 0.4) == pytest.approx(
-        1 / 3
-    )  # nor the one of 0.4, which was right
-    assert error_without(confidence, right, 0.6) == 0.0
-    assert np.isnan(error_without(confidence, right, 1.0))
-
-
-def test_two_percent_of_fifty_is_one():
-    confidence, right = np.linspace(0.5, 1.0, 50), np.ones(50, dtype=bool)
-    right[[0, 7]] = False
-    assert error_without(confidence, right) == pytest.approx(1 / 49)
+    # The one of 0.2 goes first, then that of 0.4, which was right.
+    for share, error in ((0.0, 2 / 5), (0.2, 1 / 4), (0.4, 1 / 3), (0.6, 0.0), (1.0, np.nan)):
+        assert error_without(confidence, right, share) == pytest.approx(error, nan_ok=True)
 
 
 @given(points, st.floats(0.0, 1.0, allow_subnormal=False), st.randoms(use_true_random=False))
@@ -241,26 +212,13 @@ def test_ties_count_by_the_mean_over_all_choices():
     assert error_without(np.full(4, 0.7), right, 0.5) == pytest.approx(0.5 * 1 / 2)
 
 
-def test_nothing_to_measure():
-    none = np.zeros(0)
-    assert np.isnan(expected_calibration_error(none, none.astype(bool)))
-    assert np.isnan(error_without(none, none.astype(bool)))
-
-
-def test_an_entry_is_the_mean_since_the_one_before():
+def test_an_entry_is_the_mean_since_the_one_before_and_steps_that_wait_are_kept():
     history = History()
-    for loss in (4.0, 2.0, 3.0):
+    history.add(4.0)
+    history = History(**dataclasses.asdict(history))
+    for loss in (2.0, 3.0):
         history.add(loss)
     assert history.close(768, 0.1) == 3.0
     history.add(1.0)
     assert history.close(1024, 0.05) == 1.0
     assert history.losses == [(768, 3.0, 0.1), (1024, 1.0, 0.05)]
-
-
-def test_steps_that_wait_are_kept():
-    history = History()
-    history.add(4.0)
-    again = History(**dataclasses.asdict(history))
-    again.add(2.0)
-    assert again.close(512, 0.1) == 3.0
-    assert history.losses == []

@@ -18,7 +18,7 @@ import torch
 
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.signals import Stopped
-from train import Dataset, GenerateSettings, SceneMix, SetLabelerConfig, TrainSettings, train_labeler
+from train import SetLabelerConfig, TrainSettings, train_labeler
 from train.data.batches import Part, draw_batch
 from train.fabric import start_fabric
 from train.labelers.cnn_network import DeepLabelCNN
@@ -27,7 +27,6 @@ from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import CHECKPOINT
 from train.reports.run_page import PAGE
 from train.settings import batch_recipe, usual_settings
-from train.simulation.generation import make_dataset
 
 pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,14 +38,6 @@ HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main;
 SRUN = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "training", "SLURM_NODELIST": "127.0.0.1"}
 SRUN |= {"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2", "SLURM_NNODES": "1", "SLURM_STEP_NUM_NODES": "1"}
 SRUN |= {"SLURM_NODEID": "0"}
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    config = GenerateSettings(num_frames=300, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
-    make_dataset(config, out, workers=1)
-    return Dataset(out)
 
 
 @pytest.fixture(scope="module")

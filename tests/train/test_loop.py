@@ -3,39 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import resource
+import shutil
 import signal
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks.held_out import held_out_markers
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
+from tests.sentences import assert_names
 from train import (
-    Dataset,
-    GenerateSettings,
-    SceneMix,
+    CNNConfig,
+    Corruption,
     SetLabelerConfig,
     TrainSettings,
+    evaluate_labeler,
     load_labeler,
     train_labeler,
 )
-from train.labelers.storage import WEIGHTS
-from train.loop import CHECKPOINT, TrainingError
-from train.simulation.generation import make_dataset
+from train.evaluation import paper_report
+from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.networks import cnn_labeler, prepare_network
+from train.labelers.storage import CARD, WEIGHTS, load_network
+from train.loop import CHECKPOINT, TrainingError, choose_costs
+from train.settings import usual_settings
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)
 OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--network.depth", "1"]
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(GenerateSettings(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
-    return Dataset(out)
 
 
 def done_in(run):
@@ -125,9 +126,16 @@ def test_what_a_run_writes_has_no_trace_of_the_process(dataset, tmp_path):
     assert set(modes.values()) == {0o644}, modes
 
 
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "run"
+    train_labeler(dataset, out, CONFIG)
+    return out
+
+
 @pytest.mark.parametrize("damage", ["cut", "nan", "count", "shape", "list"])
-def test_a_damaged_checkpoint_is_told(dataset, tmp_path, damage):
-    train_labeler(dataset, tmp_path, CONFIG)
+def test_a_damaged_checkpoint_is_told(dataset, trained, tmp_path, damage):
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
     path = tmp_path / CHECKPOINT
     content = torch.load(path, weights_only=True)
     name = next(iter(content["mean"]))
@@ -180,5 +188,101 @@ OPTION_ERRORS = {
 @pytest.mark.parametrize("options", OPTION_ERRORS)
 def test_options_without_sense_are_told(dataset, tmp_path, capsys, options):
     assert main(["train", str(dataset.path), "--out", str(tmp_path / "run"), *options.split()]) == 1
-    assert capsys.readouterr().err == f"handsim train: {OPTION_ERRORS[options]}\n"
+    assert_names(capsys.readouterr().err.strip(), f"handsim train: {OPTION_ERRORS[options]}")
     assert not (tmp_path / "run").exists()
+
+
+CNN = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
+
+FIXED_CNN = dataclasses.replace(CNN, cnn=CNNConfig(reject=0.04, spread=0.005))
+"""Without the choice of these two, which takes as long as many steps."""
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_is_the_run_that_was_not(dataset, tmp_path):
+    class Stopped(Exception):
+        pass
+
+    def stop(done, total):
+        if done == 2 * CNN.batch:
+            raise Stopped
+
+    train_labeler(dataset, tmp_path / "whole", FIXED_CNN)
+    with pytest.raises(Stopped):  # after the first checkpoint, before the second
+        train_labeler(dataset, tmp_path / "stopped", FIXED_CNN, progress=stop, save_every=0.0)
+    train_labeler(dataset, tmp_path / "stopped", FIXED_CNN)
+    whole, stopped = (load_network(tmp_path / name)[0].state_dict() for name in ("whole", "stopped"))
+    for name, values in whole.items():
+        assert torch.equal(values, stopped[name]), name
+    assert whole["mean_hand.markers"].std() > 0.01
+
+
+def test_what_training_used_is_saved_with_the_network(dataset, tmp_path):
+    config = dataclasses.replace(CNN, samples=16, cnn=CNNConfig(views="random", reject=0.033))
+    train_labeler(dataset, tmp_path, config)
+    card = json.loads((tmp_path / CARD).read_text())
+    assert card["labeler"] == "cnn"
+    assert card["network"]["views"] == "random" and card["network"]["reject"] == 0.033
+    assert card["network"]["spread"] > 0.0, "chosen on held-out frames"
+    assert card["curve"][-1][0] == 16
+    network, _ = load_network(tmp_path)
+    assert network.config == CNNConfig(**card["network"])
+    assert (tmp_path / WEIGHTS).stat().st_size > 80e6
+    assert load_labeler(tmp_path).marker_names == dataset.marker_names
+
+
+@pytest.mark.slow
+def test_a_minute_of_training_labels_three_times_as_much_as_chance(dataset, tmp_path):
+    recipe = {"learning_rate": 5e-4, "anisotropy": 0.0, "occlude": 0, "ghosts": 0}
+    train_labeler(dataset, tmp_path, dataclasses.replace(FIXED_CNN, samples=960, **recipe))
+    markers = dataset.rows()[:24]["markers"].astype(np.float64)
+    report = evaluate_labeler(load_labeler(tmp_path), markers, Corruption(0, 0), rng=np.random.default_rng(0))
+    assert report.figures["slot_accuracy"] > 3.0 / markers.shape[1]
+
+
+NAMES = tuple(f"marker{label}" for label in range(19))
+
+
+@pytest.fixture(scope="module")
+def rows():
+    markers = held_out_markers("dense19", 60, seed=4)
+    rows = np.zeros(len(markers), dtype=[("markers", "f4", (19, 3)), ("hand", "u4")])
+    rows["markers"] = markers
+    return rows
+
+
+@pytest.fixture(scope="module")
+def network(rows):
+    """A network that answers with the mean hand, so that some points are near their markers."""
+    torch.manual_seed(0)
+    network = DeepLabelCNN(CNNConfig(views="aligned")).eval()
+    prepare_network(network, rows)
+    last = network.positions[-1]
+    torch.nn.init.zeros_(last.weight)
+    markers = network.mean_hand.markers
+    with torch.no_grad():
+        last.bias.copy_((markers / markers.abs().max() * 0.8).flatten())
+    return network
+
+
+def test_no_other_costs_are_better(network, rows):
+    few = rows[:4]
+    network.config = CNNConfig()
+    chosen = choose_costs(network, NAMES, few)
+    assert network.config == chosen and None not in (chosen.reject, chosen.spread)
+
+    def figures(**costs):
+        network.config = dataclasses.replace(chosen, **costs)
+        return paper_report(cnn_labeler(network, NAMES), few).figures
+
+    best = figures()
+    assert 0.1 < best["slot_accuracy"] < 1.0
+    assert figures(reject=0.015)["slot_accuracy"] <= best["slot_accuracy"]
+    assert figures(reject=0.08)["slot_accuracy"] <= best["slot_accuracy"]
+    assert figures(spread=0.002)["calibration_error"] >= best["calibration_error"]
+    assert figures(spread=0.012)["calibration_error"] >= best["calibration_error"]
+
+
+def test_costs_that_are_given_are_kept(network, rows):
+    network.config = CNNConfig(reject=0.033, spread=0.0071)
+    assert choose_costs(network, NAMES, rows[:2]) == CNNConfig(reject=0.033, spread=0.0071)

@@ -14,7 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from handsim.hand.shape import NUM_JOINTS
+from gloves.fit import GloveFit
+from handsim.hand.model import join_qpos
 from handsim.kernels import kernel, point_distance, write_quaternion_matrix
 from track.kinematics.marker_kinematics import (
     LIMIT_PRECISION,
@@ -30,8 +31,7 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_prior
 
-IMPOSSIBLE: Final = 1e9
-"""Minus the score of a hypothesis that is excluded."""
+IMPOSSIBLE: Final = 1e9  # minus the score of a hypothesis that is excluded
 _ANGLES_PER_HINGE: Final = 5  # angles of each hinge at which distances are taken
 _LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
 _PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
@@ -51,29 +51,20 @@ class DigitRanges(NamedTuple):
 class DigitModel(NamedTuple):
     """The model that the candidates of a digit are tested against."""
 
-    joint_prior: JointPrior
-    """Distribution of the hand's hinges before the frame's markers were used."""
-    predicted: MarkerPrediction
-    """The hand as fitted to the labels so far."""
-    variance: Float[np.ndarray, "M"]
-    """Variance of each marker around its position [m^2]."""
-    peak_log_odds: Float[np.ndarray, "M"]
-    """Log-odds of a point exactly at the predicted position of each marker."""
-    slack: Float[np.ndarray, "M"]
-    """Distance by which each marker may be off its position on the hand of the ranges [m]."""
-    ranges: DigitRanges
-    """Distances between markers of a digit over all poses."""
+    joint_prior: JointPrior  # distribution of the hand's hinges before the frame's markers were used
+    predicted: MarkerPrediction  # the hand as fitted to the labels so far
+    variance: Float[np.ndarray, "M"]  # variance of each marker around its position [m^2]
+    peak_log_odds: Float[np.ndarray, "M"]  # of a point exactly at the predicted position of each marker
+    slack: Float[np.ndarray, "M"]  # by which each marker may be off its place on the hand of the ranges [m]
+    ranges: DigitRanges  # distances between markers of a digit over all poses
 
 
 class DigitHypotheses(NamedTuple):
     """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
 
-    scores: Float[np.ndarray, "*D S"]
-    """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
-    runners_up: Float[np.ndarray, "*D S"]
-    """The same of the next best assignment of the same points."""
-    assignments: Int[np.ndarray, "*D S K"]
-    """Candidate of each of the digit's markers, -1 for none."""
+    scores: Float[np.ndarray, "*D S"]  # log-odds against all points being strays; `-IMPOSSIBLE` if excluded
+    runners_up: Float[np.ndarray, "*D S"]  # the same of the next best assignment of the same points
+    assignments: Int[np.ndarray, "*D S K"]  # candidate of each of the digit's markers, -1 for none
 
 
 class DigitPoints(NamedTuple):
@@ -88,27 +79,13 @@ class DigitPoints(NamedTuple):
     precision: Float[np.ndarray, "4 4"]  # its precision [1/rad^2]
 
 
-@kernel
-def digit_ranges(hand: HandArrays) -> DigitRanges:
+def digit_ranges(hand: GloveFit) -> DigitRanges:
     """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
-    count, work = len(hand.digits), workspace(len(hand.digits))
-    nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
-    np.fill_diagonal(nearest, 0.0)
-    angles = np.empty(NUM_JOINTS)
-    for number in range(_ANGLES_PER_HINGE**4):
-        for hinge in range(NUM_JOINTS):
-            share = (
-                number // _ANGLES_PER_HINGE ** (3 - hinge % 4) % _ANGLES_PER_HINGE / (_ANGLES_PER_HINGE - 1)
-            )
-            low, high = hand.ranges[hinge]
-            angles[hinge] = low + share * (high - low)
-        compute_markers(hand, angles, work)
-        for one in range(count):
-            for other in range(one):
-                distance = point_distance(work.markers[one], work.markers[other])
-                nearest[one, other] = nearest[other, one] = min(nearest[one, other], distance)
-                farthest[one, other] = farthest[other, one] = max(farthest[one, other], distance)
-    return DigitRanges(nearest, farthest)
+    shares = np.indices((_ANGLES_PER_HINGE,) * 4).reshape(4, -1).T / (_ANGLES_PER_HINGE - 1)
+    low, high = hand.model.skeleton.ranges.T
+    markers, _ = hand.markers(join_qpos(low + np.tile(shares, 5) * (high - low)))
+    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
+    return DigitRanges(apart.min(axis=0), apart.max(axis=0))
 
 
 def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:
@@ -130,10 +107,7 @@ def evaluate_digit(
     log_odds: Float[np.ndarray, "N M"],
     found: DigitHypotheses,
 ) -> None:
-    """Evaluate all assignments of candidate points to the markers of one digit.
-
-    `log_odds` are those of each label beside the fit, from IDs, presence and queries.
-    """
+    """Evaluate all assignments of points to a digit's markers, with the labels' other log-odds."""
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     local, label_log_odds = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
@@ -196,10 +170,7 @@ def _fit_hypotheses(
 
 @kernel
 def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
-    """Write the hypothesis with a number to `hypothesis`, and return the set of points that it uses as bits.
-
-    The digits of the number to the base `choices` are each marker's candidate plus one, zero for none.
-    """
+    """Write the hypothesis of a number, and return the set of points that it uses as bits."""
     points_used = 0
     for slot in range(len(hypothesis)):
         hypothesis[slot] = number % choices - 1

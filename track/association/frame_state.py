@@ -27,11 +27,7 @@ _BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point 
 
 
 class Numbering:
-    """The one numbering of the markers of all owners: hands, then bodies.
-
-    Args:
-        counts: Markers of each owner.
-    """
+    """The one numbering of the markers of all owners, of which each has some: hands, then bodies."""
 
     def __init__(self, counts: Sequence[int]) -> None:
         self._first = np.cumsum([0, *counts]).tolist()
@@ -49,35 +45,22 @@ class Numbering:
     def with_markers(
         self, owner: int, markers: Int[np.ndarray, "N"], labels: Int[np.ndarray, "N"]
     ) -> Int[np.ndarray, "N"]:
-        """Labels in which exactly these points are an owner's markers.
-
-        `markers` are -1 for points that are none of them; other owners' labels stay where they are.
-        """
+        """Labels in which exactly these points are an owner's markers, -1 for none of them."""
         return _with_markers(labels, self._first[owner], self._first[owner + 1], markers)
 
 
 class FrameState(NamedTuple):
-    """P points of a frame and what is known of each so far.
+    """P points of a frame and what is known of each so far; no array of it is ever overwritten."""
 
-    Every step of the tracker takes one and gives the next; no array of it is ever overwritten.
-    """
-
-    points: Float[np.ndarray, "P 3"]
-    """Points in the world [m]."""
-    ids: Int[np.ndarray, "P"]
-    """Numbers of the points that last from frame to frame."""
-    labels: Int[np.ndarray, "P"]
-    """Label of each point by `numbering`, -1 for none."""
+    points: Float[np.ndarray, "P 3"]  # points in the world [m]
+    ids: Int[np.ndarray, "P"]  # numbers of the points that last from frame to frame
+    labels: Int[np.ndarray, "P"]  # label of each point by `numbering`, -1 for none
     evidence: Float[np.ndarray, "P"]
     """Evidence for the label of each point that its number has collected over the frames (log-odds)."""
-    confidence: Float[np.ndarray, "P"]
-    """Confidence in each label, 0 to 1."""
-    first_seen: Float[np.ndarray, "P"]
-    """Time of the first frame with the point's number [s]."""
-    time: float
-    """Time of the frame [s]."""
-    numbering: Numbering
-    """What labels mean."""
+    confidence: Float[np.ndarray, "P"]  # confidence in each label, 0 to 1
+    first_seen: Float[np.ndarray, "P"]  # time of the first frame with the point's number [s]
+    time: float  # time of the frame [s]
+    numbering: Numbering  # what labels mean
 
     @property
     def unlabeled(self) -> Bool[np.ndarray, "P"]:
@@ -145,12 +128,9 @@ def _with_markers(
 
 
 class PointHistory:
-    """What is known of the points of a stream from the frames before: label, evidence and age.
+    """What is known of the points of a stream from the frames before: label, evidence and age."""
 
-    Args:
-        numbering: What labels mean.
-        silence: Time without a frame that labels do not outlive [s]; IDs may have changed by then.
-    """
+    # Labels do not outlive some silence [s] without a frame; IDs may have changed by then.
 
     def __init__(self, numbering: Numbering, silence: float) -> None:
         self._numbering = numbering
@@ -190,11 +170,7 @@ class PointHistory:
 
 
 class PointLinker:
-    """Numbers the points of a stream.
-
-    Args:
-        owners: Hand of each label.
-    """
+    """Numbers the points of a stream."""
 
     def __init__(self, owners: Int[np.ndarray, "K"]) -> None:
         self._owners = owners
@@ -210,11 +186,9 @@ class PointLinker:
         labels: Mapping[int, int],
         expected: Float[np.ndarray, "K 3"],
     ) -> Int[np.ndarray, "P"]:
-        """Number the points of the next frame, as the stream does where most of its IDs last.
-
-        Where numbers had labels in the last frame, the IDs of these count: ghosts have short lives. A point
-        without an ID in a stream that has them gets a new one.
-        """
+        """Number the points of the next frame, as the stream does where most of its IDs last."""
+        # Where numbers had labels in the last frame, the IDs of these count: ghosts have short lives. A point
+        # without an ID in a stream that has them gets a new one.
         again = [self._numbers.get(number, -1) for number in ids.tolist()]
         known = np.array(again, dtype=np.int64)
         before = labels.keys() if labels else set(self._last.tolist())
@@ -271,11 +245,9 @@ def _assign(
 
 
 def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:
-    """Median change of the distances of neighboring points from a frame to the next [m].
-
-    About 2 mm where one frame follows from the other, also of fast hands, and 8 mm and more of hands in poses
-    that have nothing to do with each other; infinite where points cannot be linked.
-    """
+    """Median change of the distances of neighboring points [m]; infinite if points cannot be linked."""
+    # About 2 mm where one frame follows from the other, also of fast hands, and 8 mm and more of hands in
+    # poses that have nothing to do with each other.
     rows, columns = _assign(points, before, _DISTANCES[0])
     first, second = np.triu_indices(len(rows), 1)
     was = np.linalg.norm(before[columns[first]] - before[columns[second]], axis=-1)
@@ -309,11 +281,7 @@ def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Fl
 def match_points(
     log_odds: Float[np.ndarray, "P K"],
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """The most likely assignment of points to markers, one to one; either may stay alone.
-
-    Returns the marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the
-    alternatives of both.
-    """
+    """The likeliest assignment of points to markers, either -1 if alone, and the confidence in it, 0 to 1."""
     _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:
         return labels, np.ones(len(log_odds))

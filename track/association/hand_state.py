@@ -56,10 +56,8 @@ _RETURN_TIME: Final = 0.01  # [s] over the time it was hidden is a marker's chan
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that chance
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that had another point while this one was visible."""
-STRAY_LIFETIME: Final = 0.1
-"""Mean time for which a stray point lives [s]."""
-MOST_AGE_LOG_ODDS: Final = 3.0
-"""Largest log-odds that a point's age contributes."""
+STRAY_LIFETIME: Final = 0.1  # mean time for which a stray point lives [s]
+MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds that a point's age contributes
 
 
 class Prediction(NamedTuple):
@@ -95,12 +93,7 @@ class Biases(NamedTuple):
 
 
 class HandState:
-    """Filter state of one of the user's hands.
-
-    Args:
-        config: Noise of the markers, and density of strays.
-        origin: Where the hand is from.
-    """
+    """Filter state of one of the user's hands, which is from a calibration or not."""
 
     def __init__(
         self,
@@ -140,7 +133,7 @@ class HandState:
         self._spread_model = SpreadModel(hand, origin)
         self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
-        self._ranges = digit_ranges(self.adapted)
+        self._ranges = digit_ranges(hand)
         self._now = 0.0  # [s] of the last prediction
 
     def predict(self, time: float) -> Prediction:
@@ -163,10 +156,7 @@ class HandState:
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
     ) -> HandEstimate:
-        """Fit the pose to labeled markers; what they leave open follows the prediction.
-
-        With fewer than four markers the pose is the predicted one and has no RMS.
-        """
+        """Fit the pose to four labeled markers or more, and what they leave open to the prediction."""
         qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
             fit = self.solver.solve_frame(
@@ -191,11 +181,8 @@ class HandState:
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
     def digit_models(self, prediction: Prediction, estimate: HandEstimate) -> tuple[DigitModel, DigitModel]:
-        """Models for new points of a digit: of one with settled labels, and of one without.
-
-        The second has the resting prior: the pose that a wrong label gave to a digit must not confirm that
-        label.
-        """
+        """Models for new points of a digit: of one with settled labels, and of one without."""
+        # The second has the resting prior: the pose that a wrong label gave to a digit must not confirm it.
         slack = _BIAS_SLACK * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
         confirmed = DigitModel(
             prediction.joint_prior,
@@ -340,12 +327,8 @@ def _learn_bias(
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
 ) -> None:
-    """Average the residuals of markers with settled labels in the frames of their bones, and their variance.
-
-    Residuals are model minus marker in the world [m], rotations those of the markers' bones. Any pose fits
-    markers that are not tested by others on their part: their variance stays. `bias_frames`, `bias` [m] and
-    `variance` [m^2] are overwritten.
-    """
+    """Average the residuals [m] of settled markers in the frames of their bones, and their variance [m^2]."""
+    # Any pose fits markers that are not tested by others on their part: their variance stays.
     residual = np.empty(3)
     for marker in range(len(residuals)):
         if not settled[marker] or np.isnan(residuals[marker, 0]):

@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS
-from handsim.kernels import kernel, squared_distance
 from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
@@ -27,13 +27,11 @@ from track.kinematics.pose_solver import PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
-MOST_POINTS: Final = 100
-"""Largest number of points of a group that may be a hand."""
+MOST_POINTS: Final = 100  # largest number of points of a group that may be a hand
 _LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
 _LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand are linked
 _LEAST_LABELED_SHARE: Final = 0.45  # of a hand's markers that must be labeled
-FEWEST_POINTS: Final = 4
-"""Least number of labeled points of a hand; a pose needs as many."""
+FEWEST_POINTS: Final = 4  # least number of labeled points of a hand; a pose needs as many
 SPARE_POINTS: Final = 6
 """Points beyond a hand's markers from which on a group may be two hands that touch, at most."""
 _SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few markers mislead the labeler
@@ -89,15 +87,11 @@ class _Search:
 
 
 class HandInitializer:
-    """Initializes hands without any history.
+    """Initializes hands without any history, by a labeler that does not know left from right."""
 
-    Args:
-        labeler: Labels the points of a cloud of one hand; does not know left from right.
-        config: Largest RMS distance of a pose, and the density of strays.
-        at_once: Look at a group of points along all directions in one call. Otherwise a call looks along
-            three, and the next calls, a frame later each, along one more, until a hand is certain or all were
-            tried: no frame waits for a search.
-    """
+    # Unless it looks at a group of points along all directions at once, a call looks along three, and the
+    # next calls, a frame later each, along one more, until a hand is certain or all were tried: no frame
+    # waits for a search.
 
     def __init__(
         self,
@@ -118,6 +112,7 @@ class HandInitializer:
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
+        self._points: NDArray[np.float64] = np.empty((0, 3))  # those of the frame
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
@@ -125,29 +120,29 @@ class HandInitializer:
 
     def initialize(self, points: Float[np.ndarray, "N 3"], hands: Sequence[int]) -> list[InitializedHand]:
         """Look for some of the hands."""
-        search = self._searches.pop(tuple(hands), _Search())
+        search, self._points = self._searches.pop(tuple(hands), _Search()), points
         self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
         initialized: list[InitializedHand] = []
         cut = False
         least = min((self._least(index) for index in hands), default=0)
-        for group in linked_groups(np.ascontiguousarray(points), self._link_distance):
+        for group in linked_groups(points, self._link_distance):
             if not least <= len(group) <= MOST_POINTS:
                 continue
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
             here: list[InitializedHand] = []
             while missing:
-                cuts = self._cuts_of(points[rest], missing)
+                cuts = self._cuts_of(rest, missing)
                 cut |= len(cuts) > 0
-                hand = self._best(points, rest, missing, cuts, search)
+                hand = self._best(rest, missing, cuts, search)
                 if hand is None:
                     break
                 here.append(hand)
                 rest = rest[hand.labels[rest] < 0]
                 missing.remove(hand.index)
             self._attempts[missing] += 1
-            initialized += self._uncrossed(self._divided(here, points, group), points)
-        initialized = self._sides_checked(initialized, points)
+            initialized += self._uncrossed(self._divided(here, group))
+        initialized = self._sides_checked(initialized)
         for hand in initialized:
             self._attempts[hand.index] = 0
         if cut and not initialized and search.turn < _LAST_TURN and not self._at_once:
@@ -161,28 +156,21 @@ class HandInitializer:
         """Whether the last call for some hands left directions for the next one."""
         return tuple(hands) in self._searches
 
-    def _sides_checked(
-        self, hands: list[InitializedHand], points: Float[np.ndarray, "N 3"]
-    ) -> list[InitializedHand]:
-        """Two hands as they are, or the other way round where both together fit better so.
-
-        One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
-        symmetric pattern, fit both hands nearly alike.
-        """
+    def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
+        """Two hands as they are, or the other way round where both together fit better so."""
+        # One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
+        # symmetric pattern, fit both hands nearly alike.
         if len(hands) != 2:
             return hands
         one, two = hands
-        first = self._fit(two.index, points, one.labels), self._fit(one.index, points, two.labels)
+        first = self._fit(two.index, one.labels), self._fit(one.index, two.labels)
         if any(fit is None or _is_mirrored(fit, hand) for fit, hand in zip(first, hands, strict=True)):
             return hands
-        return _likelier([self._trim(fit, points) for fit in first], hands)
+        return _likelier([self._trim(fit) for fit in first], hands)
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
-        """Log-odds of `count` labeled points being a hand against their being strays.
-
-        Few points fit any pose; what a pose takes from them does not count. `spread` is the known standard
-        deviation around the markers in each direction [m], estimated from the fit when not given.
-        """
+        """Log-odds of labeled points being a hand against strays, by the markers' `spread` [m] if known."""
+        # Few points fit any pose; what a pose takes from them does not count.
         taken = min(_FREE_COORDINATES, 3.0 * count)
         square = count * rms**2
         variance = (square + _SPREAD_BEFORE_COORDINATES * _SPREAD_BEFORE**2) / (
@@ -198,19 +186,14 @@ class HandInitializer:
         return max(FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
-        self,
-        points: NDArray[np.float64],
-        group: NDArray[np.int64],
-        hands: Sequence[int],
-        cuts: NDArray[np.int64],
-        search: _Search,
+        self, group: NDArray[np.int64], hands: Sequence[int], cuts: NDArray[np.int64], search: _Search
     ) -> InitializedHand | None:
         """The first hand of a group that is certain, or the best one after the last of the cuts."""
         if not len(cuts):
-            return self._better(None, points, group, [group], hands)
+            return self._better(None, group, [group], hands)
         best: InitializedHand | None = None
         for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
-            best = self._better(best, points, group, self._clouds(points, group, cuts, turn), hands)
+            best = self._better(best, group, self._clouds(group, cuts, turn), hands)
             if best is not None and self._is_certain(best):
                 return best
         if self._at_once:
@@ -221,15 +204,13 @@ class HandInitializer:
             return None
         if search.best_turn == search.turn:
             return best
-        return self._better(best, points, group, self._clouds(points, group, cuts, search.best_turn), hands)
+        return self._better(best, group, self._clouds(group, cuts, search.best_turn), hands)
 
-    def _labeled(
-        self, points: NDArray[np.float64], clouds: Sequence[NDArray[np.int64]]
-    ) -> list[NDArray[np.int64]]:
+    def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
         """A label for every point by each cloud, the cloud of most confidence in all first."""
-        labelings = self._labeler.label_frames([points[cloud] for cloud in clouds])
+        labelings = self._labeler.label_frames([self._points[cloud] for cloud in clouds])
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
-        labeled = np.full((len(clouds), len(points)), -1)
+        labeled = np.full((len(clouds), len(self._points)), -1)
         for row, cloud, one in zip(labeled, clouds, labelings, strict=True):
             row[cloud] = one.labels
         return [labeled[number] for number in np.argsort(confidence)[::-1]]
@@ -237,18 +218,17 @@ class HandInitializer:
     def _better(
         self,
         best: InitializedHand | None,
-        points: NDArray[np.float64],
         group: NDArray[np.int64],
         clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
     ) -> InitializedHand | None:
         """The best hand so far, or one of these clouds of a group with a better score."""
-        for labels in self._labeled(points, clouds)[:_FITS_AT_A_TIME]:
-            fits = [self._fit(index, points, labels) for index in hands]
+        for labels in self._labeled(clouds)[:_FITS_AT_A_TIME]:
+            fits = [self._fit(index, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
-                hand = self._improve(first, points, group)
+                hand = self._improve(first, group)
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
             if best is not None and self._is_certain(best):
@@ -259,37 +239,29 @@ class HandInitializer:
         """Whether a hand fits so well that no other cloud need be tried."""
         return hand.score > _CERTAIN_SCORE * self._states[hand.index].num_markers
 
-    def _cuts_of(self, points: NDArray[np.float64], hands: Sequence[int]) -> NDArray[np.int64]:
+    def _cuts_of(self, group: NDArray[np.int64], hands: Sequence[int]) -> NDArray[np.int64]:
         """Directions along which a group is cut if it has points of more than one hand, the longest first."""
         most = max(self._states[index].num_markers for index in hands)
-        if len(points) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
+        if len(group) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
         count = _CUTS if self._at_once else _CUTS_OF_SEARCH
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
-        return numbers[np.argsort(-(points @ self._directions[numbers].T).std(axis=0))]
+        return numbers[np.argsort(-(self._points[group] @ self._directions[numbers].T).std(axis=0))]
 
     def _clouds(
-        self,
-        points: NDArray[np.float64],
-        group: NDArray[np.int64],
-        cuts: NDArray[np.int64],
-        turn: int,
+        self, group: NDArray[np.int64], cuts: NDArray[np.int64], turn: int
     ) -> list[NDArray[np.int64]]:
         """The clouds of a turn: the whole group and its halves along the first cuts, then one cut a turn."""
-        clouds = [group] if turn == 0 else []
-        for cut in (
-            cuts[:_CUTS_AT_FIRST] if turn == 0 else cuts[turn + _CUTS_AT_FIRST - 1 : turn + _CUTS_AT_FIRST]
-        ):
-            order = group[np.argsort(points[group] @ self._directions[cut])]
+        clouds, last = [group] if turn == 0 else [], turn + _CUTS_AT_FIRST
+        for cut in cuts[0 if turn == 0 else last - 1 : last]:
+            order = group[np.argsort(self._points[group] @ self._directions[cut])]
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
-    def _improve(
-        self, first: InitializedHand, points: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> InitializedHand | None:
+    def _improve(self, first: InitializedHand, group: NDArray[np.int64]) -> InitializedHand | None:
         """A hand without labels that do not fit, then fitted to the points of the group that do."""
         index, state = first.index, self._states[first.index]
-        hand = self._trim(first, points) or self._trim(self._without_outliers(first, points), points)
+        hand = self._trim(first) or self._trim(self._without_outliers(first))
         for _ in range(_REFINEMENTS):
             if hand is None:
                 return None
@@ -297,35 +269,28 @@ class HandInitializer:
             fitted = float(hand.fit.rms[0] / np.sqrt(3.0))
             spread = np.clip(_SEARCH_FACTOR * fitted, _SEARCH_LEAST, _SEARCH_MOST)
             covariances = np.tile(spread**2 * np.eye(3), (state.num_markers, 1, 1))
-            labels = np.full(len(points), -1)
-            log_odds = match_log_odds(points[group], positions, covariances, self._config.stray_density)
+            labels = np.full(len(self._points), -1)
+            log_odds = match_log_odds(self._points[group], positions, covariances, self._config.stray_density)
             labels[group], _ = match_points(log_odds)
             if (labels == hand.labels).all():
                 break
-            hand = self._trim(self._fit(index, points, labels, hand.fit), points)
+            hand = self._trim(self._fit(index, labels, hand.fit))
         return hand
 
-    def _divided(
-        self, hands: list[InitializedHand], points: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> list[InitializedHand]:
-        """Hands of one group, each labeled once more among the points that the others leave.
-
-        The first one may have points of the others, such as a thumb's.
-        """
+    def _divided(self, hands: list[InitializedHand], group: NDArray[np.int64]) -> list[InitializedHand]:
+        """Hands of one group, each labeled once more among the points that the others leave."""
         for number, hand in enumerate(hands if len(hands) > 1 else ()):
             others = [other.labels[group] >= 0 for other in hands if other is not hand]
-            again = self._better(hand, points, group, [group[~np.any(others, axis=0)]], (hand.index,))
+            again = self._better(hand, group, [group[~np.any(others, axis=0)]], (hand.index,))
             hands[number] = again or hand
         return hands
 
-    def _uncrossed(self, hands: list[InitializedHand], points: NDArray[np.float64]) -> list[InitializedHand]:
-        """Two hands, with the points of a digit exchanged where both together fit better so.
-
-        A thumb fits the other hand's palm nearly as well as its own where hands touch.
-        """
+    def _uncrossed(self, hands: list[InitializedHand]) -> list[InitializedHand]:
+        """Two hands, with the points of a digit exchanged where both together fit better so."""
+        # A thumb fits the other hand's palm nearly as well as its own where hands touch.
         if len(hands) != 2:
             return hands
-        digits = self._states[hands[0].index].solver.hand.digits
+        points, digits = self._points, self._states[hands[0].index].solver.hand.digits
         for digit in range(len(DIGITS)):
             one, two = hands
             ours, theirs = (
@@ -339,13 +304,13 @@ class HandInitializer:
             first[ours], second[theirs] = -1, -1
             first[theirs], second[ours] = two.labels[theirs], one.labels[ours]
             changed = [
-                self._trim(self._fit(hand.index, points, labels, hand.fit), points)
+                self._trim(self._fit(hand.index, labels, hand.fit))
                 for hand, labels in ((one, first), (two, second))
             ]
             hands = _likelier(changed, hands)
         return hands
 
-    def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
+    def _trim(self, hand: InitializedHand | None) -> InitializedHand | None:
         """Drop the worst label while that improves the score; None where it is no hand."""
         best: InitializedHand | None = None
         while hand is not None and (best is None or hand.score > best.score):
@@ -354,7 +319,7 @@ class HandInitializer:
             squares = (hand.fit.residuals[0, hand.labels[labeled]] ** 2).sum(axis=1)
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
-            hand = self._fit(hand.index, points, labels, hand.fit)
+            hand = self._fit(hand.index, labels, hand.fit)
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
@@ -363,33 +328,27 @@ class HandInitializer:
         )
         return best if accepted else None
 
-    def _without_outliers(
-        self, first: InitializedHand, points: NDArray[np.float64]
-    ) -> InitializedHand | None:
-        """The hand without labels that a robust fit leaves aside; None where these are many.
-
-        One wrong label can bend a whole first fit.
-        """
+    def _without_outliers(self, first: InitializedHand) -> InitializedHand | None:
+        """The hand without labels that a robust fit leaves aside; None where these are many."""
+        # One wrong label can bend a whole first fit.
         state = self._states[first.index]
-        targets = targets_of(points, first.labels, state.num_markers)
+        targets = targets_of(self._points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
         distances = np.linalg.norm(fit.residuals[0], axis=-1)
         kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
         if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
-        return self._fit(first.index, points, np.where(kept, first.labels, -1), fit)
+        return self._fit(first.index, np.where(kept, first.labels, -1), fit)
 
     def _fit(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit | None = None
+        self, index: int, labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
-        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few.
-
-        Its score counts how unusual the pose is; a hand that was seen lately must fit as well as then.
-        """
+        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few."""
+        # An unusual pose costs score, and a hand that was seen lately must fit as well as then.
         count, state = int((labels >= 0).sum()), self._states[index]
         if count < self._least(index):
             return None
-        targets = targets_of(points, labels, state.num_markers)[None]
+        targets = targets_of(self._points, labels, state.num_markers)[None]
         start, steps = (None, _FIRST_FIT_STEPS) if near is None else (near.qpos, _REFIT_STEPS)
         fit = state.solver.solve(targets, start, iterations=steps)
         spread = self._spreads[index] if self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS else None
@@ -425,10 +384,8 @@ def _link_distance(hand: GloveFit) -> float:
 class FrameLabels(NamedTuple):
     """Labels of a frame's points."""
 
-    labels: Int[np.ndarray, "N"]
-    """Marker of each point, counted through the hands in their order; -1 for none."""
-    confidence: Float[np.ndarray, "N"]
-    """Confidence in each label, 0 to 1."""
+    labels: Int[np.ndarray, "N"]  # marker of each point, counted through the hands; -1 for none
+    confidence: Float[np.ndarray, "N"]  # confidence in each label, 0 to 1
 
 
 def label_alone(
@@ -437,11 +394,7 @@ def label_alone(
     labeler: Labeler,
     told: Callable[[int], None] = lambda count: None,
 ) -> list[FrameLabels]:
-    """Label every frame by itself.
-
-    A hand is there where a pose fits. In a capture that shows hands in most frames, a frame with enough
-    points holds one also where none fits: the labeler can be right where too many labels are wrong for a fit.
-    """
+    """Label every frame by itself; a hand is there where a pose fits."""
     finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []
     for points in frames:
@@ -483,8 +436,10 @@ def _clouds(
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
     """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
-    number = _single_linkage(points, distance)
-    groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
+    number = np.zeros(len(points), dtype=np.int64)
+    if len(points) > 1:
+        number = fcluster(linkage(points, "single"), distance, "distance")
+    groups = [np.flatnonzero(number == one) for one in dict.fromkeys(number)]
     return sorted(groups, key=len, reverse=True)
 
 
@@ -496,48 +451,6 @@ def distances_to_nearest(
     return distances
 
 
-@kernel
-def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np.ndarray, "N"]:
-    """Number of the group of each point."""
-    number = np.full(len(points), -1)
-    stack = np.zeros(len(points), dtype=np.int64)
-    groups = 0
-    for first in range(len(points)):
-        if number[first] >= 0:
-            continue
-        number[first], stack[0], height = groups, first, 1
-        while height > 0:
-            height -= 1
-            here = stack[height]
-            for other in range(len(points)):
-                if number[other] >= 0:
-                    continue
-                if squared_distance(points[here], points[other]) <= distance**2:
-                    number[other] = groups
-                    stack[height] = other
-                    height += 1
-        groups += 1
-    return number
-
-
-@kernel
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
-    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
-    longest = np.zeros(len(points))
-    for frame in range(len(points)):
-        nearest = np.full(points.shape[1], np.inf)
-        added = 0
-        for _ in range(1, points.shape[1]):
-            nearest[added] = -1.0  # is in the tree
-            least, following = np.inf, added
-            for other in range(points.shape[1]):
-                if nearest[other] < 0.0:
-                    continue
-                square = squared_distance(points[frame, other], points[frame, added])
-                nearest[other] = min(nearest[other], square)
-                if nearest[other] < least:
-                    least, following = nearest[other], other
-            longest[frame] = max(longest[frame], least)
-            added = following
-        longest[frame] = np.sqrt(longest[frame])
-    return longest
+    """The least distance at which the points of each frame are linked to one group [m]."""
+    return np.array([linkage(frame, "single")[-1, 2] for frame in points])

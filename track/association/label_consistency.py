@@ -27,8 +27,7 @@ _GATE: Final = 16.0  # squared Mahalanobis distance of a point that is fitted: f
 _PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a predicted marker beside its own spread
 _PREDICTION_FACTOR: Final = 2.0  # the same over what the other markers show in this frame
 _MOST_GATED_SHARE: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong
-EXCHANGE_DISTANCE: Final = 0.04
-"""Distance of two points within which their IDs may be exchanged [m]."""
+EXCHANGE_DISTANCE: Final = 0.04  # distance of two points within which their IDs may be exchanged [m]
 _EXCHANGE_MARGIN: Final = 8.0  # log-odds from which on two labels are exchanged; systems rarely exchange IDs
 _EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset of two predicted markers
 _EXCHANGE_CONFIDENCE: Final = 0.5
@@ -52,11 +51,8 @@ _MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label c
 
 
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
-    """Exchange the labels of two points where that explains both much better: the system exchanged their IDs.
-
-    A motion that the prediction misses moves both points alike and cancels in the comparison. A hand without
-    a prediction has no labels.
-    """
+    """Exchange the labels of two points where that explains both much better, as if IDs were exchanged."""
+    # A motion that the prediction misses moves both points alike and cancels in the comparison.
     labels = frame.labels.copy()
     points = _exchange(frame.points, labels, positions)
     if len(points) == 0:
@@ -73,11 +69,9 @@ def _exchange(
     labels: NDArray[np.int64],
     positions: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Kernel of `exchange_labels`: overwrites the labels (P,), returns the points whose label has changed.
-
-    What an exchange of i and j gains, (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is
-    -(p_i-p_j).(m_i-m_j) / s^2. The pair that gains most comes first; a point is exchanged once.
-    """
+    """Kernel of `exchange_labels`: overwrites the labels, returns the points whose label has changed."""
+    # What an exchange of i and j gains, (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is
+    # -(p_i-p_j).(m_i-m_j) / s^2. The pair that gains most comes first; a point is exchanged once.
     labeled = np.flatnonzero(labels >= 0)
     changed = np.empty(len(labeled), dtype=np.int64)
     count = 0
@@ -110,11 +104,8 @@ def _exchange(
 
 
 def gate_labels(frame: FrameState, hand: int, state: HandState, prediction: Prediction) -> FrameState:
-    """Drop labels whose points are outside the gate around their markers at the predicted pose.
-
-    The gate is as wide as the innovations of the hand's other markers in this frame are large. Where too many
-    labels are outside, the prediction is wrong, and all labels stay.
-    """
+    """Drop labels of points outside a gate as wide as the innovations of the hand's other markers."""
+    # Where too many labels are outside, the prediction is wrong, and all labels stay.
     markers = frame.markers(hand)
     _gate(frame.points, markers, prediction.positions, state.variance)
     return frame.with_markers(hand, markers)
@@ -143,10 +134,7 @@ def _gate(
 def fit_labels(
     frame: FrameState, hand: int, state: HandState, prediction: Prediction
 ) -> tuple[FrameState, HandEstimate]:
-    """Fit the pose to the labeled points.
-
-    Labels that are inconsistent with the others are dropped, the worst first.
-    """
+    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first."""
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
     while True:
@@ -197,21 +185,14 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
 class _Proposal(NamedTuple):
     """Labels of a hand's points by the labeler, and the pose that fits them."""
 
-    frame: FrameState
-    """The frame with these labels."""
+    frame: FrameState  # the frame with these labels
     confidence: Float[np.ndarray, "P"]
     """The labeler's confidence in each label; NaN for points that it was not shown."""
-    estimate: HandEstimate
-    """The pose fitted to them."""
+    estimate: HandEstimate  # the pose fitted to them
 
 
 class LabelerReview:
-    """Decides when a hand's labels are reviewed, and reviews them.
-
-    Args:
-        labeler: Labels the points of a cloud of one hand.
-        config: Density of strays, and the longest time between reviews.
-    """
+    """Decides when a hand's labels are reviewed, and reviews them."""
 
     def __init__(self, labeler: Labeler, num_hands: int, config: TrackerConfig) -> None:
         self._labeler = labeler
@@ -334,10 +315,8 @@ class LabelerReview:
 
 
 def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64]) -> Int[np.ndarray, "K"]:
-    """Markers that the hand lacks, and for which the labeler names points that have lasted.
-
-    Their biases may have been learned from other points if the markers would be much nearer without them.
-    """
+    """Markers that the hand lacks, for which the labeler names points that have lasted."""
+    # Their biases may be of other points if the markers would be much nearer without them.
     old = frame.time - frame.first_seen >= STRAY_LIFETIME
     rows = np.flatnonzero(old & frame.unlabeled & (named >= 0))
     if not len(rows):

@@ -50,8 +50,7 @@ class DigitCandidates(NamedTuple):
 
     candidates: Int[np.ndarray, "D 7"]
     """Points of each digit: first those labeled as its markers, then others, the nearest first."""
-    counts: Int[np.ndarray, "D"]
-    """How many there are; zero where there is nothing to decide."""
+    counts: Int[np.ndarray, "D"]  # how many there are; zero where there is nothing to decide
 
 
 def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
@@ -238,10 +237,7 @@ def assign_jointly(
     assigned: Int[np.ndarray, "N"],
     margins: Float[np.ndarray, "N"],
 ) -> None:
-    """Assign points to digits: the best combination of hypotheses of all digits that share points.
-
-    A point's margin is the log-odds by which the next best combination with another label for it is worse.
-    """
+    """Assign points to digits: the best combination of hypotheses, and what each label is better by."""
     pending = candidates.counts > 0
     group = np.empty(len(pending), dtype=np.int64)
     for first in range(len(pending)):
@@ -339,10 +335,7 @@ def best_combination(
     banned: Int[np.ndarray, "D"],
     best: Int[np.ndarray, "D"],
 ) -> float:
-    """The best choice of one row per digit such that no point is used twice, by branch and bound.
-
-    Returns the sum of the scores; `-IMPOSSIBLE` if there is no choice. `sets` has one bit per point.
-    """
+    """Score of the best choice of one row per digit that shares no point, by branch and bound."""
     digits = len(scores)
     bound = np.zeros(digits + 1)
     for digit in range(digits - 1, -1, -1):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
-from handsim.hand.model import HandModel, skinned_jacobian
+from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
 from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
@@ -52,14 +52,12 @@ ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 POSITION_SPREAD: Final = 0.002
 """Standard deviation of a marker's slip along the skin [m], to begin with; (noise / spread)^2 is the paper's
 lambda_1."""
-HEIGHT_SPREAD: Final = 0.0005
-"""The same of a marker center's height around that of the design [m]."""
+HEIGHT_SPREAD: Final = 0.0005  # the same of a marker center's height around that of the design [m]
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
-RELINEARIZE: Final = 0.005
-"""Change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian."""
+RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
 """Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
@@ -80,39 +78,41 @@ _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors of the damping after a failed step and a good one
 _LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
-SMALL_GAIN: Final = 1e-4
-"""Share of the energy; a step that gains less is the last one."""
+SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
+
+
+class Contacts(NamedTuple):
+    """K contacts of the thumb, each in one frame, with a point on either pad."""
+
+    frames: Int[np.ndarray, "K"]
+    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
+    pads: SkinCoordinates  # points on the thumb, then those on the fingers
+
+
+_NO_COORDINATES: Final = SkinCoordinates(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
+_NO_CONTACTS: Final = Contacts(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), _NO_COORDINATES)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """All unknowns of a calibration at one iteration."""
 
-    parameters: Float[np.ndarray, "53"]
-    """Hand shape, see `hand_parameters`."""
-    points: Float[np.ndarray, "M 3"]
-    """Marker centers on the rest hand of this shape, in the wrist's frame [m]."""
-    coordinates: SkinCoordinates
-    """The same points in coordinates of its skin."""
+    parameters: Float[np.ndarray, "53"]  # hand shape, see `hand_parameters`
+    points: Float[np.ndarray, "M 3"]  # marker centers on the rest hand, in the wrist's frame [m]
+    coordinates: SkinCoordinates  # the same points in coordinates of its skin
     qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts | None = None
-    """Their frames count in `qpos`."""
+    contacts: Contacts = _NO_CONTACTS  # their frames count in `qpos`
 
 
 class Fit(NamedTuple):
     """Residuals and energy of an estimate."""
 
     model: HandModel
-    bones: Float[np.ndarray, "F L 4 4"]
-    """`T_world_bone` in every frame."""
-    residuals: Float[np.ndarray, "F M 3"]
-    """Model minus marker [m], zero where a marker is missing."""
-    design_residuals: Float[np.ndarray, "M 3"]
-    """Marker minus its position by the glove's design on this hand, in the wrist's frame [m]."""
-    normals: Float[np.ndarray, "M 3"]
-    """Unit normals of the rest skin under the markers."""
-    geometry: ContactGeometry | None
-    """How the pads of the contacts lie to each other."""
+    bones: Float[np.ndarray, "F L 4 4"]  # `T_world_bone` in every frame
+    residuals: Float[np.ndarray, "F M 3"]  # model minus marker [m], zero where a marker is missing
+    design_residuals: Float[np.ndarray, "M 3"]  # marker minus its designed position, in the wrist's frame [m]
+    normals: Float[np.ndarray, "M 3"]  # unit normals of the rest skin under the markers
+    geometry: ContactGeometry  # how the pads of the contacts lie to each other
     cost: float
 
 
@@ -127,28 +127,17 @@ class NormalEquations(NamedTuple):
 
 
 class Problem:
-    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change.
-
-    Args:
-        shape: Right hand that the parameters start from.
-        design: Skin coordinates of the markers by the glove's design.
-        heights: Heights of the marker centers above the skin, as designed [m].
-        targets: Labeled markers of the chosen frames [m]; NaN where missing.
-        noise: Standard deviation of a marker's coordinates [m].
-        robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
-            (Geman and McClure 1987).
-        relinearize: Change of a parameter that renews the skin's jacobian.
-    """
+    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change."""
 
     def __init__(
         self,
-        shape: HandShape,
-        design: SkinCoordinates,
-        heights: Float[np.ndarray, "M"],
-        targets: Float[np.ndarray, "F M 3"],
+        shape: HandShape,  # right hand that the parameters start from
+        design: SkinCoordinates,  # of the markers by the glove's design
+        heights: Float[np.ndarray, "M"],  # of the marker centers above the skin, as designed [m]
+        targets: Float[np.ndarray, "F M 3"],  # labeled markers of the chosen frames [m]; NaN where missing
         *,
-        noise: float,
-        robust_scale: float,
+        noise: float,  # standard deviation of a marker's coordinates [m]
+        robust_scale: float,  # where a residual costs half of a quadratic loss [m] (Geman and McClure 1987)
         relinearize: float = RELINEARIZE,
     ) -> None:
         self._relinearize = relinearize
@@ -172,14 +161,12 @@ class Problem:
         _, by_bone = skinning_terms(model, bones, estimate.points, weights)
         predicted = np.einsum("ml,tmli->tmi", weights, by_bone, optimize=True)
         residuals = np.where(self.present[..., None], predicted - self.targets, 0.0)
-        faces, count = self._all_coordinates(estimate).faces, len(estimate.points)
-        corners = SkinPatch(faces).corners(model.surface.vertices)
-        _, normals = skin_points(estimate.coordinates, _part(corners, 0, count))
-        design, _ = skin_points(self.design, _part(corners, count, 2 * count))
-        geometry = None
-        if estimate.contacts is not None:
-            pads = _part(corners, 2 * count, len(faces))
-            geometry = contact_geometry(estimate.contacts, pads, model, bones[estimate.contacts.frames])
+        contacts, count = estimate.contacts, len(estimate.points)
+        corners = SkinPatch(self._all_coordinates(estimate).faces).corners(model.surface.vertices)
+        _, normals = skin_points(estimate.coordinates, corners.part(0, count))
+        design, _ = skin_points(self.design, corners.part(count, 2 * count))
+        pads = corners.part(2 * count, None)
+        geometry = contact_geometry(contacts, pads, model, bones[contacts.frames])
         fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
         return fit._replace(cost=self._cost(estimate, fit))
 
@@ -187,21 +174,21 @@ class Problem:
         squares = (fit.residuals**2).sum(axis=2)
         cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
         cost += estimate.parameters @ self.precision @ estimate.parameters
-        cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
+        off = fit.design_residuals
+        cost += np.einsum("mi,mij,mj->", off, self._position_precision(fit), off)
         cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
         cost += ((off @ self._pose_precision) * off).sum()
-        if fit.geometry is not None and estimate.contacts is not None:
-            weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-            cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
+        weights = contact_weights(fit.geometry, estimate.contacts.fingers)
+        cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
-    def _apply_position_precision(self, fit: Fit, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """E_prior's precision matrix of each marker [1/m^2] times vectors (M, 3)."""
-        along = (vectors * fit.normals).sum(axis=1, keepdims=True) * fit.normals
-        product: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
-        return product / self.position_spread**2
+    def _position_precision(self, fit: Fit) -> NDArray[np.float64]:
+        """E_prior's precision matrix of each marker (M, 3, 3) [1/m^2]."""
+        normal = fit.normals[:, :, None] * fit.normals[:, None]
+        precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
+        return precision / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Joint angles (F, 20) [rad] beyond their limits, and from the mean of gestures."""
@@ -215,42 +202,49 @@ class Problem:
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._all_coordinates(estimate).faces)
-        corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        bone_weights = skin_weights(estimate.coordinates)
-        by_pose, by_shape, by_point, by_bone = self._point_jacobians(
-            fit, estimate, slice(None), estimate.points, bone_weights, rest[:count]
+        corners, rest = patch.corners(skin).part(0, count), self._rest_jacobian(estimate, patch, skin)
+        # A frame has a row for each coordinate of a marker, and the last one for the gap of its contact.
+        by_pose = np.zeros((frames, 3 * count + 1, NUM_VELOCITIES))
+        by_shared = np.zeros((frames, 3 * count + 1, NUM_PARAMETERS + 3 * count))
+        residuals, precision = np.zeros((2, frames, 3 * count + 1))
+        poses, shapes, by_point, by_bone = self._point_jacobians(
+            fit, estimate, slice(None), estimate.points, skin_weights(estimate.coordinates), rest[:count]
         )
-        weight_jacobian = skin_weight_jacobian(estimate.coordinates, _part(corners, 0, count))
+        weight_jacobian = skin_weight_jacobian(estimate.coordinates, corners)
         by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
-        by_marker = np.zeros((frames, count, 3, count, 3))
+        by_pose[:, :-1] = poses.reshape(frames, 3 * count, -1)
+        by_shared[:, :-1, :NUM_PARAMETERS] = shapes.reshape(frames, 3 * count, -1)
+        by_marker = by_shared[:, :-1, NUM_PARAMETERS:].reshape(frames, count, 3, count, 3)
         by_marker[:, np.arange(count), :, np.arange(count)] = by_point.swapaxes(0, 1)
-        by_pose = by_pose.reshape(frames, 3 * count, -1)
-        by_shared = np.concatenate([by_shape, by_marker.reshape(frames, count, 3, -1)], axis=-1)
-        by_shared = by_shared.reshape(frames, 3 * count, -1)
+        residuals[:, :-1] = fit.residuals.reshape(frames, -1)
         squares = (fit.residuals**2).sum(axis=2)
         weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
-        rows = np.repeat(weights, 3, axis=1)[..., None]
-        residual = fit.residuals.reshape(len(fit.residuals), -1, 1)
-        pose = by_pose.swapaxes(1, 2) @ (rows * by_pose)
-        mixed = by_pose.swapaxes(1, 2) @ (rows * by_shared)
-        flat = (np.sqrt(rows) * by_shared).reshape(-1, by_shared.shape[2])
-        shared = flat.T @ flat
-        pose_gradient = (by_pose.swapaxes(1, 2) @ (rows * residual))[..., 0]
-        shared_gradient = np.einsum("fns,fn->s", by_shared, (rows * residual)[..., 0])
-        result = NormalEquations(pose, mixed, shared, pose_gradient, shared_gradient)
+        precision[:, :-1] = np.repeat(weights, 3, axis=1)
+        if len(estimate.contacts.frames):
+            at = estimate.contacts.frames, -1
+            gaps = self._gap_jacobians(estimate, fit, rest[2 * count :])
+            by_pose[at], by_shared[*at, :NUM_PARAMETERS] = gaps
+            residuals[at] = fit.geometry.gaps
+            precision[at] = contact_weights(fit.geometry, estimate.contacts.fingers) / CONTACT_SPREAD**2
+        root = np.sqrt(precision)[..., None]
+        by_pose, by_shared, residuals = root * by_pose, root * by_shared, root[..., 0] * residuals
+        transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
+        result = NormalEquations(
+            transposed @ by_pose,
+            transposed @ by_shared,
+            flat.T @ flat,
+            (transposed @ residuals[..., None])[..., 0],
+            residuals.ravel() @ flat,
+        )
         self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
-        if estimate.contacts is not None and fit.geometry is not None:
-            self._add_contacts(estimate, fit, rest[2 * count :], result)
         return result
 
     def _rest_jacobian(
         self, estimate: Estimate, patch: SkinPatch, skin: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53).
-
-        The skin is built for every estimate, its derivative only when a parameter has changed: by 0.005 or
-        more changes the result by less than a micrometer, while four times as much is noticeable.
-        """
+        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53)."""
+        # The skin's derivative is renewed when a parameter has changed: by 0.005 or more changes the result
+        # by less than a micrometer, while four times as much is noticeable.
         if (
             self._surface_jacobian is None
             or np.abs(estimate.parameters - self._linearized_at).max() > self._relinearize
@@ -267,66 +261,44 @@ class Problem:
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
         """Skin coordinates of the markers, of their design, and of compressed pads at the contacts."""
-        parts = [estimate.coordinates, self.design]
-        if estimate.contacts is not None:
-            parts += [
-                side._replace(heights=np.full(len(estimate.contacts.frames), -PAD_COMPRESSION))
-                for side in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates)
-            ]
-        return SkinCoordinates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        pads = estimate.contacts.pads
+        pads = pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION))
+        parts = zip(estimate.coordinates, self.design, pads, strict=True)
+        return SkinCoordinates(*map(np.concatenate, parts))
 
     def _add_priors(
         self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
     ) -> None:
         """Add the priors; `design_jacobian` (M, 3, 53): marker minus design, at fixed skin coordinates."""
-        count = len(estimate.points)
-        first = NUM_PARAMETERS
+        first, count = NUM_PARAMETERS, len(estimate.points)
+        by_marker = np.eye(3 * count).reshape(count, 3, -1)
         result.shared[:first, :first] += self.precision
         result.shared_gradient[:first] += self.precision @ estimate.parameters
-        jacobian = np.concatenate([design_jacobian, np.zeros((count, 3, 3 * count))], axis=2)
-        heights = np.zeros((count, result.shared.shape[0]))
-        for marker in range(count):
-            mine = slice(first + 3 * marker, first + 3 * marker + 3)
-            jacobian[marker, :, mine] = np.eye(3)
-            heights[marker, mine] = fit.normals[marker]
-        columns = [self._apply_position_precision(fit, jacobian[..., s]) for s in range(jacobian.shape[2])]
-        weighted = np.stack(columns, axis=-1)
+        jacobian = np.concatenate([design_jacobian, by_marker], axis=2)
+        weighted = self._position_precision(fit) @ jacobian
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
-        result.shared[:] += heights.T @ heights / self.height_spread**2
-        result.shared_gradient[:] += (
-            (estimate.coordinates.heights - self.heights) @ heights / self.height_spread**2
-        )
+        lifts, higher = np.einsum("mi,mis->ms", fit.normals, by_marker), estimate.coordinates.heights
+        result.shared[first:, first:] += lifts.T @ lifts / self.height_spread**2
+        result.shared_gradient[first:] += (higher - self.heights) @ lifts / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         result.pose[:, 6:, 6:] += self._pose_precision
         angles = np.arange(6, 26)
         result.pose[:, angles, angles] += (beyond != 0.0) / _LIMIT_SPREAD**2
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
 
-    def _add_contacts(
-        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64], result: NormalEquations
-    ) -> None:
-        """Add each contact's gap; `rest` (2 K, 3, 53): jacobian of the pads' rest points."""
-        contacts, geometry = estimate.contacts, fit.geometry
-        assert contacts is not None
-        assert geometry is not None
-        frames, rows, count = contacts.frames, np.arange(len(contacts.frames)), len(contacts.frames)
-        coordinates = self._all_coordinates(estimate)
-        pads = SkinCoordinates(*(values[len(values) - 2 * count :] for values in coordinates))
+    def _gap_jacobians(
+        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
+        """Jacobians of the gaps by poses (K, 26) and parameters (K, 53), given those of points at rest."""
+        frames, count = estimate.contacts.frames, len(estimate.contacts.frames)
+        rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        jacobians = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
-        pose, shape = (
-            np.einsum("ki,kis->ks", geometry.directions, by[rows, count + rows] - by[rows, rows])
-            for by in jacobians[:2]
-        )
-        shared = np.pad(shape, ((0, 0), (0, result.shared.shape[0] - NUM_PARAMETERS)))
-        precision = (contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2)[:, None]
-        pull = precision * geometry.gaps[:, None]
-        np.add.at(result.pose, frames, (precision * pose)[:, :, None] * pose[:, None])
-        np.add.at(result.mixed, frames, (precision * pose)[:, :, None] * shared[:, None])
-        np.add.at(result.pose_gradient, frames, pull * pose)
-        result.shared[:] += shared.T @ (precision * shared)
-        result.shared_gradient[:] += (pull * shared).sum(axis=0)
+        by = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
+        return [
+            np.einsum("ki,kis->ks", fit.geometry.directions, one[rows, count + rows] - one[rows, rows])
+            for one in by[:2]
+        ]
 
     def _point_jacobians(
         self,
@@ -337,11 +309,7 @@ class Problem:
         weights: NDArray[np.float64],
         rest: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Jacobians of skinned points in some frames (T, M, 3, ...) by poses, parameters and rest points.
-
-        Also where each bone alone would put them (T, M, L, 3). `rest` (M, 3, 53) is the jacobian of the rest
-        points by the parameters.
-        """
+        """Jacobians of skinned points by poses, parameters and rest points, and the points by each bone."""
         bones, qpos = fit.bones[frames], estimate.qpos[frames]
         by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
         all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
@@ -365,28 +333,21 @@ class Problem:
         )
 
 
-def _part(corners: Corners, first: int, last: int) -> Corners:
-    return Corners(corners.points[first:last], corners.normals[first:last])
-
-
-class Contacts(NamedTuple):
-    """K contacts of the thumb, each in one frame, with a point on either pad."""
-
-    frames: Int[np.ndarray, "K"]
-    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
-    thumb_coordinates: SkinCoordinates
-    finger_coordinates: SkinCoordinates
+def first_estimate(
+    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
+) -> tuple[Problem, Estimate]:
+    """The problem of a right hand's labeled markers [m] with its options, and the hand as it is."""
+    worn, coordinates = hand.attachment, nearest_coordinates(hand.attachment.points, hand.shape)
+    problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
+    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, qpos)
 
 
 class ContactGeometry(NamedTuple):
     """How the pads of K contacts lie to each other in the world."""
 
-    directions: Float[np.ndarray, "K 3"]
-    """Unit vectors from thumb to finger."""
-    gaps: Float[np.ndarray, "K"]
-    """Distance of the pads, both compressed by `PAD_COMPRESSION` [m]; negative where they press harder."""
-    facing: Bool[np.ndarray, "K"]
-    """Whether the points are on the last bones and face each other."""
+    directions: Float[np.ndarray, "K 3"]  # unit vectors from thumb to finger
+    gaps: Float[np.ndarray, "K"]  # distance of the compressed pads [m]; negative where they press harder
+    facing: Bool[np.ndarray, "K"]  # whether the points are on the last bones and face each other
 
 
 def find_touches(
@@ -423,9 +384,7 @@ def _speed(
     model: HandModel, angles: NDArray[np.float64], finger: str, window: int, rate: float
 ) -> NDArray[np.float64]:
     """Speed of the finger's tip in the frame of the thumb's last bone (T,) [m/s]."""
-    qpos = np.zeros((len(angles), 27))
-    qpos[:, 3], qpos[:, 7:] = 1.0, angles
-    bones = model.forward_kinematics(qpos)
+    bones = model.forward_kinematics(join_qpos(angles))
     thumb, other = bones_of("thumb")[2], bones_of(finger)[2]
     tip = bones[:, other, :3, 3] + model.skeleton.lengths[other] * bones[:, other, :3, 0]
     position = np.einsum("tji,tj->ti", bones[:, thumb, :3, :3], tip - bones[:, thumb, :3, 3])
@@ -447,10 +406,11 @@ def initialize_contacts(
             bone = bones_of(digit)[2]
             local = np.linalg.inv(T_world_bone[number, bone]) @ np.append(ends[part], 1.0)
             points[part, number] = (model.rest_transforms[bone] @ local)[:3]
-    sides = [nearest_coordinates(side, model.shape)._replace(heights=np.zeros(len(side))) for side in points]
+    pads = nearest_coordinates(points.reshape(-1, 3), model.shape)
+    pads = pads._replace(heights=np.zeros(len(pads.faces)))
     frames = np.array([frame for frame, _ in touches], dtype=np.int64)
     fingers = np.array([DIGITS.index(finger) for _, finger in touches], dtype=np.int64)
-    return slide_contacts(Contacts(frames, fingers, *sides), model, T_world_bone)
+    return slide_contacts(Contacts(frames, fingers, pads), model, T_world_bone)
 
 
 def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray[np.float64]:
@@ -473,68 +433,51 @@ def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: s
 def slide_contacts(
     contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Slide the contact points on the skin to where thumb and finger come nearest.
-
-    Each point moves to the point of its skin nearest to a target inside the other pad. A target on the other
-    skin would fail where the skins overlap.
-    """
-    skin = build_skin(model.shape)
-    sides = [contacts.thumb_coordinates, contacts.finger_coordinates]
+    """Slide the contact points on the skin to where thumb and finger come nearest."""
+    # Each moves to where its skin is nearest to a target inside the other pad. A target on the other skin
+    # would fail where the skins overlap.
+    skin, count = build_skin(model.shape), len(contacts.frames)
+    sides = [contacts.pads.part(0, count), contacts.pads.part(count, None)]
     for _ in range(_SLIDE_ROUNDS):
         for own, other in ((0, 1), (1, 0)):
-            inner = sides[other]._replace(heights=np.full(len(contacts.frames), -_PAD_DEPTH))
+            inner = sides[other]._replace(heights=np.full(count, -_PAD_DEPTH))
             points, _ = skin_points(inner, skin.corners(inner.faces))
             blend = _blend_transforms(inner, model, T_world_bone)
             target = np.einsum("kij,kj->ki", blend[:, :, :3], points) + blend[:, :, 3]
             blend = _blend_transforms(sides[own], model, T_world_bone)
             rest = np.linalg.solve(blend[:, :, :3], (target - blend[:, :, 3])[..., None])[..., 0]
             slid = project_onto_skin(sides[own], rest, skin)
-            sides[own] = slid._replace(heights=np.zeros(len(contacts.frames)))
-    return contacts._replace(thumb_coordinates=sides[0], finger_coordinates=sides[1])
+            sides[own] = slid._replace(heights=np.zeros(count))
+    return contacts._replace(pads=SkinCoordinates(*map(np.concatenate, zip(*sides, strict=True))))
 
 
 def contact_geometry(
     contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> ContactGeometry:
     """How the pads lie to each other."""
-    count = len(contacts.frames)
-    points, normals = [], []
-    for part, coordinates in enumerate((contacts.thumb_coordinates, contacts.finger_coordinates)):
-        mine = slice(part * count, (part + 1) * count)
-        rest, normal = skin_points(coordinates, Corners(corners.points[mine], corners.normals[mine]))
-        blend = _blend_transforms(coordinates, model, T_world_bone)
-        points.append(np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3])
-        normals.append(np.einsum("kij,kj->ki", blend[:, :, :3], normal))
+    rest, rest_normals = skin_points(contacts.pads, corners)
+    blend = _blend_transforms(contacts.pads, model, np.concatenate([T_world_bone, T_world_bone]))
+    points = (np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]).reshape(2, -1, 3)
+    normals = np.einsum("kij,kj->ki", blend[:, :, :3], rest_normals).reshape(2, -1, 3)
     direction = normals[0] - normals[1]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     offset = points[1] - points[0]
     along = (offset * direction).sum(axis=1)
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
-    normals = [normal / np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
-    facing = (
-        ((normals[0] * normals[1]).sum(axis=1) < _FACING_COSINE)
-        & (across < _MOST_PAD_OFFSET)
-        & _on_tips(contacts)
-    )
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    # Both points are on last bones, and have not slid away.
+    last = np.array([bones_of(digit)[2] for digit in DIGITS])
+    bones = np.append(np.full(len(offset), last[0]), last[contacts.fingers])
+    on_tips = (skin_weights(contacts.pads)[np.arange(len(bones)), bones] > 0.5).reshape(2, -1).all(axis=0)
+    facing = (normals[0] * normals[1]).sum(axis=1) < _FACING_COSINE
+    facing &= (across < _MOST_PAD_OFFSET) & on_tips
     return ContactGeometry(direction, along + 2.0 * PAD_COMPRESSION, facing)
 
 
-def _on_tips(contacts: Contacts) -> NDArray[np.bool_]:
-    """Whether both points are on last bones and have not slid away (K,)."""
-    last = np.array([bones_of(digit)[2] for digit in DIGITS])
-    rows = np.arange(len(contacts.frames))
-    thumb = skin_weights(contacts.thumb_coordinates)[:, last[0]]
-    finger = skin_weights(contacts.finger_coordinates)[rows, last[contacts.fingers]]
-    tips: NDArray[np.bool_] = np.minimum(thumb, finger) > 0.5
-    return tips
-
-
 def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    """Weight of each contact, 0 to 1: small where its gap is unlike the others of its finger.
-
-    Geman and McClure's weights (1987), around a lower quantile: a touch is the nearest that the thumb comes.
-    Contacts that do not face each other get none.
-    """
+    """Weight of each contact, 0 to 1: small where its gap is unlike the others of its finger."""
+    # Geman and McClure's weights (1987), around a lower quantile: a touch is the nearest that the thumb
+    # comes.
     weights = np.zeros(len(geometry.gaps))
     for finger in np.unique(fingers[geometry.facing]):
         mine = (fingers == finger) & geometry.facing
@@ -560,14 +503,18 @@ def levenberg_marquardt(
     progress: Progress | None,
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
-    """Minimize the energy until a step gains less than a share of it, or step number `most` has been made.
-
-    Returns the estimate, its fit, and the number of the last step; `steps` were made before.
-    """
-    fit, damping, better = problem.fit(estimate), _FIRST_DAMPING, True
-    while better and steps < most:
-        before = fit.cost
-        estimate, fit, damping, better = _step(problem, estimate, fit, damping)
+    """Minimize until a step gains less than a share, or step `most`; with the last step's number."""
+    fit, damping = problem.fit(estimate), _FIRST_DAMPING
+    while steps < most:
+        before, equations = fit.cost, problem.normal_equations(estimate, fit)
+        for _ in range(_MOST_DAMPING_TRIALS):
+            trial = problem.apply_step(estimate, *_damped_step(equations, damping))
+            trial_fit = problem.fit(trial)
+            if trial_fit.cost < before:
+                estimate, fit = _with_slid_contacts(problem, trial, trial_fit)
+                damping = max(_DAMPING_CUT * damping, _LEAST_DAMPING)
+                break
+            damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
         steps += 1
         if progress is not None:
             progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
@@ -584,7 +531,7 @@ def marker_rms(problem: Problem, fit: Fit) -> float:
 
 def contact_gap(estimate: Estimate, fit: Fit) -> float:
     """Weighted RMS gap of the contacts [m], NaN without any."""
-    if estimate.contacts is None or fit.geometry is None:
+    if not len(estimate.contacts.frames):
         return float("nan")
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
     return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
@@ -599,11 +546,7 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 def eliminate_poses(
     equations: NormalEquations, damping: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Schur complement of the poses, with `damping` times the diagonal of their blocks added to it.
-
-    Returns the reduced system with its gradient as last column (S, S + 1), and the poses' blocks solved for
-    the shared unknowns and the gradient (F, 26, S + 1).
-    """
+    """The damped poses' Schur complement (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])
     pose[:, diagonal, diagonal] *= 1.0 + damping
@@ -621,33 +564,19 @@ def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[n
     return np.linalg.inv(reduced[:, :-1])
 
 
-def _step(
-    problem: Problem, estimate: Estimate, fit: Fit, damping: float
-) -> tuple[Estimate, Fit, float, bool]:
-    """One step: the new estimate, its fit, the next damping, and whether the energy fell."""
-    equations = problem.normal_equations(estimate, fit)
-    for _ in range(_MOST_DAMPING_TRIALS):
-        reduced, solved = eliminate_poses(equations, damping)
-        system, gradient = reduced[:, :-1].copy(), reduced[:, -1]
-        diagonal = np.arange(len(system))
-        system[diagonal, diagonal] += damping * equations.shared[diagonal, diagonal]
-        shared = -np.linalg.solve(system, gradient)
-        poses = -solved[..., -1] - solved[..., :-1] @ shared
-        trial = problem.apply_step(estimate, poses, shared)
-        trial_fit = problem.fit(trial)
-        if trial_fit.cost < fit.cost:
-            return (
-                *_with_slid_contacts(problem, trial, trial_fit),
-                max(_DAMPING_CUT * damping, _LEAST_DAMPING),
-                True,
-            )
-        damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
-    return estimate, fit, damping, False
+def _damped_step(
+    equations: NormalEquations, damping: float
+) -> tuple[Float[np.ndarray, "F 26"], Float[np.ndarray, "S"]]:
+    """The step of the poses (F, 26) and that of the shared unknowns (S,)."""
+    reduced, solved = eliminate_poses(equations, damping)
+    system = reduced[:, :-1] + np.diag(damping * equations.shared.diagonal())
+    shared = -np.linalg.solve(system, reduced[:, -1])
+    return -solved[..., -1] - solved[..., :-1] @ shared, shared
 
 
 def _with_slid_contacts(problem: Problem, estimate: Estimate, fit: Fit) -> tuple[Estimate, Fit]:
     """The estimate after its contact points have slid on the skin, and its fit."""
-    if estimate.contacts is None:
+    if not len(estimate.contacts.frames):
         return estimate, fit
     contacts = slide_contacts(estimate.contacts, fit.model, fit.bones[estimate.contacts.frames])
     slid = dataclasses.replace(estimate, contacts=contacts)

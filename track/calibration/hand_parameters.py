@@ -91,10 +91,7 @@ def skinned_shape_jacobian(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> Float[np.ndarray, "T M 3 53"]:
-    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed.
-
-    A longer bone moves all bones beyond it, in the pose and at rest.
-    """
+    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed."""
     homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
     def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
@@ -115,10 +112,7 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """Blended rotations of skinned points, and the position that each bone alone would give them [m].
-
-    The hand is a right one, rest points [m] are in the wrist's frame.
-    """
+    """Blended rotations of skinned points, and the position that each bone alone would give them [m]."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
@@ -132,7 +126,6 @@ class SkinTopology(NamedTuple):
     subdivide: sparse.csr_array  # matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
     adjacent: Int[np.ndarray, "F 3"]  # the triangle beyond the edge opposite to each corner
-    vertex_faces: Int[np.ndarray, "V A"]  # triangles at each vertex, the last one repeated
     weights: Float[np.ndarray, "V 16"]  # skinning weights of all bones
 
 
@@ -143,12 +136,20 @@ class SkinCoordinates(NamedTuple):
     bary: Float[np.ndarray, "P 3"]  # barycentric coordinates of the foot points
     heights: Float[np.ndarray, "P"]  # above the skin, along the normal [m]
 
+    def part(self, first: int, last: int | None) -> SkinCoordinates:
+        """Those of some of the points."""
+        return SkinCoordinates(*(values[first:last] for values in self))
+
 
 class Corners(NamedTuple):
     """Corners of some triangles on one hand's skin."""
 
     points: Float[np.ndarray, "P 3 3"]  # in the wrist's frame [m]
     normals: Float[np.ndarray, "P 3 3"]  # unit vertex normals
+
+    def part(self, first: int, last: int | None) -> Corners:
+        """Those of some of the triangles."""
+        return Corners(self.points[first:last], self.normals[first:last])
 
 
 class Skin(NamedTuple):
@@ -174,9 +175,7 @@ def skin_mesh() -> SkinTopology:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     weights = np.zeros((len(coarse.vertices), NUM_BONES))
     np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
-    return SkinTopology(
-        step, faces, _adjacent_faces(faces), _vertex_faces(faces, step.shape[0]), step @ weights
-    )
+    return SkinTopology(step, faces, _adjacent_faces(faces), step @ weights)
 
 
 def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -189,27 +188,12 @@ def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return neighbors.reshape(faces.shape)
 
 
-def _vertex_faces(faces: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Triangles (V, A) at each of `count` vertices, the last one repeated."""
-    vertex, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    order = np.argsort(vertex, kind="stable")
-    number = np.bincount(vertex, minlength=count)
-    first = np.cumsum(number) - number
-    slots = np.minimum(np.arange(number.max()), number[:, None] - 1)
-    vertex_faces: NDArray[np.int64] = face[order][first[:, None] + slots]
-    return vertex_faces
-
-
 class SkinPatch:
-    """The part of the skin that determines some triangles and their normals, for any shape.
-
-    Args:
-        faces: Triangles of `skin_mesh`.
-    """
+    """The part of the skin that determines some triangles of `skin_mesh`, for any shape."""
 
     def __init__(self, faces: Int[np.ndarray, "P"]) -> None:
         mesh = skin_mesh()
-        needed = np.unique(mesh.vertex_faces[mesh.faces[faces]])
+        needed = np.isin(mesh.faces, mesh.faces[faces]).any(axis=1)  # the triangles around a vertex
         vertices, local = np.unique(mesh.faces[needed], return_inverse=True)
         self._rows = mesh.subdivide[vertices]
         self._faces = local.reshape(-1, 3)
@@ -256,20 +240,6 @@ def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: Han
     return Attachment(layout, points, normals, bones, shares / shares.sum(axis=1, keepdims=True))
 
 
-def displace_markers(
-    worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
-) -> Attachment:
-    """A glove on a right hand with every marker displaced along the skin, as on a real glove."""
-    steps = rng.normal(size=worn.points.shape)
-    steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
-    steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)
-    coordinates = project_onto_skin(
-        nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
-    )
-    heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
-    return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)
-
-
 def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Float[np.ndarray, "P 16 3"]:
     """Derivative of the skinning weights by the point's position in the wrist's frame [1/m]."""
     mesh = skin_mesh()
@@ -297,11 +267,8 @@ def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[n
 def project_onto_skin(
     coordinates: SkinCoordinates, targets: Float[np.ndarray, "P 3"], skin: Skin
 ) -> SkinCoordinates:
-    """Coordinates of points, by Newton steps that walk from triangle to adjacent triangle.
-
-    The height of a point is its signed distance along the normal. Where the skin folds and the walk does not
-    converge, the foot point stays on the last edge. Targets are in the wrist's frame [m].
-    """
+    """Coordinates of points [m], by Newton steps that walk from triangle to adjacent triangle."""
+    # Where the skin folds and the walk does not converge, the foot point stays on the last edge.
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
     active = np.arange(len(faces))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
@@ -35,6 +35,7 @@ from track.calibration.energy import (
     contact_geometry,
     contact_weights,
     find_touches,
+    first_estimate,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -45,27 +46,23 @@ from track.calibration.hand_parameters import (
     LENGTH,
     NUM_PARAMETERS,
     SkinPatch,
-    nearest_coordinates,
     shape_at,
     shape_jacobian,
     skin_points,
     skin_weights,
 )
-from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_solver import PoseFit, PoseSolver
 
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
-MOST_STEPS: Final = 30
-"""Steps in all, at most."""
+MOST_STEPS: Final = 30  # steps in all, at most
 _SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
 _BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
 _SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
-NUM_FRAMES: Final = 240
-"""Frames that a calibration is solved on."""
-FEWEST_FRAMES: Final = 100
-"""Usable frames without which a capture is refused."""
+NUM_FRAMES: Final = 240  # frames that a calibration is solved on
+FEWEST_FRAMES: Final = 100  # usable frames without which a capture is refused
 _INITIAL_FRAMES: Final = 800
 _FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
 _LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
@@ -199,27 +196,29 @@ def calibrate_hand(
     mirror = MIRROR if start.side == "left" else np.eye(3)
     markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
-    complete = complete_digits(markers, right.attachment)
+    seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)
     # Poses of frames spread over the capture, on the hand that the calibration begins with.
-    track = solve_frames(markers, right, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
-    problem, estimate = _initial_problem(markers, right, track)
+    some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
+    track = PoseSolver(right).solve(some)
+    chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
+    problem, estimate = first_estimate(right, some[chosen], track.qpos[chosen], **scales)
     # Distant markers lose their weight only when the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
     rough = user_hand(right, problem, estimate)
-    rough_track = solve_frames(markers, rough, usable)
-    touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
-    problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
+    rough_track = PoseSolver(rough).solve(seen)
+    touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
+    problem, estimate = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
         learn_spreads(problem, estimate, problem.fit(estimate))
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)
     before = np.empty(0)
     if touches:
-        touching = usable[[frame for frame, _ in touches]]
-        before = contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
-    final = solve_frames(markers, done, usable, rough_track.qpos)
+        touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
+        before = contact_gaps(right.model, touches, touching.qpos)
+    final = PoseSolver(done).solve(seen, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
         hand=done.with_side(start.side),
@@ -229,27 +228,9 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        touches=_touches(estimate, fit, touches, rough_track.frames, before, mirror),
-        still_joints=still_joints(final.qpos[:, 7:], complete[usable], done.model),
+        touches=_touches(estimate, fit, touches, usable, before, mirror),
+        still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
-
-
-def _initial_problem(
-    markers: NDArray[np.float64], right: GloveFit, track: PoseTrack
-) -> tuple[Problem, Estimate]:
-    """The problem without contacts, and the estimate that the first poses give."""
-    chosen = informative_frames(track, markers)
-    shape, worn = right.model.shape, right.attachment
-    coordinates = nearest_coordinates(worn.points, shape)
-    problem = Problem(
-        shape,
-        coordinates,
-        worn.layout.heights,
-        markers[track.frames[chosen]],
-        noise=_FIRST_NOISE,
-        robust_scale=_FIRST_SCALE,
-    )
-    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, track.qpos[chosen])
 
 
 def _with_touches(
@@ -257,13 +238,11 @@ def _with_touches(
     estimate: Estimate,
     fit: Fit,
     markers: NDArray[np.float64],
-    track: PoseTrack,
+    track: PoseFit,
     touches: list[tuple[int, str]],
 ) -> tuple[Problem, Estimate]:
-    """The problem with the frames of the touches, at the noise of the first fit.
-
-    The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
-    """
+    """The problem with the frames of the touches, at the noise of the first fit."""
+    # The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
     noise = marker_noise(problem, fit)
     chosen = informative_frames(track, markers)
     touching = np.array([frame for frame, _ in touches], dtype=np.int64)
@@ -274,7 +253,7 @@ def _with_touches(
         problem.shape,
         problem.design,
         problem.heights,
-        markers[track.frames[frames]],
+        markers[frames],
         noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
     )
@@ -296,29 +275,14 @@ def _touches(
     mirror: NDArray[np.float64],
 ) -> tuple[Touch, ...]:
     """The touches with their gaps on the first and on the calibrated hand."""
-    if estimate.contacts is None or fit.geometry is None:
-        return ()
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-    sides: list[NDArray[np.float64]] = []
-    for coordinates in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates):
-        sides.append(
-            skin_points(coordinates, SkinPatch(coordinates.faces).corners(fit.model.surface.vertices))[0]
-            @ mirror
-        )
-    points, after = np.stack(sides, axis=1), fit.geometry.gaps
+    pads, after = estimate.contacts.pads, fit.geometry.gaps
+    ends, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
+    points = (ends @ mirror).reshape(2, -1, 3).swapaxes(0, 1)
     return tuple(
         Touch(int(frames[frame]), finger, float(before[k]), float(after[k]), float(weights[k]), points[k])
         for k, (frame, finger) in enumerate(touches)
     )
-
-
-class PoseTrack(NamedTuple):
-    """Poses of K frames of a capture."""
-
-    frames: Int[np.ndarray, "K"]  # their numbers in the capture
-    qpos: Float[np.ndarray, "K 27"]
-    rms: Float[np.ndarray, "K"]  # 3D RMS distance of the markers from the model's [m]
-    residuals: Float[np.ndarray, "K M 3"]  # model minus marker [m], NaN where a marker is missing
 
 
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
@@ -334,17 +298,6 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
     return usable
 
 
-def solve_frames(
-    markers: Float[np.ndarray, "T M 3"],
-    hand: GloveFit,
-    frames: NDArray[np.int64],
-    initial: NDArray[np.float64] | None = None,
-) -> PoseTrack:
-    """Solve the poses of frames by their numbers, from initial poses (K, 27) if there are any."""
-    solved = PoseSolver(hand).solve(markers[frames], initial)
-    return PoseTrack(frames, solved.qpos, solved.rms, solved.residuals)
-
-
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
     """Whether all markers of a digit are seen."""
     present = np.isfinite(markers[..., 0])
@@ -352,12 +305,9 @@ def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment)
     return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
-def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
-    """Indices into a track of up to `NUM_FRAMES` frames with poses as different as possible.
-
-    Frames without missing markers are preferred; frames with an unusual RMS are left out.
-    """
-    missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
+def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
+    """Indices into a track of well fitted frames, poses as different and complete as possible."""
+    missing = np.isnan(markers[..., 0]).sum(axis=1)
     well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
         candidates = np.flatnonzero((missing <= allowed) & well_fitted)
@@ -382,12 +332,9 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
 
 
 def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray, "T M 3"]) -> float:
-    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints.
-
-    It is the correlation of each frame's residuals, in the wrist's frame, with those of the frame whose joint
-    angles are nearest. Noise that is independent from frame to frame gives zero. There are two poses at
-    least.
-    """
+    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints."""
+    # It is the correlation, in the wrist's frame, with the frame whose joint angles are nearest. Noise that
+    # is independent from frame to frame gives zero.
     from scipy.spatial import cKDTree
 
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
@@ -398,10 +345,7 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
 
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
-    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992).
-
-    Each marker counts as far as the data determine its place, beside a few of the usual spread.
-    """
+    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992)."""
     covariance = shared_covariance(problem, estimate, fit)
     own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
     blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
@@ -429,10 +373,9 @@ def _learned(
 def standard_errors(
     problem: Problem, estimate: Estimate, fit: Fit
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m].
-
-    Where the wrist is in the palm is a convention: of the palm's markers it is the error among the knuckles.
-    """
+    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
+    # Where the wrist is in the palm is a convention: of the palm's markers it is the error among the
+    # knuckles.
     covariance = shared_covariance(problem, estimate, fit)
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
@@ -452,10 +395,8 @@ def standard_errors(
     count = len(bones)
     jacobian = np.zeros((count, 3, len(covariance)))
     jacobian[..., :NUM_PARAMETERS] = shape_jacobian(problem.shape, estimate.parameters, on_bones)
-    rotations = fit.model.rest_transforms[bones][:, :3, :3].swapaxes(1, 2)
-    for marker in range(count):
-        first = NUM_PARAMETERS + 3 * marker
-        jacobian[marker, :, first : first + 3] = rotations[marker]
+    by_place = jacobian[..., NUM_PARAMETERS:].reshape(count, 3, count, 3)
+    by_place[range(count), :, range(count)] = fit.model.rest_transforms[bones, :3, :3].swapaxes(1, 2)
     positions = np.sqrt(np.einsum("mis,st,mit->m", jacobian, covariance, jacobian, optimize=True))
     own = covariance[BONE_LENGTHS, BONE_LENGTHS].diagonal()
     logs = own + covariance[LENGTH, LENGTH] + 2.0 * covariance[BONE_LENGTHS, LENGTH]
@@ -468,8 +409,8 @@ def contact_gaps(
     """Gaps between thumb and finger (K,) [m] of touches on a right hand, in the poses (K, 27) of each."""
     bones = model.forward_kinematics(qpos)
     contacts = initialize_contacts(model, touches, bones)
-    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
-    return contact_geometry(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
+    corners = SkinPatch(contacts.pads.faces).corners(model.surface.vertices)
+    return contact_geometry(contacts, corners, model, bones).gaps
 
 
 def still_joints(

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import BONES, NUM_BONES, NUM_JOINTS
-from handsim.kernels import kernel, multiply_rotations, rotate_quaternion
+from handsim.kernels import kernel, multiply_rotations, quaternion_product, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
@@ -36,66 +36,41 @@ _MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from ther
 class HandArrays(NamedTuple):
     """A hand and its glove as plain arrays: L bones, J = 20 hinges, M markers."""
 
-    offsets: Float[np.ndarray, "L 3"]
-    """Origin of each bone in its parent's frame [m]."""
-    rotations: Float[np.ndarray, "L 3 3"]
-    """Rotation of each bone in its parent's frame, all hinges at zero."""
-    axes: Float[np.ndarray, "J 3"]
-    """Unit axis of each hinge in the frame of its bone."""
-    ranges: Float[np.ndarray, "J 2"]
-    """Lower and upper limit of each hinge [rad]."""
-    bones: Int[np.ndarray, "M 4"]
-    """The bones that carry each marker, largest weight first; -1 where there is no further one."""
-    bone_weights: Float[np.ndarray, "M 4"]
-    """Skinning weight of each of these bones; they sum to one."""
-    positions: Float[np.ndarray, "M 4 3"]
-    """Position of each marker in the frames of its bones [m], times the bone's weight."""
-    digits: Int[np.ndarray, "M"]
-    """Digit of the bone with the largest weight; -1 for the palm."""
-    hinge_span: Int[np.ndarray, "M 2"]
-    """First hinge that may move each marker, and the one after the last."""
-    skyline: Int[np.ndarray, "26"]
-    """Column of the first entry of each row of the normal matrix that can differ from zero."""
+    offsets: Float[np.ndarray, "L 3"]  # origin of each bone in its parent's frame [m]
+    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all hinges at zero
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge in the frame of its bone
+    ranges: Float[np.ndarray, "J 2"]  # lower and upper limit of each hinge [rad]
+    bones: Int[np.ndarray, "M 4"]  # bones that carry each marker, largest weight first; -1 for none
+    bone_weights: Float[np.ndarray, "M 4"]  # skinning weight of each of these bones; they sum to one
+    positions: Float[np.ndarray, "M 4 3"]  # each marker in the frames of its bones [m], times the weight
+    digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
+    hinge_span: Int[np.ndarray, "M 2"]  # first hinge that may move each marker, and the one after the last
+    skyline: Int[np.ndarray, "26"]  # first column of each row of the normal matrix that can be nonzero
 
 
 class Workspace(NamedTuple):
     """Buffers for one pose: bones and markers in the wrist's frame, and the equations of its next step."""
 
-    rotations: Float[np.ndarray, "L 3 3"]
-    """Rotation of each bone."""
-    origins: Float[np.ndarray, "L 3"]
-    """Origin of each bone [m]."""
-    axes: Float[np.ndarray, "J 3"]
-    """Unit axis of each hinge."""
-    bone_terms: Float[np.ndarray, "M 4 3"]
-    """Each bone's term of the weighted sum that is a marker's position [m]."""
-    markers: Float[np.ndarray, "M 3"]
-    """Position of each marker [m]."""
-    residuals: Float[np.ndarray, "M 3"]
-    """Model marker minus target marker [m]; NaN where the target is missing."""
-    jacobian: Float[np.ndarray, "M 3 26"]
-    """Derivatives of the markers by the unknowns [m/rad, m/m]."""
-    normal: Float[np.ndarray, "26 26"]
-    """Normal matrix, upper triangle; zero between digits that share no marker."""
-    gradient: Float[np.ndarray, "26"]
-    """Half the gradient of the cost."""
-    factor: Float[np.ndarray, "26 26"]
-    """Room for a factor of the normal matrix."""
-    step: Float[np.ndarray, "26"]
-    """Step of the unknowns [rad, m]."""
+    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone
+    origins: Float[np.ndarray, "L 3"]  # origin of each bone [m]
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge
+    bone_terms: Float[np.ndarray, "M 4 3"]  # each bone's term of the weighted sum that is a marker [m]
+    markers: Float[np.ndarray, "M 3"]  # position of each marker [m]
+    residuals: Float[np.ndarray, "M 3"]  # model minus target marker [m]; NaN where that is missing
+    jacobian: Float[np.ndarray, "M 3 26"]  # derivatives of the markers by the unknowns [m/rad, m/m]
+    normal: Float[np.ndarray, "26 26"]  # upper triangle; zero between digits that share no marker
+    gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
+    factor: Float[np.ndarray, "26 26"]  # room for a factor of the normal matrix
+    step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
 
 
 class PoseEnergy(NamedTuple):
     """What a pose is fitted to: markers, and a prior."""
 
-    target: Float[np.ndarray, "M 3"]
-    """Markers in the world [m]; NaN where missing."""
-    prior_mean: Float[np.ndarray, "27"]
-    """Mean of the prior, a pose."""
-    precision: Float[np.ndarray, "26"]
-    """Its diagonal precision, in the order of the unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none."""
-    robust_scale: float
-    """Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for least squares."""
+    target: Float[np.ndarray, "M 3"]  # markers in the world [m]; NaN where missing
+    prior_mean: Float[np.ndarray, "27"]  # mean of the prior, a pose
+    precision: Float[np.ndarray, "26"]  # its precision by unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none
+    robust_scale: float  # inverse square distance where the robust loss levels off [1/m^2]; zero for none
 
 
 def hand_arrays(fit: GloveFit) -> HandArrays:
@@ -351,10 +326,7 @@ def _linearize(
     weights: Float[np.ndarray, "M"],
     work: Workspace,
 ) -> None:
-    """Normal matrix and half gradient at the pose for which `marker_residuals` was last called.
-
-    The robust loss is taken into account by reweighting; `weights` [1/m^2] is a buffer and is overwritten.
-    """
+    """Normal matrix and half gradient where `marker_residuals` was last called; `weights` is a buffer."""
     precision = energy.precision
     for marker in range(len(weights)):
         residual = work.residuals[marker]
@@ -379,10 +351,7 @@ def _linearize(
 
 @kernel
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
-    """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
-
-    Returns the expected decrease of the cost; a negative number when the matrix has no factor.
-    """
+    """Solve the damped equations by a skyline Cholesky factor; the expected gain, negative for none."""
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):
         start, own = skyline[row], factor[row]
@@ -413,10 +382,7 @@ def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> f
 def move_wrist(
     qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
 ) -> None:
-    """Write the wrist of a pose after the last six unknowns of a step to the first seven numbers of another.
-
-    The step [rad, m, rad] translates and rotates the wrist along its own axes.
-    """
+    """Write the wrist of a pose after a step, which is along the wrist's own axes, to another pose."""
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
     i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
@@ -430,31 +396,23 @@ def move_wrist(
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:
-    """Fill the last six numbers of a step: translation and rotation of the wrist from one pose to another.
-
-    They are along its axes in the second; the rotation is to first order, twice the vector part of the
-    quaternion.
-    """
+    """Fill the step of the wrist from one pose to another, along its axes in the second."""
+    # The rotation is to first order: twice the vector part of the quaternion.
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
     i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
     step[NUM_JOINTS] = a + 2.0 * (w * i + j * z - k * y)
     step[NUM_JOINTS + 1] = b + 2.0 * (w * j + k * x - i * z)
     step[NUM_JOINTS + 2] = c + 2.0 * (w * k + i * y - j * x)
-    p, q, r, s = before[3], -before[4], -before[5], -before[6]
-    e = p * w - q * x - r * y - s * z
+    e, i, j, k = quaternion_product(before[3], -before[4], -before[5], -before[6], w, x, y, z)
     share = 2.0 if e >= 0.0 else -2.0
-    step[NUM_JOINTS + 3] = share * (p * x + q * w + r * z - s * y)
-    step[NUM_JOINTS + 4] = share * (p * y - q * z + r * w + s * x)
-    step[NUM_JOINTS + 5] = share * (p * z + q * y - r * x + s * w)
+    step[NUM_JOINTS + 3], step[NUM_JOINTS + 4], step[NUM_JOINTS + 5] = share * i, share * j, share * k
 
 
 @kernel
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
-    """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read.
-
-    A call of LAPACK costs more than the inverse of so small a matrix.
-    """
+    """Overwrite a symmetric positive-definite matrix, given by its lower triangle, by its inverse."""
+    # A call of LAPACK costs more than the inverse of so small a matrix.
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):
@@ -483,11 +441,7 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
-    """Eliminate unknowns `first` to before `last` of a symmetric positive-definite system (Schur complement).
-
-    Matrix and right side are overwritten; the block below and right of the eliminated unknowns stays
-    symmetric and complete.
-    """
+    """Eliminate unknowns `first` to before `last` of a positive-definite system; the rest stays symmetric."""
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]
         for row in range(pivot + 1, len(matrix)):

@@ -33,12 +33,10 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 
-FEWEST_MARKERS: Final = 4
-"""Least number of markers of a frame for a pose to be solved."""
+FEWEST_MARKERS: Final = 4  # least number of markers of a frame for a pose to be solved
 FEWEST_ON_PART: Final = 3
 """Markers that determine a digit's hinges, also when it is straight, or a palm's pose."""
-RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
-"""Hinge angles of a relaxed hand [rad]."""
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # hinge angles of a relaxed hand [rad]
 # Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
 # knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
 # finger, opposed, opposed and bent, across the palm.
@@ -74,12 +72,9 @@ _ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all 
 class _StartingShapes(NamedTuple):
     """K hand shapes with the wrist at the origin, and the positions of their markers."""
 
-    angles: Float[np.ndarray, "K 20"]
-    """Hinge angles [rad]."""
-    markers: Float[np.ndarray, "K M 3"]
-    """Markers in the wrist's frame [m]."""
-    weights: Float[np.ndarray, "M"]
-    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
+    angles: Float[np.ndarray, "K 20"]  # hinge angles [rad]
+    markers: Float[np.ndarray, "K M 3"]  # markers in the wrist's frame [m]
+    weights: Float[np.ndarray, "M"]  # of each marker in aligning whole hands [1/m^2]: small if shapes differ
 
 
 class _PosePrior(NamedTuple):
@@ -108,22 +103,11 @@ class PoseFit:
     """Steps tried, over all starts of a frame."""
 
 
-class AnglePrior(NamedTuple):
-    """Independent normal priors of the hinges, for digits that lack a marker or have under three."""
-
-    angles: Float[np.ndarray, "T 20"]
-    """Mean angles [rad]."""
-    spread: float
-    """Their standard deviation [rad]."""
-
-
 class PoseSolver:
-    """Solves poses of one hand in one glove; precomputes what does not depend on the frame.
+    """Solves poses of one hand in one glove; precomputes what does not depend on the frame."""
 
-    Args:
-        outlier_distance: Scale [m] of a robust loss (Geman and McClure 1987), so that a wrong label does not
-            bend the hand; it needs a good start. Plain least squares when not given.
-    """
+    # The outlier distance [m] is the scale of a robust loss (Geman and McClure 1987), so that a wrong label
+    # does not bend the hand; it needs a good start. Without it a fit is plain least squares.
 
     def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
         self.hand: HandArrays = hand_arrays(fit)
@@ -143,17 +127,18 @@ class PoseSolver:
         targets: Float[np.ndarray, "T M 3"],
         initial: Float[np.ndarray, "T 27"] | None = None,
         *,
-        prior: AnglePrior | None = None,
+        prior: tuple[Float[np.ndarray, "T 20"], float] | None = None,
         iterations: int = _MOST_STEPS,
     ) -> PoseFit:
         """Solve the poses of frames with four markers or more, each by itself; see `solve_pose`."""
+        # The prior is that of digits that lack a marker or have under three: mean angles, their spread [rad].
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
         starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
         known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST)
         if prior is not None:
-            precision = np.full(prior.angles.shape, np.asarray(prior.spread) ** -2)
-            known = _PosePrior(np.array(prior.angles, order="C"), precision, _NO_WRIST)
+            precision = np.full(prior[0].shape, np.asarray(prior[1]) ** -2)
+            known = _PosePrior(np.array(prior[0], order="C"), precision, _NO_WRIST)
         return self._run(targets, starts, known, iterations, _CONVERGED)
 
     def solve_frame(
@@ -179,16 +164,14 @@ class PoseSolver:
         small_gain: float,
     ) -> PoseFit:
         """Solve with the arrays of the kernel."""
-        scale, frames = self._robust_scale, (targets, starts, prior)
-        return PoseFit(
-            *_fit_frames(self.hand, self._shapes, self.on_part, *frames, scale, iterations, small_gain)
-        )
+        whole = np.isfinite(targets).all(axis=-1, keepdims=True)
+        frames = np.where(whole, targets, np.nan), starts, prior
+        steps = self._robust_scale, iterations, small_gain
+        return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, *frames, *steps))
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
-        positions = np.empty((len(self.hand.digits), 3))
-        _write_world_markers(self.hand, np.array(qpos, dtype=np.float64), positions)
-        return positions
+        return _world_markers(self.hand, np.array(qpos, dtype=np.float64))
 
 
 def solve_pose(
@@ -244,21 +227,16 @@ def _fit_frames(
     robust_scale: float,
     iterations: int,
     small_gain: float,
-) -> tuple[
-    Float[np.ndarray, "T 27"],
-    Float[np.ndarray, "T"],
-    Float[np.ndarray, "T M 3"],
-    Int[np.ndarray, "T"],
-]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Solve frames one by one; the result has the fields of a `PoseFit`."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
-    mean, precision, seen = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS), np.empty(len(on_part), dtype=np.int64)
-    work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
+    mean, precision = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS)
+    work, pose = workspace(count), np.empty(NUM_QPOS)
     for frame in range(frames):
-        present = _read_markers(hand.digits, targets[frame], target, seen)
-        _set_prior(seen, on_part, prior, frame, mean, precision)
+        target = targets[frame]
+        present = _set_prior(hand.digits, on_part, target, prior, frame, mean, precision)
         if len(initial) > 0:
             starts = initial[frame : frame + 1].copy()
             starts[0, 3:7] /= np.sqrt((starts[0, 3:7] ** 2).sum())
@@ -286,38 +264,20 @@ def _fit_frames(
 
 
 @kernel
-def _read_markers(
-    digits: Int[np.ndarray, "M"],
-    given: Float[np.ndarray, "M 3"],
-    target: Float[np.ndarray, "M 3"],
-    seen: Int[np.ndarray, "6"],
-) -> int:
-    """Copy the markers of one frame to `target`, each complete or NaN, and return how many are present.
-
-    `seen` is filled with how many are present on each digit and on the palm (last).
-    """
-    seen[:] = 0
-    present = 0
-    for marker in range(len(given)):
-        if np.isfinite(given[marker, 0] + given[marker, 1] + given[marker, 2]):
-            target[marker] = given[marker]
-            present += 1
-            seen[digits[marker]] += 1
-        else:
-            target[marker] = np.nan
-    return present
-
-
-@kernel
 def _set_prior(
-    seen: Int[np.ndarray, "6"],
+    digits: Int[np.ndarray, "M"],
     on_part: Int[np.ndarray, "6"],
+    target: Float[np.ndarray, "M 3"],
     prior: _PosePrior,
     frame: int,
     mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],
-) -> None:
-    """Fill mean and precision of the prior of one frame; see `PoseEnergy`."""
+) -> int:
+    """Fill the prior of a frame, see `PoseEnergy`; return how many markers it has, each complete or NaN."""
+    seen = np.zeros(len(on_part), dtype=np.int64)
+    for marker in range(len(target)):
+        if not np.isnan(target[marker, 0]):
+            seen[digits[marker]] += 1
     mean[:7] = prior.wrist[:7]
     incomplete = seen[-1] < max(on_part[-1], FEWEST_ON_PART)
     precision[NUM_JOINTS : NUM_JOINTS + 3] = prior.wrist[7] if incomplete else 0.0
@@ -331,6 +291,7 @@ def _set_prior(
             rest += (prior.angles[frame, hinge] - rest) * prior.precision[frame, hinge] / both
             weight = both
         mean[7 + hinge], precision[hinge] = rest, weight
+    return int(seen.sum())
 
 
 @kernel
@@ -358,26 +319,22 @@ def _write_residuals(
 
 
 @kernel
-def _write_world_markers(
-    hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
-) -> None:
-    """Write the positions of a pose's markers in the world [m]."""
-    work, wrist = workspace(len(positions)), np.empty((3, 3))
+def _world_markers(hand: HandArrays, pose: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+    """Positions of a pose's markers in the world [m]."""
+    positions, wrist = np.empty((len(hand.digits), 3)), np.empty((3, 3))
+    work = workspace(len(positions))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     compute_markers(hand, pose[7:], work)
     for marker in range(len(positions)):
         positions[marker] = pose[:3] + wrist @ work.markers[marker]
+    return positions
 
 
 @kernel
 def _initial_poses(
     shapes: _StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "S 27"]:
-    """Poses to start from (K + 1, 27) for the markers of one frame, the most likely one first.
-
-    The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
-    aligned with the markers first.
-    """
+    """Poses to start a frame from (K + 1, 27): digits of the nearest shapes, then shapes, best first."""
     count = len(shapes.angles)
     aligned, poses, squares = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS)), np.empty(count)
     for number in range(count):

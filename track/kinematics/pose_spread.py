@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, bones_of
+from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, PALM
 from handsim.kernels import kernel, write_quaternion_matrix
 from poses.shapes import LIBRARIES, gestures_of
 from track.config import HandOrigin
@@ -65,7 +65,10 @@ _CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m], tips last
 _SINGLE: Final = (7.0, 3.0)  # times these, of a digit with one marker
 _LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
 _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
-_CHAIN: Final = 10  # unknowns that move a digit: its four hinges and the wrist
+_NUMBERS: Final = 5 * _OWN + 1  # numbers of a hand that are not known: those of its digits, and its size
+# Unknowns by which a digit's keypoints respond to each number: its own hinges, and the wrist.
+_OWN_UNKNOWNS: Final = np.ones((NUM_UNKNOWNS, _NUMBERS))
+_OWN_UNKNOWNS[:NUM_JOINTS, :-1] = np.kron(np.eye(5), np.ones((4, _OWN)))
 
 
 class JointPrior(NamedTuple):
@@ -84,41 +87,26 @@ class JointPrior(NamedTuple):
 class MarkerPrediction(NamedTuple):
     """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
 
-    qpos: Float[np.ndarray, "27"]
-    """The pose; hinges of digits that lack markers are moved to the optimum of markers and prior."""
-    positions: Float[np.ndarray, "M 3"]
-    """Markers in the world [m]."""
-    covariances: Float[np.ndarray, "M 3 3"]
-    """Covariance of each marker in the world [m^2]: that of the pose, and the marker's own variance."""
-    rotations: Float[np.ndarray, "M 3 3"]
-    """Rotation in the world of the bone with the largest weight of each marker."""
-    joint_covariance: Float[np.ndarray, "20 20"]
-    """Covariance of the hinges [rad^2]."""
-    information_matrix: Float[np.ndarray, "20 20"]
-    """Information of the markers alone on the hinges, the palm being held [1/rad^2]."""
-    information_vector: Float[np.ndarray, "20"]
-    """The matrix times the angles that the markers alone would give [1/rad]."""
+    qpos: Float[np.ndarray, "27"]  # the pose; digits that lack markers at the optimum of markers and prior
+    positions: Float[np.ndarray, "M 3"]  # markers in the world [m]
+    covariances: Float[np.ndarray, "M 3 3"]  # of each marker in the world [m^2]: the pose's and its own
+    rotations: Float[np.ndarray, "M 3 3"]  # in the world, of each marker's bone with the largest weight
+    joint_covariance: Float[np.ndarray, "20 20"]  # covariance of the hinges [rad^2]
+    information_matrix: Float[np.ndarray, "20 20"]  # of the markers alone on hinges, the palm held [1/rad^2]
+    information_vector: Float[np.ndarray, "20"]  # the matrix times the angles by the markers alone [1/rad]
 
 
 class HandDoubt(NamedTuple):
     """How far a hand in its glove may be from its user's: standard deviations."""
 
-    noise: float
-    """Of a marker around its place on the hand, from frame to frame [m]."""
-    size: float
-    """Of the size of the whole hand, its logarithm."""
-    places: Float[np.ndarray, "M"]
-    """Of each marker's place on its bone, in each direction [m]."""
-    knuckles: Float[np.ndarray, "5"]
-    """Of where each digit begins on the palm, in each direction [m]."""
-    directions: Float[np.ndarray, "5 3"]
-    """Of the way each digit points, about the axes of the palm [rad]."""
-    bones: Float[np.ndarray, "5 2"]
-    """Of the length of each bone of a digit, and of all of them together, logarithms."""
-    wrist: float
-    """Of where the wrist is in the palm, which no marker shows, in each direction [m]."""
-    joints: Float[np.ndarray, "5 2"]
-    """Of where a digit's joints and its tip are, as far as no marker shows it, in each direction [m]."""
+    noise: float  # of a marker around its place on the hand, from frame to frame [m]
+    size: float  # of the size of the whole hand, its logarithm
+    places: Float[np.ndarray, "M"]  # of each marker's place on its bone, in each direction [m]
+    knuckles: Float[np.ndarray, "5"]  # of where each digit begins on the palm, in each direction [m]
+    directions: Float[np.ndarray, "5 3"]  # of the way each digit points, about the axes of the palm [rad]
+    bones: Float[np.ndarray, "5 2"]  # of the length of each bone of a digit, and of all together, logarithms
+    wrist: float  # of where the wrist is in the palm, which no marker shows, in each direction [m]
+    joints: Float[np.ndarray, "5 2"]  # of a digit's joints and tip, beyond what markers show, each way [m]
 
 
 class _Proportions(NamedTuple):
@@ -153,28 +141,14 @@ def resting_prior() -> JointPrior:
 def predict_joints(
     angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
 ) -> JointPrior:
-    """Prior of the hinges `span` seconds after they were estimated.
-
-    The angles [rad] are predicted by velocity alone; they return to those of a resting hand.
-    """
+    """Prior of the hinges `span` seconds after they were estimated, near these predicted angles [rad]."""
     kept, resting = np.exp(-max(span, 0.0) / _JOINT_MEMORY), resting_prior()
     mean = angles + (1.0 - kept) * (resting.angles - angles)
-    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
-    _predict_covariance(covariance, resting.covariance, kept**2, prior)
-    return prior
-
-
-@kernel
-def _predict_covariance(
-    known: Float[np.ndarray, "20 20"], resting: Float[np.ndarray, "20 20"], kept: float, prior: JointPrior
-) -> None:
-    """Fill covariance and precision of a prior: a share of what is known, the rest of a resting hand."""
-    for row in range(len(known)):
-        for column in range(len(known)):
-            prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
-        prior.covariance[row, row] += _JOINT_SPREAD**2
-    prior.precision[:] = prior.covariance
-    invert_positive(prior.precision)
+    covariance = kept**2 * covariance + (1.0 - kept**2) * resting.covariance
+    covariance += _JOINT_SPREAD**2 * np.eye(NUM_JOINTS)
+    precision = covariance.copy()
+    invert_positive(precision)
+    return JointPrior(mean, covariance, precision)
 
 
 @kernel
@@ -316,11 +290,7 @@ def _complete_digits(
     work: Workspace,
     qpos: Float[np.ndarray, "27"],
 ) -> bool:
-    """Move hinges of digits that lack markers to the optimum of prior and markers; False without such digits.
-
-    The hinges of the other digits are held, and inform those of their neighbors through the prior's
-    covariance.
-    """
+    """Move hinges of digits that lack markers to the optimum of prior and markers, the others held."""
     weak = np.zeros(NUM_JOINTS, dtype=np.int64)
     count = 0
     for hinge in range(NUM_JOINTS):
@@ -356,11 +326,9 @@ def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -> HandDoubt:
-    """Doubt of a user's hand by where it is from.
-
-    People and gloves differ as simulated ones do. A calibrated hand is as near to its user's as the noise of
-    its markers [m] lets it be; a digit with a single marker remains half as doubtful as on a measured hand.
-    """
+    """Doubt of a user's hand by where it is from: people and gloves differ as simulated ones do."""
+    # A calibrated hand is as near to its user's as the noise of its markers [m] lets it be; a digit with a
+    # single marker remains half as doubtful as on a measured hand.
     known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
     turns = np.full((count, 3), np.deg2rad(known.turn))
     turns[0] *= known.thumb
@@ -397,7 +365,7 @@ class SpreadModel:
     """Standard deviations of the poses of one hand, which depend on where the hand is from."""
 
     def __init__(self, fit: GloveFit, origin: HandOrigin) -> None:
-        self._hand, self._tips, self._origin = hand_arrays(fit), tip_lengths(fit), origin
+        self._hand, self._digits, self._origin = with_keypoints(fit), hand_arrays(fit).digits, origin
         self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
 
     def of_pose(
@@ -410,54 +378,53 @@ class SpreadModel:
     def spreads(
         self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-        """Standard deviations of joint angles [rad] and of keypoints in each direction [m].
-
-        Times since markers were seen are in [s], infinite where never; the RMS distance [m] may be NaN.
-        """
-        digits = self._hand.digits
+        """Standard deviations of angles [rad] and keypoints [m]; markers are unseen for [s] or for ever."""
+        digits = self._digits
         freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
         noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
         steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
             self._doubts[steps] = hand_doubt(digits, self._origin, steps * _NOISE_STEP)
-        return pose_spreads(
-            self._hand, self._tips, resting_prior().precision, self._doubts[steps], qpos, unseen
-        )
+        return pose_spreads(self._hand, resting_prior().precision, self._doubts[steps], qpos, unseen)
 
 
-def tip_lengths(fit: GloveFit) -> Float[np.ndarray, "5"]:
-    """Lengths of the last bones [m]."""
-    return np.array([fit.model.skeleton.lengths[bones_of(digit)[-1]] for digit in DIGITS])
-
-
-class _PoseErrors(NamedTuple):
-    """Covariances of the unknowns of one pose, and how its fit answers to what is not known of the hand."""
-
-    posterior: Float[np.ndarray, "26 26"]
-    """By noise alone."""
-    covariance: Float[np.ndarray, "26 26"]
-    """With the doubt of the hand; lower triangle."""
-    own: Float[np.ndarray, "5 10 26"]
-    """Change of the fit's gradient by each digit's own numbers, in their standard deviations."""
-    whole: Float[np.ndarray, "26"]
-    """The same by the size of the whole hand."""
+def with_keypoints(fit: GloveFit) -> HandArrays:
+    """The arrays of a hand whose keypoints follow its markers, each on the bone that ends there."""
+    hand, count = hand_arrays(fit), NUM_KEYPOINTS
+    digits = np.repeat(np.arange(len(DIGITS)), 4)
+    ends = 1 + 3 * digits + np.tile([0, 0, 1, 2], len(DIGITS))  # a knuckle is where the first bone begins
+    bones, weights, positions = np.full((count, 4), -1), np.zeros((count, 4)), np.zeros((count, 4, 3))
+    bones[0, 0], bones[1:, 0], weights[:, 0] = PALM, ends, 1.0
+    positions[1:, 0, 0] = fit.model.skeleton.lengths[ends] * np.tile([0.0, 1.0, 1.0, 1.0], len(DIGITS))
+    spans = np.zeros((count, 2), dtype=np.int64)
+    spans[1:] = 4 * digits[:, None] + [0, 4]
+    return hand._replace(
+        bones=np.concatenate([hand.bones, bones]),
+        bone_weights=np.concatenate([hand.bone_weights, weights]),
+        positions=np.concatenate([hand.positions, positions]),
+        digits=np.concatenate([hand.digits, [-1], digits]),
+        hinge_span=np.concatenate([hand.hinge_span, spans]),
+    )
 
 
 @kernel
 def pose_spreads(
     hand: HandArrays,
-    tips: Float[np.ndarray, "5"],
     prior: Float[np.ndarray, "20 20"],
     doubt: HandDoubt,
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
 ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-    """Standard deviations of each joint angle [rad] and of each keypoint in each direction [m]."""
+    """Standard deviations of joint angles [rad] and keypoints [m] of a hand `with_keypoints`.
+
+    A marker off its place moves the fit as noise does. The hand's numbers move markers, through them the fit,
+    and the keypoints also by themselves.
+    """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
-    count = unseen.shape[1]
-    work, weights, square = workspace(count), np.empty(count), (NUM_UNKNOWNS, NUM_UNKNOWNS)
-    own, whole = np.empty((len(tips), _OWN, NUM_UNKNOWNS)), np.empty(NUM_UNKNOWNS)
-    errors = _PoseErrors(np.empty(square), np.empty(square), own, whole)
+    count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
+    moved, posterior = np.zeros((len(weights), 3, _NUMBERS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    weighted, places = np.empty((3 * count, NUM_UNKNOWNS)), np.empty((3 * count, NUM_UNKNOWNS))
+    jacobian, numbers = work.jacobian.reshape(-1, NUM_UNKNOWNS), moved.reshape(-1, _NUMBERS)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
         for marker in range(count):
@@ -466,257 +433,64 @@ def pose_spreads(
         accumulate_normal_equations(hand, weights, work)
         for row in range(NUM_UNKNOWNS):
             for column in range(row + 1):
-                errors.posterior[row, column] = work.normal[column, row]
-                if row < NUM_JOINTS:
-                    errors.posterior[row, column] += prior[row, column]
-            if row >= NUM_JOINTS:
-                errors.posterior[row, row] += _ANYWHERE
-        invert_positive(errors.posterior)
-        _add_systematic(hand, doubt, weights, work, errors)
+                posterior[row, column] = work.normal[column, row]
+            posterior[row, row] += _ANYWHERE if row >= NUM_JOINTS else 0.0
+        posterior[:NUM_JOINTS, :NUM_JOINTS] += prior
+        invert_positive(posterior)
+        _move_points(hand, doubt, work, moved)
+        for row in range(3 * count):
+            for unknown in range(NUM_UNKNOWNS):
+                weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
+                places[row, unknown] = doubt.places[row // 3] * weighted[row, unknown]
+        forces = weighted.T @ numbers[: 3 * count]
+        off, answers = places @ posterior, posterior @ forces
+        covariance = posterior + off.T @ off + answers @ answers.T
         for hinge in range(NUM_JOINTS):
-            angles[frame, hinge] = np.sqrt(errors.covariance[hinge, hinge])
-        _spread_keypoints(hand, tips, doubt, errors, work, keypoints[frame])
+            angles[frame, hinge] = np.sqrt(covariance[hinge, hinge])
+        spread = jacobian[3 * count :] @ covariance
+        response = jacobian[3 * count :] @ (posterior @ (_OWN_UNKNOWNS * forces))
+        for keypoint in range(NUM_KEYPOINTS):
+            digit, total = (keypoint - 1) // 4, 0.0
+            for row in range(3 * keypoint, 3 * keypoint + 3):
+                for unknown in range(NUM_UNKNOWNS):
+                    total += spread[row, unknown] * jacobian[3 * count + row, unknown]
+                for number in range(_NUMBERS):
+                    own = numbers[3 * count + row, number]
+                    total += own * (own - 2.0 * response[row, number])
+            beyond = doubt.joints[digit, (keypoint - 1) % 4 // 3] if keypoint > 0 else doubt.wrist
+            keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
     return angles, keypoints
 
 
 @kernel
-def _add_systematic(
-    hand: HandArrays, doubt: HandDoubt, weights: Float[np.ndarray, "M"], work: Workspace, errors: _PoseErrors
+def _move_points(
+    hand: HandArrays, doubt: HandDoubt, work: Workspace, moved: Float[np.ndarray, "P 3 51"]
 ) -> None:
-    """Fill what the doubt of the hand adds to a posterior."""
-    forces, own, whole = work.factor, errors.own, errors.whole
-    forces[:], own[:], whole[:] = 0.0, 0.0, 0.0
-    shift, unknowns = np.empty((_OWN, 3)), np.empty(NUM_UNKNOWNS, dtype=np.int64)
-    for marker in range(len(weights)):
-        weight, jacobian, place = weights[marker], work.jacobian[marker], work.markers[marker]
-        first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
-        count = last - first + 6
-        for one in range(count):
-            unknowns[one] = first + one if one < last - first else NUM_JOINTS + one - (last - first)
-        square, size = (weight * doubt.places[marker]) ** 2, weight * doubt.size
-        for one in range(count):
-            row = unknowns[one]
-            a, b, c = jacobian[0, row], jacobian[1, row], jacobian[2, row]
-            whole[row] += size * (a * place[0] + b * place[1] + c * place[2])
-            a, b, c = square * a, square * b, square * c
-            for other in range(one + 1):
-                column = unknowns[other]
-                forces[row, column] += (
-                    a * jacobian[0, column] + b * jacobian[1, column] + c * jacobian[2, column]
-                )
-        for digit in range(first // 4, last // 4):
-            _shift_marker(hand, doubt, marker, digit, work, shift)
-            for one in range(count):
-                row = unknowns[one]
-                a, b, c = weight * jacobian[0, row], weight * jacobian[1, row], weight * jacobian[2, row]
-                for number in range(_OWN):
-                    own[digit, number, row] += (
-                        a * shift[number, 0] + b * shift[number, 1] + c * shift[number, 2]
-                    )
-    _add_columns(own, whole, forces)
-    _propagate(forces, errors.posterior, errors.covariance)
-
-
-@kernel
-def _add_columns(
-    own: Float[np.ndarray, "5 10 26"], whole: Float[np.ndarray, "26"], forces: Float[np.ndarray, "26 26"]
-) -> None:
-    """Add the squares of columns to a matrix of which the lower triangle is given, and complete it."""
-    for row in range(NUM_UNKNOWNS):
-        for column in range(row + 1):
-            forces[row, column] += whole[row] * whole[column]
-        for digit in range(len(own)):
-            for number in range(_OWN):
-                share = own[digit, number, row]
-                if share != 0.0:
-                    for column in range(row + 1):
-                        forces[row, column] += share * own[digit, number, column]
-    for row in range(NUM_UNKNOWNS):
-        for column in range(row):
-            forces[column, row] = forces[row, column]
-
-
-@kernel
-def _propagate(
-    forces: Float[np.ndarray, "26 26"],
-    posterior: Float[np.ndarray, "26 26"],
-    covariance: Float[np.ndarray, "26 26"],
-) -> None:
-    """Fill the lower triangle of the posterior plus posterior times forces times posterior."""
-    product = np.zeros((NUM_UNKNOWNS, NUM_UNKNOWNS))
-    for row in range(NUM_UNKNOWNS):
-        for inner in range(NUM_UNKNOWNS):
-            share = forces[row, inner]
-            if share != 0.0:
-                for column in range(NUM_UNKNOWNS):
-                    product[row, column] += share * posterior[inner, column]
-    for row in range(NUM_UNKNOWNS):
-        for column in range(row + 1):
-            covariance[row, column] = posterior[row, column]
-        for inner in range(NUM_UNKNOWNS):
-            share = posterior[row, inner]
-            for column in range(row + 1):
-                covariance[row, column] += share * product[inner, column]
-
-
-@kernel
-def _shift_marker(
-    hand: HandArrays,
-    doubt: HandDoubt,
-    marker: int,
-    digit: int,
-    work: Workspace,
-    shift: Float[np.ndarray, "10 3"],
-) -> None:
-    """Fill how a marker moves by each of a digit's own numbers, in their standard deviations [m]."""
-    root, point, share = work.origins[1 + 3 * digit], np.zeros(3), 0.0
-    shift[_OWN - 1] = 0.0
-    for link in range(2, -1, -1):
-        bone = 1 + 3 * digit + link
-        reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # along the bone [m]
-        for slot in range(4):
-            if hand.bones[marker, slot] == bone:
-                share += hand.bone_weights[marker, slot]
-                reach += hand.positions[marker, slot, 0]
+    """Fill how points move by a hand's numbers, in their standard deviations [m]."""
+    # Ten of each digit: where it begins, turns about three axes, lengths of bones and of all; then the size.
+    lever = np.empty(3)
+    for point in range(len(moved)):
+        for i in range(3):
+            moved[point, i, _NUMBERS - 1] = doubt.size * work.markers[point, i]
+        for digit in range(hand.hinge_span[point, 0] // 4, hand.hinge_span[point, 1] // 4):
+            shift, share = moved[point, :, _OWN * digit : _OWN * (digit + 1)], 0.0
+            shift[:], lever[:] = 0.0, 0.0
+            for link in range(2, -1, -1):
+                bone = 1 + 3 * digit + link
+                reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # along the bone [m]
+                for slot in range(4):
+                    if hand.bones[point, slot] == bone:
+                        share += hand.bone_weights[point, slot]
+                        reach += hand.positions[point, slot, 0]
+                        for i in range(3):
+                            lever[i] += work.bone_terms[point, slot, i]
                 for i in range(3):
-                    point[i] += work.bone_terms[marker, slot, i]
-        for i in range(3):
-            shift[6 + link, i] = doubt.bones[digit, 0] * reach * work.rotations[bone, i, 0]
-            shift[_OWN - 1, i] += doubt.bones[digit, 1] * reach * work.rotations[bone, i, 0]
-    for i in range(3):
-        point[i] -= share * root[i]
-    _shift_digit(doubt, digit, point, share, shift)
-
-
-@kernel
-def _shift_digit(
-    doubt: HandDoubt,
-    digit: int,
-    point: Float[np.ndarray, "3"],
-    share: float,
-    shift: Float[np.ndarray, "10 3"],
-) -> None:
-    """Fill how a point of a digit, times its share, moves with knuckle and direction, in their spreads."""
-    turns = doubt.directions[digit]
-    shift[:6] = 0.0
-    for i in range(3):
-        shift[i, i] = share * doubt.knuckles[digit]
-    shift[3, 1], shift[3, 2] = -turns[0] * point[2], turns[0] * point[1]
-    shift[4, 0], shift[4, 2] = turns[1] * point[2], -turns[1] * point[0]
-    shift[5, 0], shift[5, 1] = -turns[2] * point[1], turns[2] * point[0]
-
-
-@kernel
-def _spread_keypoints(
-    hand: HandArrays,
-    tips: Float[np.ndarray, "5"],
-    doubt: HandDoubt,
-    errors: _PoseErrors,
-    work: Workspace,
-    spread: Float[np.ndarray, "21"],
-) -> None:
-    """Fill the standard deviation of each keypoint in each direction [m].
-
-    A keypoint is off by the pose's error and by the hand's own, which the fit partly makes up for.
-    """
-    total = 0.0
-    for i in range(3):
-        total += errors.covariance[NUM_JOINTS + i, NUM_JOINTS + i]
-    spread[0] = np.sqrt(total / 3.0 + doubt.wrist**2)
-    unknowns, answers = np.empty(_CHAIN, dtype=np.int64), np.empty((_OWN + 1, _CHAIN))
-    jacobian, shift = np.zeros((_CHAIN, 3)), np.zeros((_OWN + 1, 3))
-    point, offset = np.empty(3), np.empty(3)
-    for number in range(6):
-        unknowns[4 + number] = NUM_JOINTS + number
-    for i in range(3):
-        jacobian[4 + i, i] = 1.0
-    for digit in range(len(tips)):
-        base = 1 + 3 * digit
-        for number in range(4):
-            unknowns[number] = 4 * digit + number
-        _answer(errors, digit, unknowns, answers)
-        jacobian[:4], shift[:] = 0.0, 0.0
-        for part in range(4):
-            bone = base + part - 1  # that ends here
-            length = (tips[digit] if part == 3 else hand.offsets[bone + 1, 0]) if part > 0 else 0.0
+                    shift[i, 6 + link] = doubt.bones[digit, 0] * reach * work.rotations[bone, i, 0]
+                    shift[i, 9] += doubt.bones[digit, 1] * reach * work.rotations[bone, i, 0]
             for i in range(3):
-                point[i] = work.origins[base, i]
-                if part > 0:
-                    along = length * work.rotations[bone, i, 0]
-                    point[i] = work.origins[bone, i] + along
-                    shift[5 + part, i] = doubt.bones[digit, 0] * along
-                    shift[_OWN - 1, i] += doubt.bones[digit, 1] * along
-                shift[_OWN, i] = doubt.size * point[i]
-                offset[i] = point[i] - work.origins[base, i]
-            _shift_digit(doubt, digit, offset, 1.0, shift)
-            _move_keypoint(digit, part, point, work, jacobian)
-            total = _keypoint_square(jacobian, unknowns, errors.covariance, answers, shift)
-            beyond = doubt.joints[digit, part // 3]
-            spread[1 + 4 * digit + part] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
-
-
-@kernel
-def _keypoint_square(
-    jacobian: Float[np.ndarray, "10 3"],
-    unknowns: Int[np.ndarray, "10"],
-    covariance: Float[np.ndarray, "26 26"],
-    answers: Float[np.ndarray, "11 10"],
-    shift: Float[np.ndarray, "11 3"],
-) -> float:
-    """Mean square of a keypoint's error, over all directions together [m^2].
-
-    `unknowns` move it, `covariance` is of all unknowns, and `shift` how the hand's keypoint moves by each of
-    its numbers [m].
-    """
-    total, cross = 0.0, np.empty(3)
-    for one in range(_CHAIN):
-        cross[:] = 0.0
-        for number in range(_OWN + 1):
-            for i in range(3):
-                cross[i] -= 2.0 * answers[number, one] * shift[number, i]
-        for other in range(one + 1):
-            share = (1.0 if one == other else 2.0) * covariance[unknowns[one], unknowns[other]]
-            for i in range(3):
-                cross[i] += share * jacobian[other, i]
-        for i in range(3):
-            total += jacobian[one, i] * cross[i]
-    for number in range(_OWN + 1):
-        for i in range(3):
-            total += shift[number, i] ** 2
-    return total
-
-
-@kernel
-def _answer(
-    errors: _PoseErrors, digit: int, unknowns: Int[np.ndarray, "10"], answers: Float[np.ndarray, "11 10"]
-) -> None:
-    """Fill how the fit of some unknowns answers to a digit's own numbers, and to the size (last)."""
-    answers[:] = 0.0
-    for one in range(_CHAIN):
-        for inner in range(_CHAIN):
-            column = unknowns[inner]
-            share = errors.posterior[unknowns[one], column]
-            for number in range(_OWN):
-                answers[number, one] += share * errors.own[digit, number, column]
-        for column in range(NUM_UNKNOWNS):
-            answers[_OWN, one] += errors.posterior[unknowns[one], column] * errors.whole[column]
-
-
-@kernel
-def _move_keypoint(
-    digit: int, part: int, point: Float[np.ndarray, "3"], work: Workspace, jacobian: Float[np.ndarray, "10 3"]
-) -> None:
-    """Fill the derivatives of a digit's keypoint by its hinges and by the wrist's rotation and translation.
-
-    Parts are its joints, 0 to 2, and its tip, 3, in ascending order, since further hinges are left as they
-    are.
-    """
-    for hinge in range(part + 1 if part > 0 else 0):
-        origin, axis = work.origins[1 + 3 * digit + max(0, hinge - 1)], work.axes[4 * digit + hinge]
-        p, q, r = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
-        jacobian[hinge, 0] = axis[1] * r - axis[2] * q
-        jacobian[hinge, 1] = axis[2] * p - axis[0] * r
-        jacobian[hinge, 2] = axis[0] * q - axis[1] * p
-    jacobian[7, 1], jacobian[7, 2] = -point[2], point[1]
-    jacobian[8, 0], jacobian[8, 2] = point[2], -point[0]
-    jacobian[9, 0], jacobian[9, 1] = -point[1], point[0]
+                lever[i] -= share * work.origins[1 + 3 * digit, i]
+                shift[i, i] = share * doubt.knuckles[digit]
+            turns = doubt.directions[digit]
+            shift[1, 3], shift[2, 3] = -turns[0] * lever[2], turns[0] * lever[1]
+            shift[0, 4], shift[2, 4] = turns[1] * lever[2], -turns[1] * lever[0]
+            shift[0, 5], shift[1, 5] = -turns[2] * lever[1], turns[2] * lever[0]

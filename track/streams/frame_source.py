@@ -20,13 +20,13 @@ from track.frames import LATEST_TIME, StreamedFrame
 
 LEAVE: Final = 1.0
 """Time for a source to end after `close` [s]."""
-_MOST_WAITING: Final = 1 << 14  # frames that may wait for a reader
+_MOST_WAITING: Final = 1 << 14  # largest number of frames that wait for a reader
 _WAITING: Final = 256  # waiting frames after which a source that is not live is made to wait
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
-_FEWEST_PACE: Final = 5  # frames that the pace needs
-_SAME_PACE: Final = 1.0  # [s], the longest step in time within one pace
+_FEWEST_PACE: Final = 5  # number of frames from which on the pace is known
+_SAME_PACE: Final = 1.0  # longest step in time within one pace [s]
 _FASTER: Final = 1.5  # a source that is so many times as fast as its frames' times is not live
-_SHORT: Final = 0.01  # [s] by which any source may be ahead
+_SHORT: Final = 0.01  # time by which any source may be ahead [s]
 _MOST_ID: Final = 1 << 31  # IDs of takes are smaller
 
 

@@ -41,8 +41,8 @@ _SIZED: Final[Version] = (4, 1)
 """The first version with sizes of sections, assets and a finer clock."""
 _LOST: Final = 9e6  # [m]: Motive sends lost markers farther away than this
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
-_NAME: Final = 256  # bytes of a program's name
-_BODY: Final = 38  # bytes of a rigid body: ID, position, orientation, error, flags
+_NAME: Final = 256  # size of a program's name [bytes]
+_BODY: Final = 38  # size of a rigid body: ID, position, orientation, error, flags [bytes]
 _MARKER: Final = np.dtype(
     {
         "names": ["id", "position", "size", "flags", "residual"],
@@ -51,19 +51,19 @@ _MARKER: Final = np.dtype(
         "itemsize": 26,
     }
 )
-_PATIENCE: Final = 3.0  # [s] to wait for a server
-_RETRY: Final = 0.5  # [s] between requests to a server that does not answer
-_KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets
-_ATTENDED: Final = 0.1  # [s] without a read, after which the thread empties the socket
-_BUFFER: Final = 1 << 22  # bytes of the socket's receive buffer
+_PATIENCE: Final = 3.0  # longest wait for a server [s]
+_RETRY: Final = 0.5  # time between requests to a server that does not answer [s]
+_KEEP_ALIVE: Final = 2.0  # time between keep-alive packets [s]
+_ATTENDED: Final = 0.1  # time without a read after which the thread empties the socket [s]
+_BUFFER: Final = 1 << 22  # size of the socket's receive buffer [bytes]
 _STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
 _STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
-_LONGEST_STAY: Final = 60.0  # [s] in the socket; a longer stay means that the clock was set
+_LONGEST_STAY: Final = 60.0  # after a longer stay in the socket the clock was set [s]
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # points that fit into a datagram
 _MOST_CLIENTS: Final = 8
-_CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet, after which a client is gone
-_WAIT: Final = 0.05  # [s], the longest wait for a client's packet
+_CLIENT_TIMEOUT: Final = 10.0  # time without a packet after which a client is gone [s]
+_WAIT: Final = 0.05  # longest wait for a client's packet [s]
 _NUMBERS: Final = 1 << 31  # frame numbers and IDs wrap around here
 
 

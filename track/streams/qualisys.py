@@ -17,8 +17,8 @@ from track.frames import StreamedFrame
 PORT: Final = 22223
 """QTM's port for little-endian clients."""
 _VERSION: Final = "1.23"
-_PATIENCE: Final = 3.0  # [s] to wait for an answer
-_RETRY: Final = 1.0  # [s] between attempts to reach a QTM that went away
+_PATIENCE: Final = 3.0  # longest wait for an answer [s]
+_RETRY: Final = 1.0  # time between attempts to reach a QTM that went away [s]
 _COMPONENTS: Final = ["3d", "3dnolabels"]
 _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStarted")
 _FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; identified ones have smaller IDs

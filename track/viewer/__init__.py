@@ -17,6 +17,11 @@ from handsim.errors import ArgumentError, HandSimError
 if TYPE_CHECKING:
     from viser import ViserServer
 
+# The page at `/` forwards to viser's dark or light address, because only the browser knows its theme.
+_DARK_OR_LIGHT: Final = """<!doctype html><html><script>
+location.replace("/?" + (matchMedia("(prefers-color-scheme: dark)").matches ? "darkMode" : "light"))
+</script></html>
+"""
 _PORTS: Final = range(8080, 8100)  # tried in this order when --port is not given
 
 
@@ -88,6 +93,11 @@ def _guarded(host: str) -> Iterator[None]:
             headers = request.headers
             if not is_own_page(headers.get("Origin"), headers.get("Host"), host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "another page's connection is refused\n")
+            if request.path == "/" and headers.get("Upgrade") != "websocket":
+                page = connection.respond(HTTPStatus.OK, _DARK_OR_LIGHT)
+                del page.headers["Content-Type"]  # plain text; assigning would add a second one
+                page.headers["Content-Type"] = "text/html; charset=utf-8"
+                return page
             answer: Response | None = process_request(connection, request)
             return answer
 

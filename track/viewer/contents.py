@@ -38,13 +38,13 @@ ACCEPTED: Final = (
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
 """The kinds of files that can be viewed."""
-_ROUNDED: Final = 0.01  # [s] by which --time may lie outside
-_LOOKED_AT: Final = 30  # frames that decide where the first look goes
+_ROUNDED: Final = 0.01  # time by which --time may lie outside of a recording [s]
+_LOOKED_AT: Final = 30  # number of frames whose points decide where the first look goes
 
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the given function returns True."""
-_SPACING: Final = 0.14  # [m] between the centers of two hands
-_HEIGHT: Final = 0.06  # [m] above the ground
+_SPACING: Final = 0.14  # distance between the centers of two hands [m]
+_HEIGHT: Final = 0.06  # height of a flat hand above the ground [m]
 _BEFORE_COLOR: Final = (150, 150, 150)
 
 

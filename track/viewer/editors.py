@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 _NOTHING: Final = "choose"
 _HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
-_LISTED: Final = 12  # most corrections in the list
-_HEIGHT: Final = 0.06  # [m] of the wrist above the ground
-_GIZMO: Final = 0.03  # [m], size of the handle that moves a marker
+_LISTED: Final = 12  # largest number of corrections in the list
+_HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
+_GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
 
 class Corrector:
@@ -343,8 +343,20 @@ class LayoutEditor:
         every = gui.add_checkbox("names", False)
         labels = frozenset(range(count))
         every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
-        gui.add_button("Save layout", hint=f"Writes {out}").on_click(lambda _: self._save())
-        self.names.on_update(self._pick)
+        saves = gui.add_button("Save layout", hint=f"Writes {out}")
+
+        @saves.on_click
+        def _(_event: object) -> None:
+            try:
+                self.state.content = self.save()
+            except LayoutError as error:
+                self.state.content = str(error)
+
+        @self.names.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self.choose(layout.names.index(self.names.value))
+
         self.balls.balls.on_click(self._click)
         self.gizmo.on_update(self._drag)
         self._show()
@@ -384,16 +396,6 @@ class LayoutEditor:
                 raise LayoutError(f"{self._out}: cannot be written: {error.strerror or error}") from error
         self.changed = False
         return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
-
-    def _save(self) -> None:
-        try:
-            self.state.content = self.save()
-        except LayoutError as error:
-            self.state.content = str(error)
-
-    def _pick(self, event: Any) -> None:
-        if event.client is not None:
-            self.choose(self.fit.layout.names.index(self.names.value))
 
     def _click(self, event: SceneNodePointerEvent[Any]) -> None:
         index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))

@@ -30,9 +30,9 @@ GHOST_COLOR: Final = (128, 128, 128)
 """Color of points without a label."""
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
 """Names that optical systems give to unnamed trajectories."""
-_ROWS_PER_SECOND: Final = 4.0  # pace of the rows of a training set
-_MOST_LIVE_POINTS: Final = 400
-_VIDEO_RATE: Final = 30.0  # [Hz], the highest rate of a video
+_ROWS_PER_SECOND: Final = 4.0  # rows of a training set that are played per second [Hz]
+_MOST_LIVE_POINTS: Final = 400  # points of a live frame that are shown
+_VIDEO_RATE: Final = 30.0  # highest rate of a video [Hz]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

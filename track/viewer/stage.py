@@ -11,7 +11,6 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.takes.take import RigidBody
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.rig import ROOM_CENTER, CameraRig
@@ -33,11 +32,11 @@ if TYPE_CHECKING:
     from handsim.hand.shape import Side
 
 _FROM: Final = np.array([0.62, -0.62, 0.48])  # direction from the target of the first look to the eye
-_NEAREST: Final = 0.22  # [m], the smallest distance between the eye and its target
-_HALF_SIDE: Final = 0.3  # [m], half the side of the cube that wrists move in, as in training sets
-_SPACING: Final = 0.2  # [m] of the grid of points whose cameras are counted
-_MOST_POINTS: Final = 40_000  # of the grid
-_FRUSTUM: Final = 0.12  # [m]
+_NEAREST: Final = 0.22  # smallest distance between the eye and its target [m]
+_HALF_SIDE: Final = 0.3  # half side of the cube that wrists move in, as in training sets [m]
+_SPACING: Final = 0.2  # distance between grid points whose cameras are counted [m]
+_MOST_POINTS: Final = 40_000  # largest number of grid points
+_FRUSTUM: Final = 0.12  # size of a camera's frustum [m]
 _FEW_CAMERAS_COLOR, _ALL_CAMERAS_COLOR = np.array([214, 96, 60]), np.array([40, 120, 180])
 _SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
 _FILLED: Final = 0.45  # relative size of a marker that was not seen
@@ -277,7 +276,16 @@ class FrameView:
             most=recording.most_points,
             radius=recording.radius,
         )
-        self.bodies = [_add_body(server, body) for body in recording.bodies]
+        self.bodies: list[MeshHandle | FrameHandle] = []
+        for body in recording.bodies:
+            name, thing = f"/bodies/{body.name.replace('/', '_')}", body.shape
+            if thing is None:
+                self.bodies.append(server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002))
+            else:
+                surface = thing.vertices, thing.faces
+                self.bodies.append(
+                    server.scene.add_mesh_simple(name, *surface, color=_BODY_COLOR, opacity=0.6)
+                )
         self._clicked: frozenset[int] = frozenset()
         self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points in the frame
         self.on_pick: Callable[[int], None] = lambda index: None
@@ -321,7 +329,7 @@ class FrameView:
             center = server.gui.add_button("Look at the hands", color="gray", hint="C")
             switch(server, "lines of sight", self._rays, visible=len(first.rays) > 0)
         for box in (self._names, self._ghosts, self._filled):
-            box.on_update(lambda _: self._refresh())
+            box.on_update(lambda _: self._show_points())
         center.on_click(self._look)
         server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
 
@@ -337,19 +345,17 @@ class FrameView:
             camera = client.camera
             camera.position = camera.position + points.mean(axis=0) - camera.look_at
 
-    def _refresh(self) -> None:
-        with self._lock, self._server.atomic():
-            self._show_points()
-
     def _show_points(self) -> None:
+        """Show the points of the frame and the names that are wanted, in one message."""
         frame = self._frame
         if frame is None:
             return
         kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
-        self._kept = np.flatnonzero(kept)
-        self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
         every = frozenset(range(len(self._recording.label_names)))
-        self.balls.name(every if self._names.value else self._clicked)
+        with self._lock, self._server.atomic():
+            self._kept = np.flatnonzero(kept)
+            self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
+            self.balls.name(every if self._names.value else self._clicked)
 
     def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
         """Show or hide the name of the clicked marker."""
@@ -358,13 +364,5 @@ class FrameView:
             return
         if (label := int(self._frame.labels[self._kept[index]])) >= 0:
             self._clicked ^= {label}
-            self._refresh()
+            self._show_points()
         self.on_pick(int(self._kept[index]))
-
-
-def _add_body(server: ViserServer, body: RigidBody) -> MeshHandle | FrameHandle:
-    """Add a body's surface if it is known, else its axes."""
-    name, thing = f"/bodies/{body.name.replace('/', '_')}", body.shape
-    if thing is None:
-        return server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002)
-    return server.scene.add_mesh_simple(name, thing.vertices, thing.faces, color=_BODY_COLOR, opacity=0.6)

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 PICTURES: Final = 60.0
 """Most pictures per second while playing [Hz]."""
 _SPEEDS: Final = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_SLIDER_PERIOD: Final = 0.1  # [s] between two moves of the slider while playing
-_IDLE: Final = 0.2  # [s], the longest wait before `ended` is asked again
-_TEXT_PERIOD: Final = 0.1  # [s] between two texts while playing
-_LIVE_TEXT_PERIOD: Final = 0.2  # [s]
-_COLUMNS: Final = 600  # of a plot
+_SLIDER_PERIOD: Final = 0.1  # time between two moves of the slider while playing [s]
+_IDLE: Final = 0.2  # longest wait before `ended` is asked again [s]
+_TEXT_PERIOD: Final = 0.1  # time between two texts while playing [s]
+_LIVE_TEXT_PERIOD: Final = 0.2  # time between two texts of a live view [s]
+_COLUMNS: Final = 600  # largest number of points in a plotted curve
 _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
 
 Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "pagedown"]

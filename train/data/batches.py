@@ -75,7 +75,13 @@ def corrupt(
     batch, count = markers.shape[:2]
     known = np.isfinite(markers).all(-1)
     positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)
-    present = known & ~_draw_drops(batch, count, corruption.occlude, rng)
+    dropped = np.zeros((batch, count), dtype=bool)
+    if corruption.occlude:  # zero to `occlude` draws with replacement per row
+        num_draws = rng.integers(0, corruption.occlude + 1, size=(batch,))
+        draws = rng.integers(0, count, size=(batch, corruption.occlude))
+        row, draw = np.nonzero(np.arange(corruption.occlude) < num_draws[:, None])
+        dropped[row, draws[row, draw]] = True
+    present = known & ~dropped
     drawn = _draw_ghosts(positions, known, corruption, rng)
     parts = [positions, drawn] if ghosts is None else [positions, drawn, ghosts]
     points = np.concatenate(parts, axis=1)
@@ -102,17 +108,6 @@ def shuffled(
     present = np.take_along_axis(present, order, 1)
     points = np.where(present[..., None], np.take_along_axis(points, order[..., None], 1), 0.0)
     return Cloud(points, present, np.take_along_axis(truth, order, 1))
-
-
-def _draw_drops(batch: int, count: int, most: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Markers to drop (B, M): zero to `most` draws with replacement per row."""
-    dropped = np.zeros((batch, count), dtype=bool)
-    if most:
-        num_draws = rng.integers(0, most + 1, size=batch)
-        draws = rng.integers(0, count, size=(batch, most))
-        row, draw = np.nonzero(np.arange(most) < num_draws[:, None])
-        dropped[row, draws[row, draw]] = True
-    return dropped
 
 
 def _draw_ghosts(

@@ -176,8 +176,7 @@ def _nearest_axes(
     axes = axes * np.linalg.det(axes)[:, None, None]
     rotations = SIGNS[SIGNS.prod(axis=1) > 0]
     nearest = np.einsum("bij,si,bij->bs", aligned, rotations, axes).argmax(axis=1)
-    found: NDArray[np.float64] = rotations[nearest][:, :, None] * axes
-    return found
+    return np.asarray(rotations[nearest][:, :, None] * axes)
 
 
 IMAGE_SIZE = 52
@@ -312,15 +311,17 @@ class CNNLabeler:
 
     def label_batch(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         """Label the points [m] of a few frames together."""
-        return [
-            label_by_distance(distances, self._reject, self._spread) for distances in self.distances(clouds)
-        ]
+        return [label_by_distance(one, self._reject, self._spread) for one in self.distances(clouds)]
 
     def distances(self, clouds: list[NDArray[np.float64]]) -> list[Float[np.ndarray, "N M"]]:
         """Distances of the points of each cloud from its predicted markers in the best view [m]."""
         padded, present = pad_clouds(clouds)
         points = padded.astype(np.float64)
-        views = self._first_views(points, present)
+        if self._aligned:
+            views = self._hand.first_views(points, present)
+        else:  # a fixed seed gives the same clouds the same labels every time
+            shown = spread_views(points, present, rng=np.random.default_rng(0))
+            views = np.stack([shown, MIRROR_IMAGE[:, None] * shown], axis=1)
         best = [_NONE] * len(clouds)
         pending = np.arange(len(clouds))
         for tried in np.split(np.arange(views.shape[1]), np.cumsum(_TOGETHER)):
@@ -333,16 +334,6 @@ class CNNLabeler:
             if not len(pending):
                 break
         return [view.distances for view in best]
-
-    def _first_views(
-        self, points: NDArray[np.float64], present: NDArray[np.bool_]
-    ) -> Float[np.ndarray, "B V 3 3"]:
-        """The views to try, in order."""
-        if self._aligned:
-            return self._hand.first_views(points, present)
-        # A fixed seed gives the same clouds the same labels every time.
-        views = spread_views(points, present, rng=np.random.default_rng(0))
-        return np.stack([views, MIRROR_IMAGE[:, None] * views], axis=1)
 
     def predict(
         self,

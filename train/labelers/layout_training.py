@@ -53,11 +53,6 @@ class SkinBank:
     positions: Float16[np.ndarray, "T C 3"]
     """Positions around their mean [m]; left hands are mirrored."""
 
-    @property
-    def bones(self) -> Int[np.ndarray, "C"]:
-        """Index of the bone under each place."""
-        return np.array([BONE_NAMES.index(place.bone) for place in self.places])
-
     def mean_distances(self, num_poses: int = 1000) -> Float[np.ndarray, "C C"]:
         """Mean distance between every two places [m], over some poses."""
         some = self.positions[:: max(1, len(self.positions) // num_poses)].astype(np.float32)
@@ -101,24 +96,17 @@ def sample_places(
             along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
             around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
         place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
-        point = _point_of(place, model)
-        if point is not None and all(np.linalg.norm(point - other) > apart for other in points):
+        copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
+        missed += 1
+        try:
+            point = np.asarray(attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[0])
+        except LayoutError:
+            continue  # the place is off the skin
+        if all(np.linalg.norm(point - other) > apart for other in points):
             places.append(place)
             points.append(point)
             missed = 0
-        else:
-            missed += 1
     return tuple(places)
-
-
-def _point_of(place: MarkerPlace, model: HandModel) -> Float[np.ndarray, "3"] | None:
-    """Position of a place on the flat hand [m]; None if it is off the skin."""
-    copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
-    try:
-        points = attach_markers(MarkerLayout("place", copies, _RADIUS), model).points
-    except LayoutError:
-        return None
-    return np.asarray(points[0])
 
 
 def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
@@ -166,7 +154,7 @@ class LayoutBatches:
         for points in some:
             total += distance_features(torch.from_numpy(points)[None], _CONFIG)[0]
         self._features = (total / len(some)).numpy().astype(np.float16)
-        self._bones = bank.bones
+        self._bones = np.array([BONE_NAMES.index(place.bone) for place in bank.places])
 
     def draw(self) -> tuple[Cloud, Float[np.ndarray, "G M M K"]]:
         """Clouds [m] of layouts with equally many markers, and the mean distance features of each layout."""

@@ -8,18 +8,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, cast
 
 import numpy as np
 
 from gloves.fit import GlovedHand, GloveFit
-from gloves.layout import MarkerLayout, list_layouts, load_layout
+from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import Side
-from handsim.settings import Expected, Limits, Settings
-from handsim.space.rig import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig, rig_setting
+from handsim.settings import Limits, Settings
+from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MAX_OTHERS,
@@ -35,7 +34,7 @@ from train.simulation.scenes import (
     sample_real_like_scene,
     sample_scene_motion,
 )
-from train.simulation.training_frames import sample_adult_hands, wear_gloves
+from train.simulation.training_frames import AnyLayout, AnyRig, sample_adult_hands, wear_gloves
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube that wrists stay in [m]; no camera may stand there."""
@@ -57,13 +56,9 @@ class SimulateSettings(Settings):
     num_frames: Annotated[int, Limits(1)] | None = None
     """Frames; when not given the paper's number for this kind, 3000 for real-like and free, and for
     calibration touches and 40 s of free motion."""
-    glove: Annotated[
-        MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-    ] = "dense19"
+    glove: AnyLayout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
-    rig: Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)] = (
-        "figure5"
-    )
+    rig: AnyRig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     seed: Annotated[int, Limits(0)] = 0
     """Seed of people, motion and losses."""

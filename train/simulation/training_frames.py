@@ -38,6 +38,10 @@ NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
 """Reason to replace a scene with an object by one of an empty hand."""
 _MAX_LOST_CAMERAS: Final = 6  # cameras that lose their pictures together
+AnyLayout = Annotated[
+    MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
+]
+AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +65,12 @@ class GenerateSettings(Settings):
     """
 
     noun: ClassVar[str] = "setting of a training set"
-    glove: Annotated[
-        MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-    ] = "dense19"
+    glove: AnyLayout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     num_frames: Annotated[int, Limits(1)] = 170_330
     """Frames; the default is the paper's number."""
     seed: Annotated[int, Limits(0)] = 0
-    rig: Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)] = (
-        "figure5"
-    )
+    rig: AnyRig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     min_cameras: Annotated[int, Limits(1)] = 2
     """Cameras that must see a marker before it exists."""

@@ -10,8 +10,7 @@ import pytest
 from benchmarks.paper.assignment_trackers import GATE, NEAR, HungarianTracker, NearestNeighborTracker
 from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
-from gloves import GloveFit, Status, Take
-from handsim.errors import ArgumentError
+from gloves import GloveFit, Take
 from train import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
@@ -51,35 +50,6 @@ def test_hands_are_lost_with_their_points_and_stay_so(kind, take, users):
     frame = tracker.step(seen.points, seen.ids, time)
     assert not np.array_equal(frame.labels, seen.labels)
     assert evaluate_tracker(dark, users, kind(users, seen_frame(dark, 0).labels)).right[220:].mean() < 0.2
-
-
-@BOTH
-def test_the_first_frame_is_as_it_is_told(kind, take, users):
-    seen = seen_frame(take, 0)
-    wrong = np.roll(seen.labels, 1)
-    assert np.array_equal(kind(users, wrong).step(seen.points, seen.ids, 0.0).labels, wrong)
-    with pytest.raises(ArgumentError, match="first_labels are of 38 points, but the first frame has 37"):
-        kind(users, wrong).step(seen.points[1:], seen.ids[1:], 0.0)
-    with pytest.raises(ArgumentError, match="first_labels go up to 38, expected less than 38"):
-        kind(users, wrong + 1)
-
-
-@BOTH
-def test_a_pose_that_does_not_fit_is_none(kind, take, users, rng):
-    seen = seen_frame(take, 0)
-    points = seen.points.copy()
-    mine = seen.labels < 19
-    points[mine] += rng.normal(0.0, 0.03, size=(int(mine.sum()), 3))
-    hands = kind(users, seen.labels).step(points, seen.ids, 0.0).hands
-    assert [hand.status for hand in hands] == [Status.LOST, Status.TRACKED]
-
-
-@BOTH
-def test_frames_without_points_are_frames(kind, take, users):
-    tracker, _, time = started(kind, users, take)
-    frame = tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), time)
-    assert len(frame.labels) == 0
-    assert [hand.status for hand in frame.hands] == [Status.LOST] * 2
 
 
 def test_names_go_with_ids_wherever_their_points_go(take, users):

@@ -112,18 +112,3 @@ def test_table_4_has_a_column_a_test_set(capsys, monkeypatch, takes):
     column = TEST_SETS.index("hand-pen")
     assert cells(said, "Accuracy (slots)")[column].startswith(f"{100 * pen['slot_accuracy']:.2f} ")
     assert cells(said, "G recall")[column].startswith(f"{100 * pen['ghost_recall']:.2f} ")
-
-
-@pytest.mark.parametrize(
-    ("command", "sentence"),
-    [
-        (["table4", "--labelers", "nowhere"], "unknown labeler or glove 'nowhere'"),
-        (["table4", "--num-frames", "0"], "num_frames is 0, expected at least 1"),
-        (["table2", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
-    ],
-)
-def test_mistakes_end_in_one_sentence(command, sentence, tmp_path, capsys):
-    assert tables([*(word.replace("OUT", str(tmp_path / "out")) for word in command)]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and sentence in said
-    assert not list(tmp_path.iterdir())

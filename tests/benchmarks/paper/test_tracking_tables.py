@@ -16,7 +16,6 @@ from benchmarks.paper.comparison import (
     USERS,
     compare_trackers,
     measure_with_body,
-    trackers,
 )
 from benchmarks.paper.printed import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from benchmarks.paper.tracking_tables import TRACKING_TABLES, print_errors, print_trials, table5_figures
@@ -116,13 +115,6 @@ def test_few_cameras(capsys):
     assert set(tables) == {(HAN, "calibrated"), *((name, users) for name in METHODS for users in USERS)}
 
 
-@pytest.mark.slow
-def test_the_paper_has_no_figures_of_other_gloves(capsys):
-    assert command(["cameras", "--num-frames", "6", "--glove", "sparse13"]) == 0
-    said = capsys.readouterr().out
-    assert HAN not in said and OURS in said
-
-
 def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     monkeypatch.setattr(comparison, "USERS", {"calibrated": USERS["calibrated"]})
     take = simulate_take(kind="single-hand", num_frames=FEWEST_FRAMES).without_body()
@@ -159,23 +151,3 @@ def test_a_body_that_is_followed_must_have_its_labels():
     assert np.flatnonzero(~wrong).tolist() == [7]
     with pytest.raises(ArgumentError, match="controller: the take has no body"):
         measure_with_body("controller", take.without_body(), labeler)
-
-
-def test_every_tracker_has_a_maker():
-    assert tuple(trackers(load_labeler("dense19"), 0)) == METHODS
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["table5", "--glove", "dense91"], "unknown labeler or glove 'dense91'"),
-        (["table5", "--num-frames", "0"], "num_frames is 0, expected at least 1"),
-        (["table7", "--seed", "-1"], "seed is -1, expected 0 or more"),
-        (["table7", "--labeler", "nowhere"], "unknown labeler or glove 'nowhere'"),
-        (["cameras", "--rig", "figure6"], "unknown camera rig 'figure6'"),
-    ],
-)
-def test_mistakes_end_in_one_sentence(words, sentence, capsys):
-    assert command(words) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and sentence in said

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.paper.take_evaluation import seen_frame, true_users
+from benchmarks.paper.take_evaluation import seen_frame
 from benchmarks.paper.trials import FEWEST_FRAMES, hide_points, initialization_times, recovery_times
 from gloves import Status, Take
 from handsim.errors import ArgumentError
-from track import TrackedFrame, TrackedHand, Tracker
-from train import load_labeler, simulate_take
+from track import TrackedFrame, TrackedHand
+from train import simulate_take
 
 
 @pytest.fixture(scope="module")
@@ -32,16 +32,6 @@ class Late:
             labels = np.full(len(points), -1)
         hand = TrackedHand("right", Status.TRACKED, np.zeros(27), 0.001, np.zeros((19, 3)), np.arange(0))
         return TrackedFrame(time, (hand, hand), labels, np.ones(len(points)))
-
-
-def test_a_cut_take_is_a_part_of_it(take):
-    part = take.cut(10, 40)
-    assert part.num_frames == 30
-    np.testing.assert_array_equal(part.points, take.points[10:40])
-    np.testing.assert_array_equal(part.qpos, take.qpos[10:40])
-    np.testing.assert_array_equal(part.body_poses, take.body_poses[10:40])
-    with pytest.raises(ArgumentError, match="frames 10 to 999, expected a part of 0 to 320"):
-        take.cut(10, 999)
 
 
 def test_what_comes_back_from_the_dark_has_other_ids(take):
@@ -76,12 +66,6 @@ def test_waits_are_counted_from_the_first_frame_with_points(take, rng):
         )
     assert np.isnan(initialization_times(take, lambda part: Late(part, 120), 2, rng=rng)).all()
     assert np.isnan(recovery_times(take, lambda part: Late(part, 120), 2, rng=rng)).all()
-
-
-def test_our_tracker_is_soon_right(take, rng):
-    users, labeler = true_users(take), load_labeler("dense19")
-    assert np.median(initialization_times(take, lambda part: Tracker(users, labeler), 3, rng=rng)) <= 3
-    assert np.median(recovery_times(take, lambda part: Tracker(users, labeler), 2, rng=rng)) <= 3
 
 
 def test_a_short_take_is_told(take, rng):

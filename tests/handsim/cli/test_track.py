@@ -177,7 +177,7 @@ def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
 def test_hands_that_are_not_there_get_the_usual_size(tmp_path, capsys):
     rng = np.random.default_rng(0)
     path, out = tmp_path / "clutter.trc", tmp_path / "out.npz"
-    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (60, 30, 3)), 120.0))
+    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (15, 30, 3)), 120.0))
     main(["track", str(path), "--out", str(out)])
     assert "no hand was found to measure its size; size M is used" in capsys.readouterr().err
 

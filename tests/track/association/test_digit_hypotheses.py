@@ -46,7 +46,12 @@ def digit_model(solver, qpos, missing):
     variance = np.full(19, SPREAD**2)
     seen = predict_markers(solver.hand, solver.on_part, qpos, target, prior, (0.01, 0.1), variance, SPREAD)
     return DigitModel(
-        prior, seen, variance, peak_log_odds(variance, STRAYS), np.zeros(19), digit_ranges(solver.hand)
+        prior,
+        seen,
+        variance,
+        peak_log_odds(variance, STRAYS),
+        np.zeros(19),
+        digit_ranges(attach(load_layout("dense19"), HandModel.named("M"))),
     )
 
 
@@ -142,7 +147,7 @@ def test_odds_decide_between_points_that_fit_as_well(hand):
 
 def test_ranges_hold_the_poses_of_the_hand(hand):
     solver, model = hand
-    ranges = digit_ranges(hand_arrays(attach(load_layout("dense19"), model)))
+    ranges = digit_ranges(attach(load_layout("dense19"), model))
     angles = sample_valid_angles(model, 50, rng=np.random.default_rng(1))
     for qpos in join_qpos(angles):
         markers = solver.marker_positions(qpos)[MARKERS]
@@ -207,28 +212,10 @@ def test_no_other_angles_cost_less(arrays, seed):
     assert cost == pytest.approx(least_cost(arrays, points[order], hypothesis), abs=0.05)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_exact_points_give_their_angles(arrays, seed):
-    rng = np.random.default_rng(seed)
-    low, high = arrays.ranges[OWN].T
-    true = np.clip(MEAN + np.deg2rad(10.0) * rng.standard_normal(4), low, high)
-    cost, _, angles = fitted(arrays, markers_at(arrays, true), [0, 1, 2])
-    np.testing.assert_allclose(angles[:3], true[:3], atol=np.deg2rad(4.0))
-    assert cost < 5.0
-    wrong, _, _ = fitted(arrays, markers_at(arrays, true), [2, 1, 0])
-    assert wrong > cost + 50.0
-
-
 def test_without_points_the_prior_holds_and_costs_nothing(arrays):
     cost, complexity, angles = fitted(arrays, np.zeros((1, 3)), [-1, -1, -1])
     np.testing.assert_allclose(angles, MEAN)
     assert cost == pytest.approx(0.0) and complexity == pytest.approx(0.0, abs=1e-9)
-
-
-def test_more_points_leave_less_to_the_prior(arrays):
-    points = markers_at(arrays, MEAN)
-    complexities = [fitted(arrays, points, chosen)[1] for chosen in ([0, -1, -1], [0, 1, -1], [0, 1, 2])]
-    assert 0.0 < complexities[0] < complexities[1] < complexities[2]
 
 
 def test_a_hinge_stays_near_its_range(arrays):

@@ -14,6 +14,7 @@ from handsim import join_qpos
 from handsim.hand.shape import Side
 from handsim.space.transforms import random_quaternions
 from poses.shapes import sample_valid_angles
+from tests.labelers import CountingLabeler
 from track.association.hand_state import HandState
 from track.association.initialization import (
     MOST_POINTS,
@@ -123,30 +124,23 @@ def test_exchanged_hands_are_exchanged_back(initializer, states):
     clouds = markers(states, 0)
     points, labels = shuffled(clouds, 0, np.random.default_rng(0))
     of_hands = [np.where(labels // 19 == hand, labels % 19, -1) for hand in (0, 1)]
-    right = [initializer._fit(hand, points, of_hands[hand]) for hand in (0, 1)]
-    wrong = [initializer._fit(1 - hand, points, of_hands[hand]) for hand in (0, 1)]
-    assert initializer._sides_checked(right, points) is right
-    for hand in initializer._sides_checked(wrong, points):
+    initializer._points = points
+    right = [initializer._fit(hand, of_hands[hand]) for hand in (0, 1)]
+    wrong = [initializer._fit(1 - hand, of_hands[hand]) for hand in (0, 1)]
+    assert initializer._sides_checked(right) is right
+    for hand in initializer._sides_checked(wrong):
         seen = hand.labels >= 0
         assert (hand.labels[seen] == of_hands[hand.index][seen]).all() and seen.sum() >= 17
 
 
 def test_a_search_goes_on_from_call_to_call_and_no_call_labels_many_clouds(states, rng):
     """Points at random are looked at along six directions, three in the first call."""
-    labeler, sizes = load_labeler("dense19"), list[int]()
-
-    class Counting:
-        marker_names = labeler.marker_names
-
-        def label_frames(self, frames):
-            sizes.append(len(frames))
-            return labeler.label_frames(frames)
-
-    initializer, points = HandInitializer(states, Counting()), rng.uniform(0.0, 0.2, (60, 3))
+    labeler = CountingLabeler()
+    initializer, points = HandInitializer(states, labeler), rng.uniform(0.0, 0.2, (60, 3))
     for call in range(4):
         assert initializer.initialize(points, (0, 1)) == []
         assert initializer.is_searching((0, 1)) == (call < 3) and not initializer.is_searching((0,))
-    assert sizes[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
+    assert labeler.calls[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.1, 0.3])
@@ -157,18 +151,12 @@ def test_groups_are_those_of_single_linkage(rng, distance):
     groups = linked_groups(points, distance)
     assert {frozenset(group) for group in groups} == expected
     assert [len(group) for group in groups] == sorted(map(len, expected), reverse=True)
+    assert linked_groups(np.empty((0, 3)), distance) == []
 
 
-def test_no_points_are_no_groups():
-    assert linked_groups(np.empty((0, 3)), 0.1) == []
-
-
-def test_the_longest_link_is_that_of_the_spanning_tree(rng):
+def test_the_longest_link_is_that_of_the_spanning_tree_and_the_nearest_point_is_scipys(rng):
     frames = rng.uniform(0.0, 0.2, size=(20, 13, 3))
     expected = [minimum_spanning_tree(cdist(points, points)).max() for points in frames]
     np.testing.assert_allclose(longest_links(frames), expected)
-
-
-def test_distances_to_the_nearest_of_others(rng):
     points, others = rng.normal(size=(7, 3)), rng.normal(size=(4, 3))
     np.testing.assert_allclose(distances_to_nearest(points, others), cdist(points, others).min(axis=1))

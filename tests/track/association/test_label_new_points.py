@@ -148,10 +148,6 @@ def candidates_of(points, assigned, evidence=12.0):
     )
 
 
-def test_a_whole_hand_has_nothing_to_decide():
-    assert candidates_of(PLACES, range(7)).counts.tolist() == [0, 0]
-
-
 def test_a_stray_is_tried_near_a_marker_that_is_seen_and_farther_around_one_that_is_not():
     stray = [0.06, -0.02, 0.0]
     assert candidates_of([*PLACES, stray], [*range(7), -1]).counts.tolist() == [0, 0]
@@ -223,19 +219,3 @@ def test_no_other_choice_is_better(table):
     assert ((best >= 0) & (best < counts) & (best != banned)).all()
     assert scores[chosen].sum() == pytest.approx(total)
     assert all(one & two == 0 for one, two in itertools.combinations(sets[chosen].tolist(), 2))
-
-
-def test_without_a_conflict_everybody_has_the_best():
-    scores, sets = np.tile([9.0, 5.0, 0.0], (5, 1)), np.array([[1 << k, 1 << k, 0] for k in range(5)])
-    best = np.zeros(5, dtype=np.int64)
-    assert best_combination(scores, sets, np.full(5, 3), np.full(5, -1), best) == 45.0
-    assert best.tolist() == [0] * 5
-
-
-def test_a_point_goes_to_whom_it_is_worth_more():
-    scores, sets = np.array([[9.0, 8.0, 0.0], [9.0, 1.0, 0.0]]), np.array([[1, 2, 0], [1, 4, 0]])
-    best = np.zeros(2, dtype=np.int64)
-    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, -1]), best) == 17.0
-    assert best.tolist() == [1, 0]
-    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, 0]), best) == 10.0
-    assert best.tolist() == [0, 1]

@@ -134,10 +134,8 @@ def visits(model, fingers, hold):
 def geometry_of(model, touches, angles):
     bones = model.forward_kinematics(join_qpos(angles[[frame for frame, _ in touches]]))
     contacts = initialize_contacts(model, touches, bones)
-    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
-    return contacts, contact_geometry(
-        contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones
-    )
+    corners = SkinPatch(contacts.pads.faces).corners(model.surface.vertices)
+    return contacts, contact_geometry(contacts, corners, model, bones)
 
 
 def test_every_touch_is_found_once(model):

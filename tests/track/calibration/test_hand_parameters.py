@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from benchmarks.people import displace_markers
 from gloves import load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, sample_shape
@@ -15,7 +16,6 @@ from track.calibration.hand_parameters import (
     SkinPatch,
     attachment_at,
     build_skin,
-    displace_markers,
     nearest_coordinates,
     project_onto_skin,
     shape_at,

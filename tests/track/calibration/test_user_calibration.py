@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.people import displace_markers
 from gloves import GloveFit, attach, load_layout
 from gloves.fit import attach_markers, nominal_fit
 from handsim import HandModel, HandSimError, join_qpos
@@ -17,7 +18,6 @@ from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion import WristConfig, wrist_path
 from track import Calibration, HeldOut, User, load_user
-from track.calibration.hand_parameters import displace_markers
 from track.calibration.user_calibration import calibrate_hand
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 

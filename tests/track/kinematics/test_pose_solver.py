@@ -18,7 +18,7 @@ from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_motion
 from poses.shapes import resting_angles, sample_valid_angles
 from track import solve_pose
-from track.kinematics.pose_solver import AnglePrior, PoseSolver
+from track.kinematics.pose_solver import PoseSolver
 
 INDEX = slice(11, 15)  # of qpos
 
@@ -152,7 +152,7 @@ def test_a_hidden_digit_stays_where_it_is_thought_to_be(rng):
     near = move(qpos, 0.01 * rng.standard_normal((20, 26)))
     thought = qpos[:, 7:] + 0.02 * rng.standard_normal((20, 20))
     solver = PoseSolver(GloveFit(model, glove))
-    fit = solver.solve(markers, near, prior=AnglePrior(thought, 0.1))
+    fit = solver.solve(markers, near, prior=(thought, 0.1))
     apart = np.rad2deg(np.abs(fit.qpos[:, INDEX] - thought[:, 4:8]))
     assert apart.max() < 1.0  # what rest pulls, 90 degrees of spread against 0.1 rad
     others = np.r_[7:11, 15:27]
@@ -167,7 +167,7 @@ def test_a_prediction_is_not_heard_where_all_markers_are(rng):
     qpos = random_poses(model, 5, rng)
     markers = markers_of(model, glove, qpos)
     solver = PoseSolver(GloveFit(model, glove))
-    informed = solver.solve(markers, qpos, prior=AnglePrior(np.zeros((5, 20)), 1e-3))
+    informed = solver.solve(markers, qpos, prior=(np.zeros((5, 20)), 1e-3))
     np.testing.assert_array_equal(informed.qpos, solver.solve(markers, qpos).qpos)
 
 
@@ -176,7 +176,7 @@ def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
     qpos = random_poses(model, 30, rng)
     markers = markers_of(model, glove, qpos) + rng.normal(scale=0.0005, size=(30, 13, 3))
     solver = PoseSolver(GloveFit(model, glove))
-    informed = solver.solve(markers, qpos, prior=AnglePrior(qpos[:, 7:], 0.05))
+    informed = solver.solve(markers, qpos, prior=(qpos[:, 7:], 0.05))
     error, informed_error = (
         np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), informed)
     )

@@ -28,7 +28,7 @@ from track.kinematics.pose_spread import (
     pose_spreads,
     predict_joints,
     resting_prior,
-    tip_lengths,
+    with_keypoints,
 )
 
 NOTHING = 1e-9 * np.eye(20)  # precision of hinges of which nothing is known
@@ -36,7 +36,7 @@ INDEX = slice(4, 8)
 
 
 def spreads_of(fit, doubt, qpos, unseen, prior=NOTHING):
-    return pose_spreads(hand_arrays(fit), tip_lengths(fit), prior, doubt, qpos, unseen)
+    return pose_spreads(with_keypoints(fit), prior, doubt, qpos, unseen)
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -11,7 +11,7 @@ import pytest
 
 from gloves import Capture
 from handsim import HandSimWarning
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import CaptureError
 from tests.waiting import LONG
 from track import LiveStream, StreamedFrame
 from track.frames import capture_frames
@@ -131,11 +131,6 @@ def test_what_is_wrong_ends_the_stream_and_is_told(wrong, words):
     assert list(stream) == []
 
 
-def test_a_class_without_the_methods_is_no_source():
-    with pytest.raises(ArgumentError, match="mine has no method __iter__, expected __iter__ and close"):
-        SourceStream(object(), "mine")  # type: ignore[arg-type]
-
-
 def test_a_close_that_fails_is_told_and_loses_nothing():
     class Stuck(Listed):
         def close(self) -> None:
@@ -188,26 +183,12 @@ def test_time_goes_on_when_a_recording_begins_anew():
     np.testing.assert_allclose(times, 5.0 + 0.1 * np.arange(16), atol=0.005)
 
 
-def test_points_out_of_range_are_left_out_and_counted():
-    points = np.array([[0.1, 0.2, 0.3], [1200.0, 0.0, 0.0]])
-    with live(Listed(*[frame(n, points) for n in range(10)])) as stream:
-        assert [len(one.points) for one in stream] == [1] * 10
-        assert stream.counts["points_out_of_range"] == 10 and stream.points == 20
-
-
 class Slow(Arriving):
     """A live stream of which all frames but the last have waited for long when they are first asked for."""
 
     def __init__(self, count: int) -> None:
         now = time.monotonic()
         super().__init__([frame(n, arrived=now - 60.0 + n / 100) for n in range(count)], ends=False)
-
-
-def test_what_is_not_kept_up_with_is_dropped_oldest_first_and_counted():
-    with LiveStream(Slow(500)) as stream:
-        assert next(stream).number == 499
-        counts = [stream.counts[f"{kind}_frames"] for kind in ("received", "dropped", "missing")]
-        assert counts == [500, 499, 0]
 
 
 class Clock:

@@ -17,15 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gloves import Capture, Status, Take
+from gloves import Capture, Take
 from handsim import HandSimError
-from handsim.errors import ArgumentError, CaptureError
-from handsim.space.objects import named_object
+from handsim.errors import CaptureError
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
-from track import LiveStream, ReplayServer, RigidTemplate, StreamedFrame, open_source
-from track.rigid_body import BodyTracker
-from track.streams import natnet
+from track import LiveStream, ReplayServer, StreamedFrame
+from track.streams import LOOPBACK, natnet
 from track.streams.natnet import (
     NEWEST,
     DamagedPacket,
@@ -210,9 +208,6 @@ def test_a_greeting_says_which_layout_is_wanted():
     assert payload[:8] == b"handsim\0" and payload[265:269] == bytes((4, 1, 0, 0))
 
 
-LOOPBACK = "127.0.0.1"
-
-
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """A server is waited for, however busy the machine is."""
@@ -306,34 +301,12 @@ def test_frames_are_played_at_their_rate(monkeypatch):
             assert server.sent == last + 1, "those whose time has come"
 
 
-def test_a_body_is_tracked_live():
-    take = twin()
-    tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
-    with ReplayServer(take) as server, opened(server.url) as stream:
-        words = [
-            tracker.step(one.points, one.ids, one.time).status
-            for one in itertools.islice(stream, take.num_frames)
-        ]
-    assert words == [Status.INITIALIZED] + [Status.TRACKED] * (take.num_frames - 1)
-
-
 def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
     positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
     positions[1, 0] = np.nan
     with ReplayServer(Capture(("a", "b"), positions, 100.0)) as server, opened(server.url) as stream:
         ids = [list(one.ids) for one in itertools.islice(stream, 4)]
     assert ids == [[0, 1], [1], [2, 1], [2, 1]]
-
-
-def test_a_stream_that_stops_says_so():
-    take = twin()
-    server = ReplayServer(SimpleNamespace(points=take.points[:3], ids=take.ids[:3], rate=take.rate))
-    with server, opened(server.url, silence=0.2) as stream:
-        wait_for(lambda: server.finished)
-        got = list(itertools.islice(stream, 5))
-    assert [one.silent for one in got] == [False] * 3 + [True] * 2
-    assert got[3].number == 2 and got[2].time < got[3].time < got[4].time
-    assert got[3].points.shape == (0, 3) and got[3].ids.shape == (0,)
 
 
 def test_bad_packets_are_counted_and_left_out():
@@ -387,18 +360,6 @@ def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, sp
             server.say(frame(number, spoken))
         assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
         assert stream.counts["damaged_packets"] == 0
-
-
-def test_packets_of_others_are_not_heard():
-    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            try:
-                stranger.bind(("127.0.0.2", 0))
-            except OSError:
-                pytest.skip("this machine has one loopback address only")
-            stranger.sendto(frame(9, (4, 1)), server.client)
-        server.say(frame(10, (4, 1)))
-        assert next(stream).number == 10
 
 
 def test_the_client_listens_on_loopback_only_and_takes_leave():
@@ -462,16 +423,6 @@ def test_multicast_is_heard_on_loopback():
                 assert [one.number for one in itertools.islice(stream, 2)] == [0, 1]
 
 
-@pytest.mark.parametrize(
-    "url",
-    ["", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
-     "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
-)  # fmt: skip
-def test_addresses_that_are_none_are_told(url):
-    with pytest.raises(ArgumentError, match=r"natnet://host|a port from 1 to 65535"):
-        open_source(url)
-
-
 def test_servers_that_cannot_be_used_are_told(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(natnet, "_PATIENCE", 0.2)
@@ -501,7 +452,6 @@ def test_what_cannot_be_replayed_is_told():
     points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
     for arguments, options, words in (
         ((points, ids[:1], 100.0), {}, "expected (T, N, 3) and (T, N)"),
-        ((points, ids, 100.0), {"rate": 0.0}, "rate is 0, expected a number above 0"),
         ((points, ids, 100.0), {"version": (2, 9)}, "unknown NatNet version '2.9'"),
         ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
     ):  # fmt: skip
@@ -509,16 +459,16 @@ def test_what_cannot_be_replayed_is_told():
             ReplayServer(
                 SimpleNamespace(**dict(zip(("points", "ids", "rate"), arguments, strict=True))), **options
             )
-    with ReplayServer(Capture(("a",), points[:, :1], 100.0)) as server:
-        port = int(server.url.rpartition(":")[2])
-        with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
-            ReplayServer(Capture(("a",), points[:, :1], 100.0), port=port)
 
 
-def test_only_the_server_s_ports_are_heard():
+@pytest.mark.parametrize("host", [LOOPBACK, "127.0.0.2"])
+def test_only_the_server_and_its_ports_are_heard(host):
     with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.bind((LOOPBACK, 0))
+            try:
+                stranger.bind((host, 0))
+            except OSError:
+                pytest.skip("this machine has one loopback address only")
             for number in range(5):
                 stranger.sendto(frame(900 + number, (4, 1)), server.client)
         for number in range(3):
@@ -535,44 +485,3 @@ def test_the_port_for_data_is_the_server_s_too():
             for number in range(3):
                 data.sendto(frame(number, (4, 1)), server.client)
             assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
-
-
-def test_one_wild_time_does_not_end_a_stream():
-    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
-        for number in range(20):
-            for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
-                server.say(
-                    natnet.pack_frame(StreamedFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1))
-                )
-            server.say(frame(number, (4, 1)))
-        got = list(itertools.islice(stream, 20))
-        stream.end()
-        assert not [one.number for one in stream]
-        assert [one.number for one in got] == list(range(20))
-        assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
-
-
-MANY = 10_000  # frames, ten seconds of the server: a stream that yields so many does not end
-
-
-def test_a_stream_ends_while_frames_arrive():
-    ended = threading.Event()
-    with (
-        ReplayServer(twin(), rate=1000.0, loop=True) as server,
-        opened(server.url, ended=ended.is_set) as stream,
-    ):
-        list(itertools.islice(stream, 10))
-        ended.set()
-        assert len(list(itertools.islice(stream, MANY))) < MANY
-
-
-def test_a_stream_ends_when_it_is_told_to():
-    ended = threading.Event()
-    with Puppet(unicast((4, 1))) as server, opened(server.url, ended=ended.is_set, silence=1.0) as stream:
-        for number in (0, 1, 3):  # the last one is held, because one is missing before it
-            server.say(frame(number, (4, 1)))
-        got = [next(stream), next(stream)]
-        threading.Timer(0.3, ended.set).start()
-        rest = list(itertools.islice(stream, round(LONG)))
-        assert len(rest) < LONG, "it goes on"
-        assert [one.number for one in (*got, *rest) if not one.silent] == [0, 1, 3]

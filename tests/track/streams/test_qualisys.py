@@ -12,9 +12,9 @@ import pytest
 
 from handsim.errors import CaptureError
 from track import open_source
+from track.streams import LOOPBACK
 from track.streams.qualisys import QualisysSource
 
-LOOPBACK = "127.0.0.1"
 ERROR, COMMAND, DATA, NO_MORE_DATA, EVENT = 0, 1, 3, 4, 6
 LABELED, UNLABELED = 1, 2
 STARTED = 3

@@ -5,19 +5,26 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from track.viewer.contents import show_recording
 from track.viewer.recordings import TakeRecording
 from track.viewer.stage import FrameView
 
 
-def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page_of, tracked):
+@pytest.fixture
+def show(server, tracked):
+    """Shows a frame of the take in the page."""
     recording = TakeRecording(tracked)
     view = FrameView(server, recording)
-    view.show(recording.frame(0))
+    return lambda index: view.show(recording.frame(index))
+
+
+def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page_of, show, tracked):
+    show(0)
     page = page_of(server)
     for index in (0, 7, 3, 29, 12):
-        view.show(recording.frame(index))
+        show(index)
         page.settle()
         for number, hand in enumerate(tracked.hands):
             name = f"/hands/{number}"
@@ -27,28 +34,24 @@ def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page
                 np.testing.assert_allclose(page.skin(name), hand.model.skin(qpos[None])[0], atol=5e-5)
 
 
-def test_a_frame_sends_poses_and_never_a_mesh_again(server, page_of, tracked):
-    recording = TakeRecording(tracked)
-    view = FrameView(server, recording)
-    view.show(recording.frame(0))
+def test_a_frame_sends_poses_and_never_a_mesh_again(server, page_of, show, tracked):
+    show(0)
     page = page_of(server)
     before, meshes = page.bytes, page.counts["SkinnedMeshMessage"]
     assert meshes == 2 and before > 100_000
-    view.show(recording.frame(1))
+    show(1)
     page.settle()
     assert 0 < page.bytes - before < 15_000
     before = page.counts.total()
-    view.show(recording.frame(1))
+    show(1)
     page.settle()
     assert page.counts.total() == before, "nothing changed, so nothing is sent"
     assert page.counts["SkinnedMeshMessage"] == meshes
 
 
-def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
-    recording = TakeRecording(tracked)
-    view = FrameView(server, recording)
+def test_points_have_their_places_colors_and_sizes(server, page_of, show, tracked):
     page = page_of(server)
-    view.show(recording.frame(20))
+    show(20)
     page.settle()
     balls = page.nodes["/points"]
     places, sizes = (balls[name].reshape(-1, width) for name, width in
@@ -64,23 +67,19 @@ def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
     assert tracked.label_names[0].split(":")[1] == tracked.label_names[19].split(":")[1]
 
 
-def test_bodies_are_where_they_are_tracked_and_hidden_where_they_are_lost(server, page_of, tracked):
-    recording = TakeRecording(tracked)
-    view = FrameView(server, recording)
+def test_bodies_are_where_they_are_tracked_and_hidden_where_they_are_lost(server, page_of, show, tracked):
     page = page_of(server)
-    view.show(recording.frame(0))
+    show(0)
     page.settle()
     assert "/bodies/controller" in page.hidden
-    view.show(recording.frame(1))
+    show(1)
     page.settle()
     assert "/bodies/controller" not in page.hidden
     np.testing.assert_allclose(page.places["/bodies/controller"], tracked.body_poses[1, 0, :3])
 
 
-def test_switches_take_things_away_and_names_follow_their_points(server, page_of, tracked):
-    recording = TakeRecording(tracked)
-    view = FrameView(server, recording)
-    view.show(recording.frame(5))
+def test_switches_take_things_away_and_names_follow_their_points(server, page_of, show, tracked):
+    show(5)
     page = page_of(server)
     page.press("names")
     page.press("unlabeled points", False)
@@ -90,15 +89,13 @@ def test_switches_take_things_away_and_names_follow_their_points(server, page_of
     page.wait(lambda: (page.nodes["/points"]["batched_scales"] > 0).sum() == 37)  # each switch draws anew
     assert page.nodes["/points/names/0"]["text"] == "ThumbCMC"
     np.testing.assert_allclose(page.places["/points/names/0"], tracked.points[5, 0], atol=1e-6)
-    view.show(recording.frame(29))
+    show(29)
     page.settle()
     assert "/points/names/19" in page.hidden, "the left hand is lost"
 
 
-def test_the_eye_is_led_to_the_hands(server, page_of, tracked):
-    recording = TakeRecording(tracked)
-    view = FrameView(server, recording)
-    view.show(recording.frame(29))
+def test_the_eye_is_led_to_the_hands(server, page_of, show, tracked):
+    show(29)
     page = page_of(server)
     page.press("Look at the hands")
     page.wait(lambda: page.counts["SetCameraLookAtMessage"] > 0)

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train import Dataset, GenerateSettings, MappedRows, SceneMix, TrainSettings
+from train import MappedRows, TrainSettings
 from train.data.batches import Part, draw_batch
 from train.data.shards import row_dtype
 from train.settings import batch_recipe
-from train.simulation.generation import make_dataset
 
 
 def shards_of(sizes):
@@ -41,13 +40,6 @@ def test_spans_numbers_and_fields_are_those_of_the_rows_in_memory(sizes, data):
         for outside in (-1, len(whole)):
             with pytest.raises(IndexError):
                 mapped[np.array([outside])]
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    make_dataset(GenerateSettings(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
-    return Dataset(out)
 
 
 def test_a_set_that_is_handed_on_is_its_files(dataset):

@@ -124,19 +124,15 @@ def with_cameras(change, name="six"):
     return square_rig(rig.name, poses)
 
 
-def test_opengl_axes_are_told():
-    def turn(poses):
+def test_opengl_axes_and_a_camera_upside_down_are_told():
+    def back(poses):
         poses[:, :3, 1:3] *= -1.0
 
-    (sentence, *_) = faults(with_cameras(turn))
-    assert "OpenGL" in sentence
-
-
-def test_a_camera_upside_down_is_told():
-    def turn(poses):
+    def upside_down(poses):
         poses[2, :3, :2] *= -1.0
 
-    (sentence,) = faults(with_cameras(turn))
+    assert "OpenGL" in faults(with_cameras(back))[0]
+    (sentence,) = faults(with_cameras(upside_down))
     assert sentence.startswith("camera 3 is upside down")
 
 

@@ -160,10 +160,6 @@ def rotations(rng, batch=3):
     return quaternion_matrix(random_quaternions(batch, rng=rng))
 
 
-def everything_of_depth_image(points):
-    return np.ones(points.shape[:2], dtype=bool)
-
-
 @given(seed=seeds)
 @settings(max_examples=40, deadline=None)
 def test_points_keep_the_margin_and_fill_what_is_left(seed):
@@ -254,7 +250,7 @@ def test_every_bright_pixel_is_a_point(seed):
 
 def test_rows_are_y_columns_are_x_and_depth_is_z():
     points = np.array([[[0.1, 0.0, 0.0], [-0.1, 0.0, 0.1], [0.0, 0.05, 0.05], [0.0, -0.05, 0.05]]])
-    image = depth_images(points, everything_of_depth_image(points), STRAIGHT)[0][0]
+    image = depth_images(points, everything(points), STRAIGHT)[0][0]
     assert np.isclose(image[26, 46], 0.1)
     assert np.isclose(image[26, 5], 1.0)
     assert np.isclose(image[36, 26], 0.55)
@@ -265,7 +261,7 @@ def test_rows_are_y_columns_are_x_and_depth_is_z():
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [1, 0, 3, 2]])
 def test_nearer_point_keeps_the_pixel(order):
     points = np.array([[[0.1, 0.0, -0.02], [0.1, 0.0, 0.03], [-0.1, 0.0, 0.08], [-0.1, 0.0, 0.05]]])[:, order]
-    image = depth_images(points, everything_of_depth_image(points), STRAIGHT)[0][0]
+    image = depth_images(points, everything(points), STRAIGHT)[0][0]
     assert np.count_nonzero(image) == 2
     assert np.isclose(image[26, 46], 0.1)
     assert np.isclose(image[26, 5], 0.1 + 0.9 * 0.7)
@@ -274,7 +270,7 @@ def test_nearer_point_keeps_the_pixel(order):
 @pytest.mark.parametrize("shape", ["nothing", "one", "equal", "line", "plane"])
 def test_degenerate_clouds(shape, rng):
     points = rng.uniform(-0.1, 0.1, size=(1, 6, 3)) + 1.0
-    present = everything_of_depth_image(points)
+    present = everything(points)
     if shape == "nothing":
         present[:] = False
     elif shape == "one":

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gloves import load_layout
-from handsim import HandSimWarning
 from handsim.errors import WeightsError
-from train import Corruption, evaluate_labeler, load_labeler
+from train import Corruption, evaluate_labeler
 from train.labelers import layout_labeler
 from train.labelers.layout_labeler import (
     LayoutLabeler,
@@ -22,7 +21,6 @@ from train.labelers.layout_labeler import (
     shipped_network,
 )
 from train.labelers.protocol import learned_folder, learned_gloves
-from train.labelers.storage import shipped_labelers
 
 
 @pytest.fixture(scope="module")
@@ -51,15 +49,6 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     ]
     equal = np.array(names[:60]) == np.array(names[60:])
     assert equal.mean() > 0.97  # the two know the layout from other poses
-
-
-def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, quickly_learned):
-    layout = load_layout("starter6")
-    layout.save(tmp_path / "mine.toml")
-    with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
-        found = load_labeler(str(tmp_path / "mine.toml"), None)
-    assert isinstance(found, LayoutLabeler) and found.marker_names == layout.names
-    assert "any_layout" not in shipped_labelers()
 
 
 def test_the_network_is_saved_and_read_again(tmp_path, monkeypatch):

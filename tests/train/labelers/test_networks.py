@@ -12,6 +12,7 @@ from benchmarks.held_out import held_out_markers
 from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, load_labeler
 from train.labelers import networks
 from train.labelers.networks import (
+    LabelScores,
     LayoutNetwork,
     LayoutNetworkConfig,
     SetLabeler,
@@ -22,67 +23,95 @@ from train.labelers.networks import (
     new_network,
 )
 
+CONFIG = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=2)
 
-@pytest.fixture(scope="module")
-def network():
+
+@pytest.fixture(scope="module", params=["one layout", "any layout"])
+def run(request):
+    """Scores of five labels that a network gives to points, or to those that are present."""
     torch.manual_seed(0)
-    return SetLabeler(SetLabelerConfig(num_labels=5, width=32, gates=8, depth=2)).double().eval()
+    one = request.param == "one layout"
+    config = SetLabelerConfig(num_labels=5, width=32, gates=8, depth=2) if one else CONFIG
+    network = (SetLabeler if one else LayoutNetwork)(config).double().eval()
+
+    def scores(points, present=None, known=None) -> LabelScores:
+        if present is None:
+            present = torch.ones(points.shape[:2], dtype=torch.bool)
+        with torch.inference_mode():
+            if one:
+                return network(points, present)
+            return network(points, present, layout(1) if known is None else known)[-1]
+
+    return scores
 
 
 def cloud(seed: int, count: int = 7) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(seed).uniform(-0.08, 0.08, size=(1, count, 3)))
 
 
-def run(network, points):
-    with torch.inference_mode():
-        return network(points, torch.ones(points.shape[:2], dtype=torch.bool))
+def layout(seed: int, count: int = 5) -> torch.Tensor:
+    """Mean features of a layout of markers that scatter around their places."""
+    rng = np.random.default_rng([7, seed])
+    poses = rng.uniform(-0.08, 0.08, size=(count, 3)) + 0.005 * rng.normal(size=(20, count, 3))
+    return distance_features(torch.from_numpy(poses), CONFIG).mean(0, keepdim=True)
+
+
+def same(before, after) -> None:
+    for one, other in zip(before, after, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-6)
 
 
 @given(seed=st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
-def test_turning_moving_and_mirroring_change_nothing(network, seed):
+@settings(max_examples=20, deadline=None)
+def test_turning_moving_and_mirroring_change_nothing(run, seed):
     points = cloud(seed)
     rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))  # reflections among them
     moved = points @ torch.from_numpy(rotation) + torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
-    for before, after in zip(run(network, points), run(network, moved), strict=True):
-        torch.testing.assert_close(before, after, atol=1e-6, rtol=1e-6)
+    same(run(points), run(moved))
 
 
 @given(seed=st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
-def test_order_only_reorders(network, seed):
-    points = cloud(seed)
-    order = torch.from_numpy(np.random.default_rng(seed).permutation(7))
-    before, after = run(network, points), run(network, points[:, order])
-    torch.testing.assert_close(before.points[:, order], after.points)
-    torch.testing.assert_close(before.labels[..., [*order.tolist(), 7]], after.labels)
+@settings(max_examples=20, deadline=None)
+def test_order_only_reorders(run, seed):
+    points, order = cloud(seed), np.random.default_rng(seed).permutation(7)
+    before = run(points)
+    same((before.points[:, order], before.labels[..., [*order, 7]]), run(points[:, order]))
 
 
-def test_padding_changes_nothing(network):
+def test_padding_changes_nothing(run):
     points = cloud(1)
     padded = torch.cat([points, torch.full((1, 4, 3), 0.5, dtype=torch.float64)], dim=1)
-    present = torch.arange(11)[None] < 7
-    with torch.inference_mode():
-        scores = network(padded, present)
-    alone = run(network, points)
-    torch.testing.assert_close(scores.points[:, :7], alone.points)
-    torch.testing.assert_close(scores.labels[..., [*range(7), 11]], alone.labels)
+    scores = run(padded, torch.arange(11)[None] < 7)
+    same((scores.points[:, :7], scores.labels[..., [*range(7), 11]]), run(points))
 
 
-def test_outputs_are_log_probabilities(network):
-    scores = run(network, cloud(2))
+def test_outputs_are_log_probabilities(run):
+    scores = run(cloud(2))
     assert scores.points.shape == (1, 7, 6)
     assert scores.labels.shape == (1, 5, 8)
-    torch.testing.assert_close(scores.points.exp().sum(-1), torch.ones(1, 7, dtype=torch.float64))
-    torch.testing.assert_close(scores.labels.exp().sum(-1), torch.ones(1, 5, dtype=torch.float64))
+    for table in scores:
+        torch.testing.assert_close(table.exp().sum(-1), torch.ones_like(table[..., 0]))
+
+
+@pytest.mark.parametrize("run", ["any layout"], indirect=True)
+def test_the_order_of_markers_only_reorders(run):
+    points, known, order = cloud(4), layout(4), np.random.default_rng(4).permutation(5)
+    before, after = run(points, known=known), run(points, known=known[:, order][:, :, order])
+    same((before.points[..., [*order, 5]], before.labels[:, order]), after)
+
+
+@pytest.mark.parametrize("run", ["any layout"], indirect=True)
+def test_layouts_of_a_batch_do_not_meet(run):
+    points = torch.cat([cloud(seed) for seed in range(4)])
+    both = run(points, known=torch.cat([layout(0), layout(1)]))
+    parts = run(points[:2], known=layout(0)), run(points[2:], known=layout(1))
+    same(both, [torch.cat(tables) for tables in zip(*parts, strict=True)])
 
 
 def test_loss_is_least_at_the_truth():
     truth, present = torch.tensor([[0, 2, -1]]), torch.ones(1, 3, dtype=torch.bool)
 
     def loss_of(by_point, by_label):
-        from train.labelers.networks import LabelScores
-
         points, labels = torch.full((1, 3, 4), -20.0), torch.full((1, 3, 4), -20.0)
         points[0, range(3), by_point] = 0.0
         labels[0, range(3), by_label] = 0.0
@@ -94,95 +123,13 @@ def test_loss_is_least_at_the_truth():
     assert loss_of([0, 2, 3], [0, 2, 1]) > 5.0
 
 
-CONFIG = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=2)
-
-
-@pytest.fixture(scope="module")
-def layouts_network():
-    torch.manual_seed(0)
-    return LayoutNetwork(CONFIG).double().eval()
-
-
-def cloud_of_layouts(seed: int, count: int = 7) -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).uniform(-0.08, 0.08, size=(1, count, 3)))
-
-
-def layout(seed: int, count: int = 5) -> torch.Tensor:
-    """Mean features of a layout of markers that scatter around their places."""
-    rng = np.random.default_rng([7, seed])
-    poses = rng.uniform(-0.08, 0.08, size=(count, 3)) + 0.005 * rng.normal(size=(20, count, 3))
-    return distance_features(torch.from_numpy(poses), CONFIG).mean(0, keepdim=True)
-
-
-def run_on(layouts_network, points, layouts):
-    with torch.inference_mode():
-        return layouts_network(points, torch.ones(points.shape[:2], dtype=torch.bool), layouts)
-
-
-def same(before, after) -> None:
-    for one, other in zip(before, after, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-6)
-
-
-@given(seed=st.integers(0, 1000))
-@settings(max_examples=15, deadline=None)
-def test_turning_moving_and_mirroring_change_nothing_of_layouts(layouts_network, seed):
-    points = cloud_of_layouts(seed)
-    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))  # reflections among them
-    moved = points @ torch.from_numpy(rotation) + torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
-    for before, after in zip(
-        run_on(layouts_network, points, layout(seed)),
-        run_on(layouts_network, moved, layout(seed)),
-        strict=True,
-    ):
-        same(before, after)
-
-
-@given(seed=st.integers(0, 1000))
-@settings(max_examples=15, deadline=None)
-def test_the_order_of_points_and_of_markers_only_reorders(layouts_network, seed):
-    points, known, rng = cloud_of_layouts(seed), layout(seed), np.random.default_rng(seed)
-    of_points, of_markers = rng.permutation(7), rng.permutation(5)
-    before = run_on(layouts_network, points, known)[-1]
-    after = run_on(layouts_network, points[:, of_points], known[:, of_markers][:, :, of_markers])[-1]
-    same(
-        (
-            before.points[:, of_points][..., [*of_markers, 5]],
-            before.labels[:, of_markers][..., [*of_points, 7]],
-        ),
-        after,
-    )
-
-
-def test_padding_changes_nothing_of_layouts(layouts_network):
-    points = cloud_of_layouts(1)
-    padded = torch.cat([points, torch.full((1, 4, 3), 0.5, dtype=torch.float64)], dim=1)
-    with torch.inference_mode():
-        scores = layouts_network(padded, torch.arange(11)[None] < 7, layout(1))[-1]
-    alone = run_on(layouts_network, points, layout(1))[-1]
-    same((scores.points[:, :7], scores.labels[..., [*range(7), 11]]), alone)
-
-
-def test_layouts_of_a_batch_do_not_meet(layouts_network):
-    points = torch.cat([cloud_of_layouts(seed) for seed in range(4)])
-    both = run_on(layouts_network, points, torch.cat([layout(0), layout(1)]))[-1]
-    first, second = (
-        run_on(layouts_network, points[:2], layout(0))[-1],
-        run_on(layouts_network, points[2:], layout(1))[-1],
-    )
-    same(both, (torch.cat([first.points, second.points]), torch.cat([first.labels, second.labels])))
-
-
-def test_scores_are_probabilities_and_the_loss_falls_with_the_truth(layouts_network):
-    found = run_on(layouts_network, cloud_of_layouts(3), layout(3))
-    for scores in found:
-        for table in scores:
-            torch.testing.assert_close(table.exp().sum(-1), torch.ones_like(table[..., 0]))
-    present = torch.ones(1, 7, dtype=torch.bool)
-    best = found[-1].points.argmax(-1)
+@pytest.mark.parametrize("run", ["any layout"], indirect=True)
+def test_the_loss_of_any_layout_falls_with_the_truth(run):
+    found, present = run(cloud(3), known=layout(3)), torch.ones(1, 7, dtype=torch.bool)
+    best = found.points.argmax(-1)
     likely = torch.where(best == 5, -1, best)
-    worst = found[-1].points[..., :-1].argmin(-1)
-    assert layout_loss(found, likely, present) < layout_loss(found, worst, present)
+    worst = found.points[..., :-1].argmin(-1)
+    assert layout_loss([found], likely, present) < layout_loss([found], worst, present)
 
 
 NAMES = tuple(f"m{number}" for number in range(19))

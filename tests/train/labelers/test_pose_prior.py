@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from gloves import MarkerLayout, MarkerPlace, load_layout
+from gloves import load_layout
 from gloves.fit import attach_markers
 from gloves.layout import list_layouts
 from handsim import HandModel, join_qpos
 from handsim.errors import WeightsError
-from handsim.hand.shape import DIGITS
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes import sample_valid_angles
 from train.labelers.pose_prior import (
@@ -226,16 +225,3 @@ def test_too_few_points_say_nothing(classifier, rng):
 @pytest.mark.parametrize("name", list_layouts())
 def test_no_shipped_layout_is_like_its_mirror_image(name):
     assert not is_mirror_like(load_layout(name))
-
-
-def test_a_symmetric_layout_without_a_thumb_is_like_its_mirror_image():
-    tips = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS[1:]]
-    back = [
-        MarkerPlace(f"back{along}{across}", "palm", along, 0.0, across)
-        for along in (0.3, 0.7)
-        for across in (0.2, -0.2)
-    ]
-    layout = MarkerLayout("symmetric", (*tips, *back), 0.0032)
-    assert is_mirror_like(layout)
-    thumb = MarkerPlace("thumb", "thumb_distal", 0.7, 0.0)
-    assert not is_mirror_like(dataclasses.replace(layout, markers=(*tips, *back, thumb)))

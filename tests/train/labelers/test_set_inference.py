@@ -10,7 +10,7 @@ from benchmarks.held_out import held_out_markers
 from train import SetLabelerConfig, load_labeler
 from train.labelers.networks import SetLabeler
 from train.labelers.protocol import pad_clouds
-from train.labelers.set_inference import CloudScorer, TrainedSetLabeler, _centers, weight_shapes
+from train.labelers.set_inference import CloudScorer, TrainedSetLabeler, weight_shapes
 from train.labelers.storage import load_network
 
 
@@ -22,12 +22,6 @@ def scorer(network: SetLabeler) -> CloudScorer:
 def test_weights_have_the_networks_names_and_shapes(config):
     state = SetLabeler(config).state_dict()
     assert weight_shapes(config) == {name: tuple(one.shape) for name, one in state.items()}
-
-
-@pytest.mark.parametrize("count", range(2, 40))
-def test_the_centers_are_torchs(count):
-    config = SetLabelerConfig(num_distances=count, reach=0.23)
-    np.testing.assert_array_equal(_centers(config), SetLabeler(config).centers.numpy())
 
 
 def compare(network: SetLabeler, points: np.ndarray) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,23 +12,13 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.hand.shape import JOINT_NAMES, JOINTS
-from train import Dataset, GenerateSettings
+from tests.train.reports.conftest import pictures
+from train import Dataset
 from train.data.shards import row_dtype
 from train.reports import dataset_page as report
-from train.simulation import generation
-from train.simulation.generation import make_dataset
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "small"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "ROWS_PER_SHARD", 150)
-        make_dataset(GenerateSettings(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
-    return Dataset(out)
 
 
 @pytest.fixture
@@ -40,11 +28,6 @@ def rows():
     made["markers"][..., 0] = [[0.0, 0.030, 0.070]] * 3 + [[0.0, 0.010, 0.070]]
     made["ghosts"] = np.nan
     return made
-
-
-def pictures(page: Path) -> list[str]:
-    found = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page.read_text("utf-8"))
-    return [base64.b64decode(picture).decode() for picture in found]
 
 
 def test_angles_are_counted_over_the_joints_own_range(rows):

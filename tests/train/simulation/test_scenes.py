@@ -126,13 +126,6 @@ def test_a_part_of_the_displacement_repeats_with_the_pose_in_the_frame_of_the_wr
     assert rest.std() == pytest.approx(NOISE, rel=0.05)
 
 
-def test_the_same_seed_gives_the_same_take_of_two_hands():
-    take, again = real_like(), simulate_take(kind="real-like", num_frames=FRAMES)
-    np.testing.assert_array_equal(take.points, again.points)
-    assert [hand.side for hand in take.hands] == ["right", "left"]
-    assert take.num_frames == FRAMES and take.settings["kind"] == "real-like"
-
-
 def test_hands_are_faster_than_in_the_twin_of_two_hands():
     layout = load_layout("dense19")
 
