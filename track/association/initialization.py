@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
@@ -436,9 +435,10 @@ def _clouds(
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
     """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
-    number = np.zeros(len(points), dtype=np.int64)
-    if len(points) > 1:
-        number = fcluster(linkage(points, "single"), distance, "distance")
+    near = ((points[:, None] - points) ** 2).sum(axis=-1) <= distance**2
+    before, number = np.zeros(0, dtype=np.int64), np.arange(len(points))
+    while not np.array_equal(before, number):  # each point takes the least number of its neighbors
+        before, number = number, np.where(near, number, len(points)).min(axis=1, initial=len(points))
     groups = [np.flatnonzero(number == one) for one in dict.fromkeys(number)]
     return sorted(groups, key=len, reverse=True)
 
@@ -452,5 +452,14 @@ def distances_to_nearest(
 
 
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
-    """The least distance at which the points of each frame are linked to one group [m]."""
-    return np.array([linkage(frame, "single")[-1, 2] for frame in points])
+    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
+    frames, longest = np.arange(len(points)), np.zeros(len(points))
+    added, apart = np.zeros(len(points), dtype=np.int64), np.full(points.shape[:2], np.inf)
+    in_tree = np.zeros(points.shape[:2], dtype=np.bool_)
+    for _ in range(1, points.shape[1]):
+        in_tree[frames, added] = True
+        squares = ((points - points[frames, added][:, None]) ** 2).sum(axis=-1)
+        apart = np.where(in_tree, np.inf, np.minimum(apart, squares))
+        added = apart.argmin(axis=1)
+        longest = np.maximum(longest, apart[frames, added])
+    return np.sqrt(longest)

@@ -136,10 +136,10 @@ def test_a_cache_that_cannot_be_written_costs_no_labels(quickly_learned, monkeyp
 @pytest.mark.slow
 def test_a_glove_of_tips_is_labeled_better_after_some_steps():
     layout = load_layout("tips8")
-    markers = sample_worn_markers(layout, 300, rng=np.random.default_rng(1))
+    markers = sample_worn_markers(layout, 600, rng=np.random.default_rng(1))
     shipped = {name: value.clone() for name, value in shipped_network().state_dict().items()}
     fresh = LayoutLabeler.at_once(layout)
-    tuned = fine_tuned_labeler(layout, num_clouds=2000)
+    tuned = fine_tuned_labeler(layout, num_clouds=4000)
     right = [
         evaluate_labeler(one, markers, Corruption(2, 2), rng=np.random.default_rng(2)).figures[
             "slot_accuracy"
