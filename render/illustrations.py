@@ -358,7 +358,7 @@ def draw_camera(
 def zoom(towards: Doubles, points: Doubles, up: Doubles, size: tuple[int, int]) -> float:
     """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
-    for _ in range(20):  # until the nearest position for the angle is the camera's
+    for _ in range(20):  # iterates until the place computed from the angle is the camera's
         view = view_along(towards, up, points, size, field_of_view=angle)
         distance = float(np.linalg.norm(points.mean(axis=0) - view.T_world_camera[:3, 3]))
         angle = 2 * np.arctan(np.tan(angle / 2) * distance / float(np.linalg.norm(towards)))

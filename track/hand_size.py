@@ -40,7 +40,10 @@ from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
-_SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longest in ANSUR II
+_SHORTEST, _LONGEST = (
+    0.125,
+    0.225,
+)  # hand lengths that are tried [m]: 0.6 of an adult's to beyond ANSUR II's longest
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] change of length after which the hands are labeled again
 _PRECISION: Final = 0.001  # [m] of length

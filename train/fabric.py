@@ -42,7 +42,7 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
             f"{here} processes were started on this machine, expected 1 to {torch.cuda.device_count()}: one "
             "for each GPU"
         )
-    torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
+    torch.set_flush_denormal(True)  # features of distances underflow, and denormal numbers make a core slow
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages do not concern users
     warnings.filterwarnings("ignore", module="lightning_fabric")
     if nodes == 1 and sys.platform in _LOOPBACK:  # connections on one machine stay off the network

@@ -222,7 +222,7 @@ class GrownArchive:
             told()
 
     def _column(self, column: Column, block: _Block) -> NDArray[Any]:
-        """A column of one block."""
+        """The values of one field in one block of an archive."""
         at = block.at
         for other in self._columns:
             count = block.points if other.of_points else block.frames

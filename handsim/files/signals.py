@@ -99,7 +99,7 @@ class _Persistent(Stopped):
         self._block = block
 
     def __del__(self) -> None:
-        if not self._block.left:  # from another thread: raised here, it would be lost at once
+        if not self._block.left:  # what is raised in __del__ is lost: a thread sends the signal again
             threading.Timer(_AGAIN, self._block.send, (self.number,)).start()
 
 

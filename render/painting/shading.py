@@ -183,7 +183,7 @@ def _fall(
 
 GAMMA: Final = 2.2
 _FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
-_LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces over the map's bias
+_LIFT: Final = 1.7  # shadow look-ups start this many biases of the map off a slanted surface
 _UNDER: Final = 0.012  # depth in the skin that scattered light passes at a scatter of 1 [m]
 _PI: Final = np.float32(np.pi)
 _ZERO: Final = np.float32(0.0)

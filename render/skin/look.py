@@ -142,7 +142,7 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
     redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
-    # Palms of all people lie close together, near what light skin has on the back.
+    # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
     paleness = rng.uniform(0.6, 0.75)
     palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(0.0, 2.0)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0

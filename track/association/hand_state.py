@@ -36,7 +36,7 @@ from track.kinematics.pose_spread import (
 _LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand
 _VELOCITY_SMOOTHING: Final = 0.6  # share of the newest velocity in the smoothed one
 _HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit that lacks markers
-_WRIST_SPREAD: Final = 0.001  # [m] of the wrist's predicted position in the same frame
+_WRIST_SPREAD: Final = 0.001  # standard deviation of the wrist's place as predicted within a frame [m]
 _WRIST_ACCELERATION: Final = 10.0  # [m/s^2] unforeseen
 _WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # of its predicted orientation in the same frame
 _WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] unforeseen
@@ -302,7 +302,7 @@ class HandState:
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
-        """Shift the hand's markers by their biases, and update the typical bias and the least variances."""
+        """Shift the hand's markers by their learned biases, and update what depends on these."""
         self._typical_bias = _shift_markers(
             self._bias_frames, self._bias, self._designed, self._variance, self.adapted.positions
         )

@@ -81,7 +81,7 @@ class _Search:
     """Where a search for some hands among points of more than one stands."""
 
     turn: int = 0  # number of calls before this one
-    best_turn: int = 0  # the one that gave the best hand so far, though none that is certain
+    best_turn: int = 0  # number of the rotation that gave the best hand so far
     score: float = -np.inf  # of that hand
 
 
@@ -285,7 +285,7 @@ class HandInitializer:
         return hands
 
     def _uncrossed(self, hands: list[InitializedHand]) -> list[InitializedHand]:
-        """Two hands, with the points of a digit exchanged where both together fit better so."""
+        """Two hands, with the points of a digit exchanged between them where both together fit better so."""
         # A thumb fits the other hand's palm nearly as well as its own where hands touch.
         if len(hands) != 2:
             return hands

@@ -70,8 +70,9 @@ def _exchange(
     positions: NDArray[np.float64],
 ) -> NDArray[np.int64]:
     """Kernel of `exchange_labels`: overwrites the labels, returns the points whose label has changed."""
-    # What an exchange of i and j gains, (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is
-    # -(p_i-p_j).(m_i-m_j) / s^2. The pair that gains most comes first; a point is exchanged once.
+    # The gain of exchanging the labels of points p_i and p_j with predicted markers m_i and m_j,
+    # (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is -(p_i-p_j).(m_i-m_j) / s^2.
+    # The pair that gains most comes first; a point is exchanged once.
     labeled = np.flatnonzero(labels >= 0)
     changed = np.empty(len(labeled), dtype=np.int64)
     count = 0

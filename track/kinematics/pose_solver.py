@@ -86,7 +86,7 @@ class _PosePrior(NamedTuple):
 
 
 _NO_ROWS: Final = np.empty((0, NUM_JOINTS))
-_NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero
+_NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # no rotation, and zero precisions
 
 
 @dataclass(frozen=True, slots=True, eq=False)

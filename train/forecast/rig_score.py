@@ -71,7 +71,9 @@ _OFF_CENTER: Final = 0.5  # distance of the working point from where simulated h
 _NARROW_ANGLE: Final = 30.0  # largest angle between two cameras [deg]
 _SMALL_MARKER: Final = 2.0  # diameter of a marker in the picture [px]
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
-_UPSIDE_DOWN: Final = -0.2  # cosine between the picture's up and the world's
+_UPSIDE_DOWN: Final = (
+    -0.2
+)  # cosine of the picture's up and the world's up, below which a camera is upside down
 
 
 class VolumeMap(NamedTuple):

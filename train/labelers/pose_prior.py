@@ -175,8 +175,8 @@ def errors_of_products(
 def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float, tolerance: float) -> float:
     """Largest eigenvalue of Horn's matrix of a sum of outer products, from a bound above it (Theobald 2005).
 
-    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0; where `mirrored`, that of the product with the
-    other sign of its first row, which is the sign of c1.
+    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0. For a mirrored cloud, whose first coordinates
+    have the other sign, only the sign of c1 changes.
     """
     a, b, c, d, e, f, g, h, i = product
     xx, yy, zz = a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i

@@ -65,7 +65,7 @@ class TrainedSetLabeler:
 
 
 class _Norm(NamedTuple):
-    """Layer norms of D rounds."""
+    """Weights of the layer normalization in each of the D rounds of messages."""
 
     weight: Float32[np.ndarray, "D W"]
     bias: Float32[np.ndarray, "D W"]
