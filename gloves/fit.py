@@ -274,7 +274,7 @@ def _settled(layout: MarkerLayout, wanted: MarkerLayout, model: HandModel) -> At
         for index in missed:
             markers[index] = _on_the_way(layout.markers[index], wanted.markers[index], share)
         worn, missed, _ = _put_on(markers, wanted, model)
-        if share > 0.0:
+        if share > 0.0 and wanted is not layout:
             missed = sorted({*missed, *_leaps(layout, worn, markers, model)})
         if not missed:
             return dataclasses.replace(worn, layout=dataclasses.replace(wanted, markers=tuple(markers)))
