@@ -30,10 +30,9 @@ _NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
 _DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
 # The digits of the palm's capsules: the fingers' metacarpals, and the wrist for the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-_KNUCKLE_SLACK: Final = 0.003  # [m] that a palm's marker may be nearer to a digit's bone than to the palm's
 # From the wanted place of a marker (1) back to where it was designed (0), and to the middle of its bone (-1).
 _WAY_BACK: Final = (1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0)
-_DEEP: Final = 0.02  # [m] from a bone to the skin, more than in a finger or the back of the hand
+_SIDEWAYS: Final = np.deg2rad(60.0)  # from the back of a bone
 _LONGEST_SLIP: Final = 0.025  # [m]
 _SLACK: Final = 1e-9  # of barycentric weights, so that a ray through an edge meets a face
 
@@ -181,25 +180,31 @@ def _put_on(
     weights = np.clip(np.take_along_axis(full, indices, axis=1), 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
     bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
-    others = _other_digits(feet, points, bones, model)
+    others = _other_digits(feet, points, bones, indices[:, 0], model)
     others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]
     astray = np.flatnonzero(missed | (np.array(others) != "")).tolist()
     return Attachment(layout, points, normals, indices, weights), astray, others
 
 
 def _other_digits(
-    feet: NDArray[np.float64], points: NDArray[np.float64], bones: NDArray[np.int64], model: HandModel
+    feet: NDArray[np.float64],
+    points: NDArray[np.float64],
+    bones: NDArray[np.int64],
+    carriers: NDArray[np.int64],
+    model: HandModel,
 ) -> list[str]:
     """For each marker the nearest bone of the flat hand if it is of another digit, "" otherwise.
 
     A finger's metacarpal counts as the finger's for its own markers, and as the palm's for the palm's; a
-    thumb's marker may lie over the index finger's metacarpal and the wrist. The end of a stalk may not be
-    inside another digit.
+    thumb's marker may lie over the index finger's metacarpal and the wrist. What the palm carries more than
+    any other bone, such as the skin over the thumb's muscle and the knuckles, is the palm's. The end of a
+    stalk may not be inside another digit.
 
     Args:
         feet: The places under the markers on the skin (M, 3) [m].
         points: The markers' centers (M, 3) [m].
         bones: The bone of each marker (M,).
+        carriers: The bone that carries most of the skin there (M,).
     """
     capsules = model.capsules
     axes = capsules.posed(model.rest_transforms[None])[0]
@@ -209,7 +214,7 @@ def _other_digits(
     distances = _axis_distances(feet, axes)
     nearest = np.where(own, distances, np.inf).min(axis=1)
     rival = np.where(own, np.inf, distances)
-    slack = np.where(digits[:, 0] < 0, _KNUCKLE_SLACK, 0.0)
+    slack = np.where((digits[:, 0] < 0) & (carriers == PALM), np.inf, 0.0)
     inside = np.where(own, np.inf, _axis_distances(points, axes) - capsules.radii)
     return [
         BONE_NAMES[capsules.bones[depths.argmin() if depths.min() < 0.0 else others.argmin()]]
@@ -275,23 +280,25 @@ def _settled(layout: MarkerLayout, wanted: MarkerLayout, model: HandModel) -> At
             markers[index] = _on_the_way(layout.markers[index], wanted.markers[index], share)
         worn, missed, _ = _put_on(markers, wanted, model)
         if share > 0.0 and wanted is not layout:
-            missed = sorted({*missed, *_leaps(layout, worn, markers, model)})
+            missed = sorted({*missed, *_leaps(layout, worn, model)})
         if not missed:
             return dataclasses.replace(worn, layout=dataclasses.replace(wanted, markers=tuple(markers)))
     return attach_markers(layout, model)
 
 
-def _leaps(
-    layout: MarkerLayout, worn: Attachment, markers: Sequence[MarkerPlace], model: HandModel
-) -> list[int]:
-    """Markers deep in the flesh that a small shift carries far over the skin, as from palm to thumb."""
-    origins = np.array([_ray(marker, model)[0] for marker in markers])
-    deep = np.flatnonzero(np.linalg.norm(worn.points - origins, axis=1) - layout.heights > _DEEP).tolist()
-    if not deep:
+def _leaps(layout: MarkerLayout, worn: Attachment, model: HandModel) -> list[int]:
+    """Markers that a small slip carries far over the skin, as between the palm and the thumb's muscle."""
+    broad = (BONE_NAMES[PALM], "thumb_metacarpal")
+    tried = [
+        index
+        for index, marker in enumerate(layout.markers)
+        if marker.bone in broad and abs(marker.around) > _SIDEWAYS
+    ]
+    if not tried:
         return []
     designed, missed, _ = _put_on(layout.markers, layout, model)
     moved = np.linalg.norm(worn.points - designed.points, axis=1)
-    return [index for index in deep if index not in missed and moved[index] > _LONGEST_SLIP]
+    return [index for index in tried if index not in missed and moved[index] > _LONGEST_SLIP]
 
 
 def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:

@@ -211,6 +211,15 @@ def test_a_place_in_the_web_between_fingers_is_refused_with_the_bone_it_would_be
     attach(worn_by(MarkerPlace("R1", bone, 0.7, np.deg2rad(around))), "M")
 
 
+def test_the_skin_that_the_palm_carries_is_the_palms():
+    thenar = MarkerPlace("P1", "palm", 0.3, np.pi, across=0.2)
+    knuckle = MarkerPlace("P2", "palm", 1.0, 0.0, across=0.2)
+    for size in ("XS", "M", "XL"):
+        attach(worn_by(thenar, knuckle), size)
+    with pytest.raises(LayoutError, match="would lie on little_proximal"):
+        attach(worn_by(dataclasses.replace(knuckle, along=1.2, across=-0.35)), "M")
+
+
 def test_a_stalk_that_ends_inside_the_neighboring_finger_is_refused():
     side = MarkerPlace("M1", "middle_middle", 0.4, np.pi / 2)
     attach(worn_by(side), "M")
