@@ -216,7 +216,7 @@ def test_the_skin_that_the_palm_carries_is_the_palms():
     knuckle = MarkerPlace("P2", "palm", 1.0, 0.0, across=0.2)
     for size in ("XS", "M", "XL"):
         attach(worn_by(thenar, knuckle), size)
-    with pytest.raises(LayoutError, match="would lie on little_proximal"):
+    with pytest.raises(LayoutError, match="would lie on ring_proximal"):
         attach(worn_by(dataclasses.replace(knuckle, along=1.2, across=-0.35)), "M")
 
 
