@@ -131,7 +131,7 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
 
 
 def _refusal(marker: MarkerPlace, other: str) -> str:
-    """The sentence about a marker that meets no skin, or the skin of another digit."""
+    """The error message for a marker whose place has no skin, or skin of another digit."""
     place = f"along {marker.along:g}, "
     palm = marker.bone == BONE_NAMES[PALM]
     place += f"across {marker.across:g}" if palm else f"around {np.rad2deg(marker.around):g}"

@@ -247,7 +247,7 @@ class LabelingReport:
     """Share of each frame's slots that are right."""
 
     def interval(self, people: Int[np.ndarray, "T"]) -> tuple[float, float]:
-        """The 95 % interval of the slot accuracy by a bootstrap over people, two at least.
+        """The 95 % interval of the slot accuracy, by a bootstrap over two or more people.
 
         Args:
             people: The person of each frame, as numbers.

@@ -295,6 +295,7 @@ class _Run:
                 labeler, rows["markers"].astype(np.float64), CLEAN, rng=np.random.default_rng(0)
             ),
         }
+        count = len(np.unique(people))
         card = {
             "marker_names": list(names),
             "trained_on": "simulated frames only",
@@ -303,10 +304,8 @@ class _Run:
             "dataset": self.manifest.config,
             "train": settings.record() | {"devices": self.state.fabric.world_size},
             "held_out_simulated": {name: one.figures for name, one in reports.items()},
-            "held_out_people": len(np.unique(people)),
-            "held_out_intervals": {
-                name: one.interval(people) for name, one in reports.items() if len(np.unique(people)) > 1
-            },
+            "held_out_people": count,
+            "held_out_intervals": {name: one.interval(people) for name, one in reports.items() if count > 1},
             "curve": self.state.history.accuracies,
         }
         return card, report

@@ -87,7 +87,7 @@ def known_types() -> list[Any]:
 
 
 def _type_of(row: str | list[Any], known: list[Any]) -> Any:
-    """The type that a row tells: a number, a literal, an array, or a tuple of earlier rows."""
+    """The numba type that a row of the table describes; tuples are made of the types of earlier rows."""
     from numba import types
 
     if isinstance(row, list):

@@ -210,7 +210,7 @@ def _add_osim_capsule(
 
 
 def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
-    """Add the joint of a bone other than the palm: one hinge, or two in turn."""
+    """Add the one or two hinges that connect a bone with its parent bone."""
     side, skeleton = model.shape.side, model.skeleton
     hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == bone]
     names = [f"{side}_{JOINTS[index].name}" for index in hinges]

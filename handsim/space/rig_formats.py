@@ -1,4 +1,4 @@
-"""Calibrations of cameras as other programs write them: Vicon, Qualisys, Motive and COLMAP.
+"""Readers of the camera calibration files of Vicon, Qualisys, Motive and COLMAP.
 
 Vicon Nexus, Shogun, Tracker and Blade keep an `.xcp` beside a capture. A `KeyFrame` has the position [mm] and
 the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down, z ahead.

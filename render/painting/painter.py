@@ -331,7 +331,7 @@ def whole_levels(background: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, 
 
 @kernel
 def _mix(painted: Bytes, background: Floats, mixed: Bytes) -> None:
-    """Write painted colors with coverage (P, 4) over a background (P, 3), whose bytes `mixed` has."""
+    """Blend painted colors with coverage (P, 4) over the background (P, 3) that `mixed` holds, in place."""
     for pixel in range(len(mixed)):
         if painted[pixel, 3]:
             clear = 1.0 - painted[pixel, 3] / 255.0

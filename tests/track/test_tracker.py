@@ -343,7 +343,7 @@ def test_five_hundred_strays_around_and_among_the_hands(tracker, take, spread, l
 
 
 def test_hands_that_come_up_amid_strays_are_not_made_up(tracker, take):
-    """Among so many they may stay lost; once alone they are found at once."""
+    """Hands may stay lost among five hundred strays, and are found at once when the strays are gone."""
     rng = np.random.default_rng(0)
 
     def change(number: int, fed: Fed) -> Fed:

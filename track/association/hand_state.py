@@ -56,7 +56,7 @@ _RETURN_TIME: Final = 0.01  # [s] over the time it was hidden is a marker's chan
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that chance
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that had another point while this one was visible."""
-STRAY_LIFETIME: Final = 0.1  # mean time for which a stray point lives [s]
+STRAY_LIFETIME: Final = 0.1  # mean time for which a stray point is seen [s]
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds that a point's age contributes
 
 

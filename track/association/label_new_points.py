@@ -237,7 +237,7 @@ def assign_jointly(
     assigned: Int[np.ndarray, "N"],
     margins: Float[np.ndarray, "N"],
 ) -> None:
-    """Assign points to digits: the best combination of hypotheses, and what each label is better by."""
+    """Choose the best hypothesis of each digit together, and the margin of each label over the next best."""
     pending = candidates.counts > 0
     group = np.empty(len(pending), dtype=np.int64)
     for first in range(len(pending)):

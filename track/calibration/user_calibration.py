@@ -333,8 +333,8 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
 
 def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray, "T M 3"]) -> float:
     """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints."""
-    # It is the correlation, in the wrist's frame, with the frame whose joint angles are nearest. Noise that
-    # is independent from frame to frame gives zero.
+    # The share is the correlation of residuals, in the wrist's frame, between each frame and the frame whose
+    # joint angles are nearest. Noise that is independent from frame to frame gives zero.
     from scipy.spatial import cKDTree
 
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)

@@ -36,7 +36,7 @@ from track.kinematics.marker_kinematics import (
 FEWEST_MARKERS: Final = 4  # least number of markers of a frame for a pose to be solved
 FEWEST_ON_PART: Final = 3
 """Markers that determine a digit's hinges, also when it is straight, or a palm's pose."""
-RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # hinge angles of a relaxed hand [rad]
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # joint angles of a relaxed hand [rad]
 # Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
 # knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
 # finger, opposed, opposed and bent, across the palm.

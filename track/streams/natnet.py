@@ -63,7 +63,7 @@ VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # points that fit into a datagram
 _MOST_CLIENTS: Final = 8
 _CLIENT_TIMEOUT: Final = 10.0  # time without a packet after which a client is gone [s]
-_WAIT: Final = 0.05  # longest wait for a client's packet [s]
+_WAIT: Final = 0.05  # longest time that the server waits for a client's packet [s]
 _NUMBERS: Final = 1 << 31  # frame numbers and IDs wrap around here
 
 
