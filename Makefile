@@ -25,6 +25,7 @@ demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
 test: $(DEVELOPER) drawing lint  ## lint, and every test that is quick
+	@$(BIN)/handsim doctor --compile >/dev/null
 	$(BIN)/pytest -n 2 --dist loadgroup --max-worker-restart 0 --durations 20 -m "not slow" -o faulthandler_timeout=600
 
 test-slow: $(DEVELOPER) drawing  ## the other tests

@@ -273,9 +273,9 @@ def test_a_mistake_is_one_sentence(command, folder, capsys, monkeypatch):
     before = {path.name for path in folder.iterdir()}
     assert main(command.split()) == 1
     *announced, said = capsys.readouterr().err.splitlines()
-    assert set(announced) <= {
-        "getting ready", "putting the glove on", "compiling what is new, once on this machine"
-    }  # fmt: skip
+    # How far compiling is comes in as many lines as it takes.
+    stages = {line for line in announced if not line.startswith("compiling ")}
+    assert stages <= {"getting ready", "putting the glove on"}
     assert said.startswith(f"handsim {command.split()[0]}: ")
     assert_names(said, CASES[command])
     assert {path.name for path in folder.iterdir()} == before, "something was left behind"
