@@ -264,7 +264,8 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
 def _slips_section(dataset: Dataset) -> Section:
     """Where slips of the glove put each marker."""
     config = dataset.manifest.config
-    given = {name: config[name] for name in ("population", "slip_along", "slip_around") if name in config}
+    names = ("population", "slip_along", "slip_around")
+    given = {name: value for name, value in config.items() if name in names}
     settings, model = GenerateSettings.from_json(given), HandModel.named("M")
     slips = slipped_gloves(dataset.layout, model, settings, rng=np.random.default_rng(0))
     text = (

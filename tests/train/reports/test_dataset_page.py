@@ -131,8 +131,8 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
     assert main(command) == 0  # the same command goes on in a folder that holds a report
     assert (out / "report.html").read_bytes() == first
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.json", "hands-00000.npy", "manifest.json", "redrawn-00000.json", "report.html",
-        "rows-00000.npy",
+        "checksums-00000.json", "config.json", "hands-00000.npy", "manifest.json", "redrawn-00000.json",
+        "report.html", "rows-00000.npy",
     ]  # fmt: skip
 
 
