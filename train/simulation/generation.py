@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pickle
-import sys
 import warnings
 from collections import Counter
 from concurrent.futures import Executor
@@ -18,7 +17,7 @@ from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim._plugins import plugin_name
 from handsim.app.output import Output, Place, open_output, place_of
-from handsim.app.workers import check_workers, run_jobs
+from handsim.app.workers import check_workers, main_script, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.inputs import load_json
@@ -129,9 +128,7 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
         return allowed
     try:
         pickle.dumps(sampler)
-        alone = getattr(sampler, "__module__", "") == "__main__" and not hasattr(
-            sys.modules["__main__"], "__file__"
-        )  # as in a notebook
+        alone = getattr(sampler, "__module__", "") == "__main__" and main_script() is None
     except Exception:  # a user's object may raise anything
         alone = True
     if alone and workers is not None:
