@@ -161,8 +161,8 @@ def score_glove(
         score = glove_score.score_glove(glove, settings, on_step=step)
     for title, report in (
         ("as the rig sees them", score.observed),
-        ("where every marker is seen", score.clean),
         ("with the paper's drops and ghosts", score.corrupted),
+        ("where every marker is seen", score.clean),
     ):
         print_line(f"{percent(report.figures['slot_accuracy'])} % of the slots right {title}")
     sides = f"{percent(score.sides_right)} % of the hands told left from right"

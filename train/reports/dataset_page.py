@@ -36,10 +36,11 @@ def write_dataset_page(
 ) -> Path:
     """Write the page on a training set, with gaps of markers that are `present` in a take at a rate [Hz]."""
     rows, manifest = sample_rows(dataset), dataset.manifest
+    rig = load_rig(manifest.config["rig"])
     sections = [
         _figures_section(dataset, rows),
         _angles_section(rows),
-        _sight_section(rows, dataset),
+        _sight_section(rows, dataset, len(rig.positions)),
         _ghosts_section(rows),
         _neighbors_section(rows, 2.0 * float(manifest.config["layout"]["radius"])),
     ]
@@ -49,8 +50,8 @@ def write_dataset_page(
         path,
         sections,
         title=f"Training set {dataset.path.resolve().name}",
-        lead=f"{manifest.num_frames:,} frames of glove {manifest.config['layout']['name']} before rig "
-        f"{manifest.config['rig']}, seed {manifest.config['seed']}.",
+        lead=f"{manifest.num_frames:,} frames of glove {manifest.config['layout']['name']} before the "
+        f"{len(rig.positions)} cameras of rig {rig.name}, seed {manifest.config['seed']}.",
     )
     return path
 
@@ -145,17 +146,20 @@ def _draw_angles(
     figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=Paint.SOFT)
 
 
-def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
-    """How often each marker is lost, and how many cameras see it."""
+def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset, num_cameras: int) -> Section:
+    """How often each marker is lost, and how many cameras have a free view of it."""
     manifest = dataset.manifest
     least = manifest.min_cameras
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
-    shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
+    shares = camera_shares(rows, num_cameras)
     text = (
-        f"A marker has a point when the rays of at least {least} cameras meet; other hands, "
-        "held objects, merged blobs and lost pictures are included."
+        f"A marker has a point when the rays of at least {least} cameras meet; otherwise it is lost. Cameras "
+        "without a free view, merged blobs, missed blobs and lost pictures are all included."
     )
-    caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
+    caption = (
+        "Left: how often each marker is lost, for whatever reason. Right: how many of "
+        f"{num_cameras} cameras have a free view of it, past hands and held objects alone."
+    )
     size = (10.8, 1.6 + 0.21 * len(lost))
     drawn = picture(size, _draw_visibility, manifest.marker_names, lost, shares, least)
     return Section("Occlusion", text, pictures=[(drawn, caption)])
@@ -174,7 +178,7 @@ def _draw_visibility(
     seen_by: Float[np.ndarray, "M C+1"],
     min_cameras: int,
 ) -> None:
-    """Draw the share of frames without each marker, and beside it the number of cameras that see it."""
+    """Draw the share of frames that lose each marker, and beside it the number of cameras in free view."""
     rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
     left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
@@ -185,7 +189,7 @@ def _draw_visibility(
     left.set_yticks(rows, names, color=Paint.INK, parse_math=False)
     left.set_ylim(len(names) - 0.4, -0.6)
     left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
-    left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
+    left.set_xlabel("frames in which it is lost [%]")
     left.tick_params(axis="y", length=0)
     most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
     shades = right.pcolormesh(
@@ -200,7 +204,7 @@ def _draw_visibility(
     least = min_cameras - 0.5
     right.axvline(least, color=Paint.WARM, linewidth=1.4)
     annotate(right, f"at least {min_cameras}", (least, -0.5), (3, 3), color=Paint.WARM, fontsize=8.0)
-    right.set_xlabel("cameras that see it")
+    right.set_xlabel("cameras with a free view of it")
     right.locator_params(axis="x", integer=True)
     right.tick_params(axis="y", length=0)
     right.spines["left"].set_visible(False)

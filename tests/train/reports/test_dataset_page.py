@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +13,9 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.hand.shape import JOINT_NAMES, JOINTS
+from handsim.space.rig import CameraRig, load_rig
 from tests.train.reports.conftest import pictures
-from train import Dataset
+from train import Dataset, generate_dataset
 from train.data.shards import row_dtype
 from train.reports import dataset_page as report
 
@@ -107,6 +109,14 @@ def test_the_page_shows_the_sets_figures_and_is_the_same_every_time(dataset, tmp
     again.write_text("an old report")
     assert report.write_dataset_page(again, dataset).read_bytes() == page.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.html", "two.html"]
+
+
+def test_a_rig_of_ones_own_is_named_in_a_word(tmp_path):
+    rig = CameraRig("garage", load_rig("figure5").cameras[:9])
+    made = generate_dataset(tmp_path / "set", num_frames=20, frames_per_hand=20, rig=rig, workers=1)
+    text = report.write_dataset_page(tmp_path / "page.html", made).read_text("utf-8")
+    (lead,) = re.findall(r'<p class="lead">(.*?)</p>', text)
+    assert lead == "20 frames of glove dense19 before the 9 cameras of rig garage, seed 0."
 
 
 def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
