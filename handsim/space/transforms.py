@@ -25,6 +25,20 @@ def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
+def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a world in which an axis points up to ours, with z up."""
+    return file_axes("z").T @ file_axes(up)
+
+
+def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """Poses in a rotated world: positions and orientations (wxyz), and what follows them; NaN stays."""
+    turned = np.array(poses, dtype=np.float64)
+    w, x, y, z = rotation_quaternions(turn[None])[0]
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ product.T
+    return turned
+
+
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) about one unit axis by `angle` (...) [rad] (Rodrigues' formula)."""
     x, y, z = axis
