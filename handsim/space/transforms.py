@@ -27,7 +27,7 @@ def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
 
 def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of a world in which an axis points up to ours, with z up."""
-    return file_axes("z").T @ file_axes(up)
+    return np.asarray(file_axes("z").T @ file_axes(up))
 
 
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
