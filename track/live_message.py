@@ -167,6 +167,7 @@ class MessageFormat(NamedTuple):
 
     header: Callable[[LiveHeader], bytes]
     frame: Callable[[LiveMessage], bytes]
+    end: Callable[[], bytes]
     is_text: bool = False
 
 
@@ -184,6 +185,7 @@ def document_format(name: str, *, points: bool = False) -> MessageFormat:
     return MessageFormat(
         lambda header: encode(header_document(header)),
         lambda message: encode(frame_document(message, points=points)),
+        lambda: encode({"type": "end", "schema": SCHEMA}),
         is_text=name == "json",
     )
 
