@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import monotonic
@@ -23,6 +23,7 @@ from track.frames import StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
+from track.streams import NoServerError
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
 
 _MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
@@ -100,8 +101,8 @@ def track_live(
     until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()
     with (
-        open_source(address, ended=lambda: interrupted() or monotonic() >= until) as stream,
         LiveStatus() as status,
+        _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
         ExitStack() as stack,
     ):
         doubt = _Doubt(stream, status)
@@ -149,6 +150,15 @@ def track_live(
     for output in outputs:
         notes += output.notes()
     return LiveTake(take, count, (*notes, *filter(None, [stream.point_doubt])))
+
+
+def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:
+    """Open a stream as soon as its server answers."""
+    while True:
+        try:
+            return open_source(address, ended=ended)
+        except NoServerError as error:  # each try takes some seconds
+            status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
 
 
 def _measured_setup(
