@@ -28,16 +28,20 @@ from handsim._checks import check_methods, check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.space.transforms import PROGRAMS
 from track.frames import StreamedFrame, TrackedFrame
 from track.live_message import (
     FORMATS,
     SCHEMA,
+    WORLD,
+    Content,
     LiveHeader,
     LiveMessage,
     LiveSink,
     MessageEncoder,
     MessageFormat,
     document_format,
+    in_axes,
 )
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
@@ -52,7 +56,8 @@ GROUP: Final = "handsim.sinks"
 STATUSES: Final = tuple(reversed(Status))
 """Values of a status channel of LSL are indices of these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
-_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # valid values of each option
+_AXES_OF: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y")}  # valid values of each option
+_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes"), "joints": ("no", "openxr"), **_AXES_OF}
 _SERVED: Final = {**_DOCUMENTS, "every": ("no", "yes")}
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
@@ -163,14 +168,20 @@ def open_sink(address: str) -> LiveSink:
     """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
-        options: Mapping[str, tuple[str, ...]] = {"osc": {}, "udp": _DOCUMENTS, "ws": _SERVED}[scheme]
-        parts = split_address(address, options=options, any_port=scheme == "ws")
+        valid: Mapping[str, tuple[str, ...]] = {"osc": _AXES_OF, "udp": _DOCUMENTS, "ws": _SERVED}[scheme]
+        host, port, options = split_address(address, options=valid, any_port=scheme == "ws")
+        content = Content(
+            points=options.get("points") == "yes",
+            joints=options.get("joints") == "openxr",
+            axes=options["axes"],
+            up="y" if options["up"] == "y" else "z",
+        )
         if scheme == "osc":
-            return DatagramSink(parts.host, parts.port, osc_format())
-        format = document_format(parts.options["format"], points=parts.options["points"] == "yes")
+            return DatagramSink(host, port, osc_format(content))
+        format = document_format(options["format"], content)
         if scheme == "udp":
-            return DatagramSink(parts.host, parts.port, format)
-        return WebSocketSink(parts.host, parts.port, format, every=parts.options["every"] == "yes")
+            return DatagramSink(host, port, format)
+        return WebSocketSink(host, port, format, every=options["every"] == "yes")
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
     name = address.partition("?")[0]
@@ -215,8 +226,9 @@ class DatagramSink:
             self.dropped += 1
 
 
-def osc_format() -> MessageFormat:
+def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
     """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists their addresses."""
+    program = content.program
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
 
@@ -232,7 +244,7 @@ def osc_format() -> MessageFormat:
 
     return MessageFormat(
         lambda header: bundle(_osc_header(header)),
-        lambda message: bundle(_osc_frame(message)),
+        lambda message: bundle(_osc_frame(message if program is None else in_axes(message, program))),
         lambda: bundle([("/handsim/end", "", [])]),
     )
 

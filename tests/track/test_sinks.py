@@ -68,12 +68,10 @@ NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "
         ("udp://user@localhost:9000", "expected udp://host:port"),
         ("udp://localhost:9000?format", "expected udp://host:port"),
         ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
-        (
-            "ws://:1?point=yes",
-            "unknown option 'point' (did you mean 'points'?); valid names: format, points, every",
-        ),
+        ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?) | format | axes | every"),
         ("udp://:1?every=yes", "udp://:1?every=yes: unknown option 'every'; valid names: format, points"),
-        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format', there are none"),
+        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format'; valid names: axes, up"),
+        ("ws://:1?axes=maya", "unknown axes 'maya' | world, ros, openxr, unity, unreal"),
     ],
 )
 def test_wrong_parts_are_told(address, words):

@@ -47,8 +47,7 @@ _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that f
 _BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
-_FORGETTING: Final[dict[HandOrigin, float]] = {"named": 4800.0, "measured": 4800.0, "calibrated": 1200.0}
-"""Frames in which a bias that nothing confirms shrinks to a third; those of calibrated hands are small."""
+_FORGETTING_FRAMES: Final = 2400.0  # in which a bias that nothing confirms shrinks to a third
 _LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
 _FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers of which a fit leaves a residual that tells their spread
@@ -128,7 +127,6 @@ class HandState:
         self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
-        self._kept = 1.0 - 1.0 / _FORGETTING[origin]  # share of a bias from frame to frame
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.zeros(count)  # [s] of each marker
@@ -282,7 +280,6 @@ class HandState:
             estimate.predicted.rotations,
             settled,
             seen[parts] >= np.where(parts > 0, _FEWEST_ON_DIGIT, _FEWEST_ON_PALM),
-            self._kept,
             self._bias_frames,
             self._bias,
             self._variance,
@@ -327,7 +324,6 @@ def _learn_bias(
     rotations: Float[np.ndarray, "M 3 3"],
     settled: Bool[np.ndarray, "M"],
     is_tested: Bool[np.ndarray, "M"],
-    kept: float,
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
@@ -345,7 +341,8 @@ def _learn_bias(
             for j in range(3):
                 residual[i] += rotations[marker, j, i] * residuals[marker, j]
             # A pose fits what all biases of a hand have in common as well: nothing else brings that back.
-            bias[marker, i] = kept * bias[marker, i] + residual[i] / bias_frames[marker]
+            bias[marker, i] *= 1.0 - 1.0 / _FORGETTING_FRAMES
+            bias[marker, i] += residual[i] / bias_frames[marker]
             square += residual[i] ** 2
         if is_tested[marker]:
             variance[marker] += (square - variance[marker]) / bias_frames[marker]
