@@ -28,7 +28,7 @@ from handsim.space.rig import (
     load_rig,
 )
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
-from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
+from train.forecast.settings import Mount, PlanRigSettings
 from train.simulation.room import SceneSight, marker_radii
 from train.simulation.scenes import SceneMotion
 

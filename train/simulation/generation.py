@@ -120,7 +120,7 @@ def make_dataset(
 def _resolved(settings: GenerateSettings) -> FrameSource:
     """The settings with the glove, rig and sampler that they name, checked against each other."""
     layout, rig = load_layout(settings.glove), load_rig(settings.rig)
-    check_outside_volume(rig, np.array(ROOM_CENTER), settings.volume)
+    check_outside_volume(rig, np.array(settings.center), settings.volume)
     if settings.min_cameras > len(rig.positions):
         raise DatasetError(
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
@@ -154,6 +154,8 @@ def _record(source: FrameSource) -> dict[str, Any]:
     record = dataclasses.replace(settings, optics=settings.optics.worn(layout.radius)).record()
     if settings.sampler is None:
         del record["sampler"]
+    if settings.center == ROOM_CENTER:  # sets of versions without this setting go on
+        del record["center"]
     return record | {
         "rig": rig_setting(rig),
         "rig_digest": rig.digest(),  # releases may change a shipped rig

@@ -21,6 +21,8 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
+from handsim.space.rig import ROOM_CENTER, CameraRig
+from handsim.space.transforms import rigid
 from poses import sample_poses
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
@@ -100,6 +102,21 @@ def test_rows_are_what_they_say(finished):
     assert 0.85 < np.isfinite(off).mean() < 1.0
     assert np.nanmedian(off) < 0.0005
     assert 0.1 < np.isfinite(rows["ghosts"][..., 0]).sum(axis=1).mean() < 2.0
+
+
+def test_hands_are_where_the_center_is(finished, tmp_path):
+    shift, rig = np.array([0.5, -2.0, 0.25]), load_rig("figure5")
+    cameras = (camera.at(rigid(np.eye(3), shift) @ camera.T_world_camera) for camera in rig.cameras)
+    there = CameraRig("elsewhere", tuple(cameras))
+    made = dataclasses.replace(CONFIG, num_frames=400, rig=there, center=tuple(ROOM_CENTER + shift))
+    make_dataset(made, tmp_path / "set", workers=1)
+    rows, usual = Dataset(tmp_path / "set").rows(), Dataset(finished).rows()[:400]
+    np.testing.assert_allclose(rows["qpos"][:, :3], usual["qpos"][:, :3] + shift, atol=1e-5)
+    np.testing.assert_allclose(rows["markers"], usual["markers"] + shift, atol=1e-5)
+    assert (rows["cameras"] == usual["cameras"]).mean() > 0.99
+    assert np.nanmedian(np.linalg.norm(rows["observed"] - usual["observed"] - shift, axis=-1)) < 1e-5
+    with pytest.raises(ArgumentError, match="camera"):
+        make_dataset(dataclasses.replace(CONFIG, center=tuple(rig.positions[3])), tmp_path / "other")
 
 
 def test_two_workers_make_the_same_bytes(finished, tmp_path, monkeypatch):
