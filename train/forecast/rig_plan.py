@@ -20,7 +20,7 @@ from handsim._checks import check_array, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
-from handsim.space.rig import (
+from handsim.space.rig import LONGEST_SIDE, (
     FEWEST_CAMERAS,
     HAND_REACH,
     MAX_CAMERAS,

@@ -199,11 +199,11 @@ def simulate_frames(
     *,
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
-) -> None:
+) -> tuple[GloveFit, ...]:
     """Fill rows with random poses of one person's gloved hands, as rig and optical system capture them.
 
     Of a scene with two hands, the first half of the rows is the right hand's. Impossible scenes are counted
-    in `redrawn`, by reason.
+    in `redrawn`, by reason. Returns the hands with their gloves as worn.
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
@@ -227,6 +227,7 @@ def simulate_frames(
         for name in HandFrames._fields:
             part[name] = getattr(frames, name)[: len(part)]
         begin += len(qpos)
+    return fits
 
 
 def sample_frame_scene(
