@@ -70,6 +70,20 @@ def program_axes(name: str, up: UpAxis) -> ProgramAxes:
     return ProgramAxes(turn, after @ np.diag([1.0, *np.prod(mirror) * np.array(mirror)]), unit)
 
 
+def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a world in which an axis points up to ours, with z up."""
+    return np.asarray(file_axes("z").T @ file_axes(up))
+
+
+def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """Poses in a rotated world: positions and orientations (wxyz), and what follows them; NaN stays."""
+    turned = np.array(poses, dtype=np.float64)
+    w, x, y, z = rotation_quaternions(turn[None])[0]
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ product.T
+    return turned
+
+
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) about one unit axis by `angle` (...) [rad] (Rodrigues' formula)."""
     x, y, z = axis
@@ -82,13 +96,14 @@ def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) 
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(unit, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = unit if unit.ndim == 1 else np.moveaxis(unit, -1, 0)  # numbers are quicker than arrays
+    matrix = np.empty((*unit.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
+    matrix[..., 0, 2], matrix[..., 1, 0] = 2 * (x * z + w * y), 2 * (x * y + w * z)
+    matrix[..., 1, 1], matrix[..., 1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    matrix[..., 2, 0], matrix[..., 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return matrix
 
 
 def rigid(
