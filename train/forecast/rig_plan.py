@@ -20,9 +20,10 @@ from handsim._checks import check_array, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
-from handsim.space.rig import LONGEST_SIDE, (
+from handsim.space.rig import (
     FEWEST_CAMERAS,
     HAND_REACH,
+    LONGEST_SIDE,
     MAX_CAMERAS,
     CameraRig,
     load_rig,
