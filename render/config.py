@@ -12,6 +12,7 @@ import numpy as np
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
+from handsim.space.transforms import UpAxis
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.depth_sensor import SENSORS, DepthSensor
 from render.frames import PASSES
@@ -88,6 +89,9 @@ class RenderConfig(Settings):
     """Frames that are written together."""
     seed: Annotated[int, Limits(0)] = 0
     """Seed of all random choices."""
+    up: UpAxis = "z"
+    """The axis of the take, and of your own cameras, that points up; y for captures of Motive's default. The
+    truth of pictures has z up."""
 
     def __post_init__(self) -> None:
         named: dict[str, Any] = {"background": Backgrounds.of(self.background)}

@@ -245,7 +245,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         if takes is not None:
             check_type("takes", takes, (Take, str, Path, list, tuple), "a Take or its path, or several")
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
-        self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
+        self._takes = [
+            load_subject(source_of(take, model=model), seed=self.seed).upright(self.config.up)
+            for take in given
+        ]
         if len({len(one.take.hands) for one in self._takes}) > 1:
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")
         if self.config.shutter is not None and not self._takes:

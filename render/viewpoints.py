@@ -23,7 +23,7 @@ from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
 from render.frames import Doubles, Flags, Floats, Integers
 
 _OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
@@ -243,10 +243,13 @@ class _Path(NamedTuple):
 class Viewpoints:
     """Cameras of every frame."""
 
-    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
+    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator, up: UpAxis = "z") -> None:
         framing, own = Framing(take), config.cameras
         if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
+            if up != "z":
+                turn = rigid(upright(up), np.zeros(3))
+                cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
         else:
