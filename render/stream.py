@@ -232,7 +232,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
         config = configured(config, None, {} if seed is None else {"seed": seed})
-        if config.depth_sensor == "auto":  # of a stream it measures near hands
+        if config.depth_sensor == "auto" and "depth" in config.passes:  # of a stream it measures near hands
             config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
         self.config = config.resolved()
         self.seed = self.config.seed

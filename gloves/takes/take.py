@@ -84,6 +84,8 @@ class MotionFormat(NamedTuple):
     """How a hand without a pose is written, in words."""
     steady: bool = False
     """Whether frames are written without times, so that they must come at a steady rate."""
+    keeps_axes: bool = False
+    """Whether positions stay in the take's axes, whatever points up."""
 
     def take_of(self, take: Take, rate: float | None) -> Take:
         """The poses of a take that are written, at a rate if given."""
@@ -116,8 +118,8 @@ MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".bvh": MotionFormat(write_bvh, HELD, steady=True),
     ".usda": MotionFormat(write_usd, "invisible"),
     ".usdc": MotionFormat(write_usd, "invisible"),
-    ".csv": MotionFormat(write_joint_csv, "blank"),
-    ".parquet": MotionFormat(write_joint_parquet, "null"),
+    ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
+    ".parquet": MotionFormat(write_joint_parquet, "null", keeps_axes=True),
     ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
     ".mot": MotionFormat(write_mot, HELD),
     OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
@@ -683,6 +685,11 @@ class Take:
         check_choice(up, get_args(UpAxis), noun="axis that points up")
         path = Path(path)
         form = motion_format(path)
+        if up != "z" and form.keeps_axes:
+            raise ArgumentError(
+                f"up is {up} and the file {path}, expected a format with a direction that is up: "
+                f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
+            )
         form.write(path, posed_motion(form.take_of(self, None if rate is None else float(rate))), up)
 
     def save(self, path: str | Path) -> None:

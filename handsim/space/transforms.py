@@ -93,16 +93,23 @@ def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) 
     return rotation
 
 
+def cross(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """The vector product (3,) of two vectors; numpy's function for arrays takes twenty times as long."""
+    (x, y, z), (u, v, w) = first.tolist(), second.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(unit, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = unit if unit.ndim == 1 else np.moveaxis(unit, -1, 0)  # numbers are quicker than arrays
+    matrix = np.empty((*unit.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
+    matrix[..., 0, 2], matrix[..., 1, 0] = 2 * (x * z + w * y), 2 * (x * y + w * z)
+    matrix[..., 1, 1], matrix[..., 1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    matrix[..., 2, 0], matrix[..., 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return matrix
 
 
 def rigid(
