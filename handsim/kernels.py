@@ -170,24 +170,6 @@ def multiply_rotations(
 
 
 @kernel
-def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float) -> None:
-    """Rotate a frame in place about an axis of its own (Rodrigues' formula on its rows).
-
-    Args:
-        rotation: Orientation (3, 3) of the frame, overwritten.
-        axis: Unit vector (3,) in the frame's own coordinates.
-    """
-    sine, cosine = np.sin(angle), np.cos(angle)
-    x, y, z = axis[0], axis[1], axis[2]
-    for row in range(3):
-        a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
-        along = (1.0 - cosine) * (a * x + b * y + c * z)
-        rotation[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
-        rotation[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
-        rotation[row, 2] = cosine * c + sine * (a * y - b * x) + along * z
-
-
-@kernel
 def quaternion_product(
     w: float, x: float, y: float, z: float, e: float, a: float, b: float, c: float
 ) -> tuple[float, float, float, float]:
@@ -401,20 +383,30 @@ def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: An
         posed: Where the axes' ends in the world go (3, 2, 3) [m].
         scratch: Room for the arithmetic (4, 3).
     """
-    frame, origin = scratch[:3], scratch[3]
-    frame[:] = wrist[0]
-    origin[:] = wrist[1]
-    joint = 0
-    for bone in range(3):
-        for row in range(3):
-            for column in range(3):
-                origin[row] += frame[row, column] * digit.offsets[bone, column]
-        multiply_rotations(frame, digit.rotations[bone], frame)
-        for _ in range(2 if bone == 0 else 1):
-            rotate_about_axis(frame, digit.axes[joint], angles[joint])
-            joint += 1
-        for end in range(2):
-            for row in range(3):
-                posed[bone, end, row] = origin[row]
-                for column in range(3):
-                    posed[bone, end, row] += frame[row, column] * digit.ends[bone, end, column]
+    for joint in range(4):
+        scratch[joint, 0], scratch[joint, 1] = np.sin(angles[joint]), np.cos(angles[joint])
+    for row in range(3):  # a row of the frames and of the origins needs no other
+        a, b, c, origin = wrist[0][row, 0], wrist[0][row, 1], wrist[0][row, 2], wrist[1][row]
+        joint = 0
+        for bone in range(3):
+            offset, local, ends = digit.offsets, digit.rotations, digit.ends
+            origin = origin + a * offset[bone, 0] + b * offset[bone, 1] + c * offset[bone, 2]
+            a, b, c = (
+                a * local[bone, 0, 0] + b * local[bone, 1, 0] + c * local[bone, 2, 0],
+                a * local[bone, 0, 1] + b * local[bone, 1, 1] + c * local[bone, 2, 1],
+                a * local[bone, 0, 2] + b * local[bone, 1, 2] + c * local[bone, 2, 2],
+            )
+            for _ in range(2 if bone == 0 else 1):  # Rodrigues' formula, about an axis of the frame's own
+                sine, cosine = scratch[joint, 0], scratch[joint, 1]
+                x, y, z = digit.axes[joint, 0], digit.axes[joint, 1], digit.axes[joint, 2]
+                along = (1.0 - cosine) * (a * x + b * y + c * z)
+                a, b, c = (
+                    cosine * a + sine * (b * z - c * y) + along * x,
+                    cosine * b + sine * (c * x - a * z) + along * y,
+                    cosine * c + sine * (a * y - b * x) + along * z,
+                )
+                joint += 1
+            for end in range(2):
+                posed[bone, end, row] = (
+                    origin + a * ends[bone, end, 0] + b * ends[bone, end, 1] + c * ends[bone, end, 2]
+                )
