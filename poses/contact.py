@@ -34,8 +34,6 @@ class Digit(NamedTuple):
 
     capsules: NDArray[np.int64]
     """Indices of the digit's capsules in the hand (3,)."""
-    others: NDArray[np.int64]
-    """Indices of the hand's other capsules (K - 3,)."""
     offsets: NDArray[np.float64]
     """Origin of each bone in its parent's frame (3, 3) [m]."""
     rotations: NDArray[np.float64]
@@ -47,7 +45,7 @@ class Digit(NamedTuple):
     radii: NDArray[np.float64]
     """Radii of the digit's capsules (3,) [m]."""
     meets: NDArray[np.bool_]
-    """Capsules of the hand that each capsule of the digit may collide with (3, K)."""
+    """Capsules of the hand's other parts that each capsule of the digit may collide with (3, K)."""
     reach: float
     """Largest distance of the digit's skin from its first joint [m]."""
 
@@ -286,6 +284,8 @@ def close_fingers(
     rotations, positions = quaternion_matrix(opened[busy, 3:7]), opened[busy, :3]
     own = model.capsules.posed(model.forward_kinematics(opened[busy]))
     others = other.capsules.posed(other.forward_kinematics(other_qpos[busy]))
+    segments = np.concatenate([others, own], axis=1)
+    radii = np.concatenate([other.capsules.radii, model.capsules.radii])
     all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
     for press, joints in _STAGES:
         for digit in _ORDER:
@@ -297,16 +297,12 @@ def close_fingers(
             share[busy] = search_closing(
                 DigitPaths(rotations, positions, angles[busy, columns], goal[busy]),
                 parts,
-                Obstacles(
-                    np.concatenate([others, own[:, parts.others]], axis=1),
-                    np.concatenate([other.capsules.radii, model.capsules.radii[parts.others]]),
-                    np.concatenate([all_of_other, parts.meets[:, parts.others]], axis=1),
-                    press,
-                ),
+                Obstacles(segments, radii, np.concatenate([all_of_other, parts.meets], axis=1), press),
             )
             share = smooth_below(share, window) * strength[:, digit]
             angles[:, columns] += share[:, None] * (goal - angles[:, columns])
-            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, columns], parts)
+            mine = len(other.capsules.radii) + parts.capsules
+            segments[:, mine] = pose_digit((rotations, positions), angles[busy, columns], parts)
     return angles
 
 
@@ -329,13 +325,13 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
     """A digit of a hand (0: thumb) as the compiled searches need it."""
     capsules, skeleton = model.capsules, model.skeleton
     first = 1 + 3 * digit
-    indices = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
+    indices = np.flatnonzero((capsules.bones >= first) & (capsules.bones < first + 3))
     meets = np.zeros((len(capsules.bones),) * 2, dtype=bool)
     pairs = capsules.touching_pairs()
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
+    meets[:, indices] = False
     return Digit(
         capsules=indices,
-        others=np.setdiff1d(np.arange(len(capsules.bones)), indices),
         offsets=skeleton.offsets[first : first + 3],
         rotations=skeleton.rotations[first : first + 3],
         axes=skeleton.axes[4 * digit : 4 * digit + 4],

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.hand.shape import DIGITS, NUM_BONES, PALM
+from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand, unpack_hand
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix
 
@@ -483,11 +483,17 @@ def build_surface(shape: HandShape) -> HandSurface:
     Subdivision shrinks, so the cage is enlarged until the skin has the shape's girths, lengths, breadth and
     palm thickness. A left hand is the exact mirror image of the right one.
     """
-    template, vertices = _template(), rest_vertices([shape])[0]
+    template, vertices = _template(), _right_vertices(np.array(pack_hand(shape), HAND_DTYPE).tobytes()[1:])
     faces = template.faces
     if shape.side == "left":
         vertices, faces = vertices @ MIRROR, faces[:, ::-1]
     return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
+
+
+@functools.lru_cache(maxsize=4)
+def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
+    """`rest_vertices` of the hand of these bytes of `HAND_DTYPE` after the side: a pair of hands shares them."""
+    return rest_vertices([unpack_hand(np.frombuffer(b"\0" + measures, HAND_DTYPE)[0])])[0]
 
 
 def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:
