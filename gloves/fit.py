@@ -240,7 +240,6 @@ def vary_layout(
 
     On the palm markers shift along and across by half of `along`.
     """
-
     draws = np.clip(rng.standard_normal((layout.num_markers, 3)), -2.0, 2.0).tolist()
 
     def moved(marker: MarkerPlace, slip: float, roll: float, side: float) -> MarkerPlace:
@@ -336,18 +335,26 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
     found, weights = np.full(len(origins), -1), np.empty((len(origins), 3))
     nearest = np.full(len(origins), np.inf)
     first, second, offset, across, turned = np.empty((5, 3))
+    ox, oy, oz = origins[:, 0].copy(), origins[:, 1].copy(), origins[:, 2].copy()
+    dx, dy, dz = directions[:, 0].copy(), directions[:, 1].copy(), directions[:, 2].copy()
+    squared = np.empty(len(origins))  # distances of the rays' lines from a face's first corner
     for f in range(len(faces)):
         corner = vertices[faces[f, 0]]
+        px, py, pz = corner
+        for r in range(len(origins)):
+            x, y, z = ox[r] - px, oy[r] - py, oz[r] - pz
+            along = x * dx[r] + y * dy[r] + z * dz[r]
+            squared[r] = x * x + y * y + z * z - along * along
         for i in range(3):
             first[i] = vertices[faces[f, 1], i] - corner[i]
             second[i] = vertices[faces[f, 2], i] - corner[i]
         # a line through a triangle comes nearer to its first corner than the longer edge there
         reach = 1.01 * max(_dot(first, first), _dot(second, second))
         for r in range(len(origins)):
+            if squared[r] > reach:
+                continue
             for i in range(3):
                 offset[i] = origins[r, i] - corner[i]
-            if _dot(offset, offset) - _dot(offset, directions[r]) ** 2 > reach:
-                continue
             _cross(directions[r], second, across)
             determinant = _dot(first, across)
             if determinant >= 0.0:  # on the way in, or along the face

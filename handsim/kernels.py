@@ -99,10 +99,8 @@ def point_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -
 
 
 @kernel(inline=True)
-def segment_distance_squared(
-    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> float:
-    """Squared distance [m^2] between the segments p-q and a-b, each point (3,) [m].
+def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
+    """Squared distance [m^2] between the segments p-q and a-b, each point an array (3,) or a tuple [m].
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
     """
@@ -136,6 +134,50 @@ def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float
     matrix[1, 1], matrix[1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     matrix[2, 0], matrix[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
     matrix[2, 2] = 1 - 2 * (x * x + y * y)
+
+
+@kernel
+def write_matrix_quaternions(
+    matrices: Float[np.ndarray, "T 3 3"], quaternions: Float[np.ndarray, "T 4"]
+) -> bool:
+    """Write the unit quaternions (wxyz) of rotation matrices, and whether all of these are rotations.
+
+    Klumpp, Singularity-free extraction of a quaternion from a direction-cosine matrix (1976): the largest of
+    the four components is computed first, and has no sign of its own.
+    """
+    for n in range(len(matrices)):
+        m, q = matrices[n], quaternions[n]
+        trace = m[0, 0] + m[1, 1] + m[2, 2]
+        i = 0
+        for other in range(1, 3):
+            if m[other, other] > m[i, i]:
+                i = other
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if m[i, i] >= trace:
+            q[1 + i] = 1.0 - trace + 2.0 * m[i, i]
+            q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+            q[0] = m[k, j] - m[j, k]
+        else:
+            q[1], q[2], q[3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+            q[0] = 1.0 + trace
+        length = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3] + q[0] * q[0])
+        for row in range(4):
+            q[row] /= length
+        determinant = (
+            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+            - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+            + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+        )
+        is_rotation = determinant > 0.0
+        for row in range(3):
+            for other in range(3):
+                product = 0.0 if row != other else -1.0
+                for column in range(3):
+                    product += m[row, column] * m[other, column]
+                is_rotation = is_rotation and abs(product) < 1e-13
+        if not is_rotation:  # also where it is NaN
+            return False
+    return True
 
 
 @kernel

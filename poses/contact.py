@@ -179,8 +179,8 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any,
     """Count the obstacles that a digit can reach, and write what `_blocked` needs of them.
 
     Args:
-        near: Both ends of each obstacle's axis (K, :6) [m], and the squared distances (K, 6:) [m^2] from it at
-            which the digit's three bones meet it; -1 for a bone that may not meet it.
+        near: Both ends of each obstacle's axis (K, :6) [m], and the squared distances (K, 6:) [m^2] at which
+            the axes of the digit's three bones meet it; -1 for a bone that may not meet it.
         spheres: Centers (:3, K) [m] of bounding spheres, and the same squares (3:6, K) for these.
     """
     knuckle = wrist[1].copy()

@@ -248,7 +248,7 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; not writable."""
+    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN

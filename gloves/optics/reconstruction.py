@@ -101,7 +101,11 @@ def cast_rays(
         for n in range(number):
             x, y, size = centers[c, blobs[n], 0], centers[c, blobs[n], 1], radii[c, blobs[n]]
             for m in range(n):
-                du, dv, reach = centers[c, blobs[m], 0] - x, centers[c, blobs[m], 1] - y, radii[c, blobs[m]] + size
+                du, dv, reach = (
+                    centers[c, blobs[m], 0] - x,
+                    centers[c, blobs[m], 1] - y,
+                    radii[c, blobs[m]] + size,
+                )
                 if du * du + dv * dv < reach * reach:
                     touches[n] = touches[m] = True
         for n in range(number):
@@ -109,7 +113,11 @@ def cast_rays(
             u, v, members = centers[c, s, 0], centers[c, s, 1], 1
             for m in range(number if touches[n] else 0):
                 o = blobs[m]
-                du, dv, reach = centers[c, o, 0] - centers[c, s, 0], centers[c, o, 1] - centers[c, s, 1], radii[c, o] + radii[c, s]
+                du, dv, reach = (
+                    centers[c, o, 0] - centers[c, s, 0],
+                    centers[c, o, 1] - centers[c, s, 1],
+                    radii[c, o] + radii[c, s],
+                )
                 squared = du * du + dv * dv
                 if o == s or squared >= reach * reach:
                     continue

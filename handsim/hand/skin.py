@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand, unpack_hand
+from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix
 
@@ -492,8 +492,10 @@ def build_surface(shape: HandShape) -> HandSurface:
 
 @functools.lru_cache(maxsize=4)
 def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
-    """`rest_vertices` of the hand of these bytes of `HAND_DTYPE` after the side: a pair of hands shares them."""
-    return rest_vertices([unpack_hand(np.frombuffer(b"\0" + measures, HAND_DTYPE)[0])])[0]
+    """`rest_vertices` of the bytes of a `HAND_DTYPE` after the side, which a pair of hands shares."""
+    shape: Any = np.frombuffer(b"\0" + measures, HAND_DTYPE).view(np.recarray)[0]
+    vertices: NDArray[np.float64] = rest_vertices([shape])[0]
+    return vertices
 
 
 def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:

@@ -316,11 +316,9 @@ def observe_scene(
     return tuple(hands)
 
 
-def _near(
-    points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]
-) -> Bool[np.ndarray, "T P"]:
+def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]) -> Bool[np.ndarray, "T P"]:
     """Which points, of which most are NaN, are within `GHOST_REACH` of a marker center of their frame."""
-    near = np.isfinite(points[..., 0])
+    near: NDArray[np.bool_] = np.isfinite(points[..., 0])
     distance = np.linalg.norm(points[near][:, None] - centers[near.nonzero()[0]], axis=-1)
     near[near] = distance.min(axis=1) < GHOST_REACH
     return near
