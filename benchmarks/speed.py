@@ -56,7 +56,6 @@ from gloves.optics.visibility import free_rays
 from handsim import HandModel, join_qpos, load_rig
 from poses.shapes import sample_valid_angles
 from track import Tracker
-from track.tracker import warm_up
 from train import (
     CNNConfig,
     Corruption,
@@ -144,7 +143,7 @@ def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray])
 def tracker(speeds: Speeds) -> None:
     takes = {kind: [twin(kind, speeds.some(1200, 120), seed) for seed in speeds.seeds] for kind in KINDS}
     for kind, some in takes.items():
-        warm_up(nominal_users(some[0]), labeler())
+        Tracker(nominal_users(some[0]), labeler()).warm_up()
         key = kind.replace("-", "_")
         true = [follow(take, true_users(take)) for take in some]
         speeds.times(f"{key}_true", f"a frame of {kind}, two true hands", np.concatenate(true))

@@ -42,6 +42,7 @@ VALID: dict[str, dict[str, object]] = {
     "gloves.write_capture": {"path": "out.trc", "capture": CAPTURE},
     "train.corrupt": {"markers": np.zeros((1, 5, 3)), "corruption": Corruption(), "rng": RNG},
     "train.evaluate_labeler": {"labeler": "dense19", "truth": np.zeros((1, 19, 3))},
+    "train.evaluate_labels": {"labeled": CAPTURE, "truth": "gone.truth.npz"},
     "train.generate_dataset": {"out": "set", "glove": "tips8", "rig": "six", "num_frames": 10, "seed": 0},
     "train.load_labeler": {"glove": "dense19"},
     "train.plan_rig": {"cameras": 2, "room": (2.4, 1.8, 2.2), "glove": "tips8", "seed": 0},

@@ -65,8 +65,8 @@ def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[s
 
 
 def _labels_section(score: LayoutScore) -> Section:
-    columns = (score.observed, score.clean, score.corrupted)
-    table = [["labels [%]", "as the rig sees them", "every marker seen", "the paper's drops and ghosts"]]
+    columns = (score.observed, score.corrupted, score.clean)
+    table = [["labels [%]", "as the rig sees them", "the paper's drops and ghosts", "every marker seen"]]
     table += [
         [title, *(percent(report.figures[name]) for report in columns)]
         for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import monotonic
@@ -19,18 +19,17 @@ from gloves.takes.take import Take, load_take
 from handsim.app.messages import LiveStatus, named_steps
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
-from track.frames import FARTHEST, StreamedFrame, TrackedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
+from track.streams import NoServerError
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
-from track.tracker import warm_up
 
 _MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for such frames
 _PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
 _LAGS: Final = 100_000  # newest frames whose lag is kept
-_MANY_FAR: Final = 0.5  # share of points out of range above which the unit is questioned
 _FOREIGN: Final = "foreign_packets"
 _PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
 """Counts of packets that were left out, in words."""
@@ -98,15 +97,16 @@ def track_live(
     if out is not None:
         check_unused(growing_path(out))
     with named_steps("getting ready"):
-        warm_up(setup.user, setup.labeler)
+        setup.tracker().warm_up()
     until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()
     with (
-        open_source(address, ended=lambda: interrupted() or monotonic() >= until) as stream,
         LiveStatus() as status,
+        _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
         ExitStack() as stack,
     ):
-        setup, frames = _measured_setup(stream, setup, status, seconds)
+        doubt = _Doubt(stream, status)
+        setup, frames = _measured_setup(stream, setup, status, seconds, doubt)
         tracker = setup.tracker()
         for output in outputs:
             output.start(tracker.hands, tracker.bodies)
@@ -117,16 +117,17 @@ def track_live(
             stack.enter_context(_recording_kept(recorder))
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
         status.show("waiting for the first frame")
-        pace, asked, count = _Pace(), False, 0
+        pace, count = _Pace(), 0
         for frame in frames:
             if seconds is not None and not frame.silent:
                 until = min(until, frame.arrived + seconds)
             if interrupted() or frame.arrived > until:
                 break
             tracked = tracker.step(frame.points, frame.ids, frame.time)
-            for output in outputs:
+            is_recent = not pace.catches_up(frame, stream.forgiven_until)
+            for output in outputs if is_recent else ():
                 output.send(frame, tracked)
-            pace.add(frame, stream.forgiven_until)
+            pace.add(frame, is_recent)
             if recorder is not None:
                 recorder.add(frame, tracked)
             count += not frame.silent
@@ -136,9 +137,7 @@ def track_live(
                 unsent = sum(sum(output.counts.values()) for output in outputs)
                 line = _status_line(frame, tracked, stream.counts, unsent, pace)
                 status.show(line, now=frame.silent or dropping)
-            if not asked and (doubt := _unit_doubt(stream)):
-                asked = True
-                status.say(doubt)
+            doubt.tell()
         stream.end(until)
         counts, take, step = stream.counts, None, 1
         if recorder is not None:
@@ -150,19 +149,27 @@ def track_live(
     notes = [*_notes(counts, step, pace, stream.order.interval)]
     for output in outputs:
         notes += output.notes()
-    doubt = _unit_doubt(stream)
-    return LiveTake(take, count, (*notes, doubt) if doubt else tuple(notes))
+    return LiveTake(take, count, (*notes, *filter(None, [stream.point_doubt])))
+
+
+def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:
+    """Open a stream as soon as its server answers."""
+    while True:
+        try:
+            return open_source(address, ended=ended)
+        except NoServerError as error:  # each try takes some seconds
+            status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
 
 
 def _measured_setup(
-    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None
+    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None, doubt: _Doubt
 ) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
     """The setup with the hands as measured in the first frames of a stream, and all its frames."""
     gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
     if not setup.is_auto:
         stream.forgive()
         return setup, stream
-    first = _first_frames(stream, setup.fewest_points, seconds, status)
+    first = _first_frames(stream, setup.fewest_points, seconds, status, doubt)
     setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
     status.say(f"size of the hands: {setup.user}")
     return setup, _first_and_others(first, stream)
@@ -177,7 +184,7 @@ def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterato
 
 
 def _first_frames(
-    stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus
+    stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus, doubt: _Doubt
 ) -> list[StreamedFrame]:
     """The first frames of a stream, until there were enough points for one second, or for ten seconds."""
     frames: list[StreamedFrame] = []
@@ -185,9 +192,12 @@ def _first_frames(
     status.show("waiting for hands, to measure their size")
     for frame in stream:
         now = monotonic()
+        doubt.tell()
         if frame.silent and frames:
             break
-        if not frame.silent:
+        if frame.silent:
+            status.show(_silence_line(stream.counts), now=True)
+        else:
             frames.append(frame)
             began = min(began, now)
         if len(frame.points) >= fewest_points:
@@ -208,6 +218,19 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
         raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
 
 
+class _Doubt:
+    """Says once what is wrong with the points of a stream."""
+
+    def __init__(self, stream: LiveStream, status: LiveStatus) -> None:
+        self._stream, self._status, self._told = stream, status, False
+
+    def tell(self) -> None:
+        """Say it as soon as it is known."""
+        if not self._told and (doubt := self._stream.point_doubt):
+            self._told = True
+            self._status.say(doubt)
+
+
 class _Pace:
     """Measures rate, lag and dropped frames of a stream."""
 
@@ -220,14 +243,15 @@ class _Pace:
         """A summary of the last second."""
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
-    def add(self, frame: StreamedFrame, forgiven_until: float) -> None:
-        """Add the lag of a frame, before `forgiven_until` as start-up lag."""
-        if frame.silent:
-            return
+    def catches_up(self, frame: StreamedFrame, forgiven_until: float) -> bool:
+        """Whether a frame came while hands were measured; its lag is forgiven until that time [s]."""
         now = monotonic()
-        lag = now - frame.arrived
-        is_first = not self.lags and lag > MOST_LAG and now < forgiven_until
-        (self.first_lags if is_first else self.lags).append(lag)
+        return now < forgiven_until and now - frame.arrived > MOST_LAG and not (frame.silent or self.lags)
+
+    def add(self, frame: StreamedFrame, is_recent: bool) -> None:
+        """Add the lag of a frame."""
+        if not frame.silent:
+            (self.lags if is_recent else self.first_lags).append(monotonic() - frame.arrived)
 
     def tick(self, counts: dict[str, int]) -> bool:
         """Once a second renew the summary; returns whether frames were dropped in that second."""
@@ -274,14 +298,11 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
         yield f"the following figures are of one half second in {step}"
 
 
-def _unit_doubt(stream: LiveStream) -> str:
-    """A question about the unit if many points are out of range, else an empty string."""
-    if stream.far_points <= _MANY_FAR * stream.points or not stream.far_points:
-        return ""
-    return (
-        f"{stream.far_points} of {stream.points} points lie {FARTHEST:.0f} m or more from the origin and are "
-        "left out; are they millimeters? Set the unit of the stream to meters"
-    )
+def _silence_line(counts: dict[str, int]) -> str:
+    """A line on a stream from which no frame comes."""
+    if foreign := counts.get(_FOREIGN):
+        return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
+    return "no frames arrive; is the server playing?"
 
 
 def _status_line(
@@ -289,9 +310,7 @@ def _status_line(
 ) -> str:
     """A line on the status of a live stream."""
     if frame.silent:
-        if foreign := counts.get(_FOREIGN):
-            return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
-        return "no frames arrive; is the server playing?"
+        return _silence_line(counts)
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from train.data.shards import MappedRows as MappedRows
     from train.evaluation import LabelingReport as LabelingReport
     from train.evaluation import evaluate_labeler as evaluate_labeler
+    from train.evaluation import evaluate_labels as evaluate_labels
     from train.forecast.rig_forecast import CameraLoss as CameraLoss
     from train.forecast.rig_forecast import ErrorEllipsoid as ErrorEllipsoid
     from train.forecast.rig_forecast import Forecast as Forecast

@@ -10,6 +10,7 @@ that is right.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -22,13 +23,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gloves.captures.capture import Capture, select_hands
-from gloves.captures.formats import find_captures, read_markers
+from gloves.captures.formats import find_captures, read_capture, read_markers
 from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
+from gloves.takes.points import PointList
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_rng, check_type
 from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.shape import SIDES
 from train.data.batches import Cloud, Corruption, OwnCorruption, corrupt, draw_cloud, paper_corruption
 from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.labelers.protocol import Labeler
@@ -243,18 +246,24 @@ class LabelingReport:
     """Whether that label is right."""
     numbers: dict[str, int] = field(default_factory=dict)
     """Slots, points, occlusions and ghosts counted."""
-    right_slots: Float[np.ndarray, "T"] = field(default_factory=lambda: np.zeros(0))
-    """Share of each frame's slots that are right."""
+    right_slots: Bool[np.ndarray, "T M"] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.bool_))
+    """Whether each slot of each frame is right."""
+    marker_names: tuple[str, ...] = ()
+    """Names of the M markers, in label order."""
+    seconds: Int[np.ndarray, "T"] | None = None
+    """The second of each frame, for labels of a take; frames of one second are alike."""
 
-    def interval(self, people: Int[np.ndarray, "T"]) -> tuple[float, float]:
-        """The 95 % interval of the slot accuracy, by a bootstrap over two or more people.
+    def interval(self, people: Int[np.ndarray, "T"], marker: int | None = None) -> tuple[float, float]:
+        """The 95 % interval of the slot accuracy, by a bootstrap over two or more people, or seconds.
 
         Args:
-            people: The person of each frame, as numbers.
+            people: The person, or the second, of each frame, as numbers.
+            marker: The index of the one marker whose slot counts; all when not given.
         """
         _, person = np.unique(people, return_inverse=True)
         frames = np.bincount(person)
-        right = np.bincount(person, weights=self.right_slots)
+        counted = self.right_slots if marker is None else self.right_slots[:, [marker]]
+        right = np.bincount(person, weights=counted.mean(axis=1))
         drawn = np.random.default_rng(0).integers(len(frames), size=(_BOOTSTRAPS, len(frames)))
         shares = right[drawn].sum(axis=1) / frames[drawn].sum(axis=1)
         low, high = np.quantile(shares, (0.025, 0.975))
@@ -267,29 +276,52 @@ Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
 
 def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport:
     """Label points whose truth is known, and count errors."""
-    num_labels = len(labeler.marker_names)
+    return _count(
+        labeler.marker_names,
+        (
+            (labeling.labels, labeling.confidence, truth)
+            for clouds, truths in parts
+            for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True)
+        ),
+    )
+
+
+def _count(
+    names: tuple[str, ...], frames: Iterable[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]
+) -> LabelingReport:
+    """Count errors in frames of given labels, their confidence, and true labels.
+
+    Labels without a confidence (NaN) are left out of the figures on confidence.
+    """
+    num_labels = len(names)
     counts = LabelCounts(confusion=np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64))
-    right_by_marker, right_slots = np.zeros(num_labels), list[float]()
+    right_slots: list[NDArray[np.bool_]] = []
     confidences: list[NDArray[np.float64]] = [np.zeros(0)]
     right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
-    for clouds, truths in parts:
-        for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True):
-            slots = counts.add(labeling.labels, truth, num_labels)
-            right_by_marker += slots
-            right_slots.append(slots.mean())
-            confidences.append(labeling.confidence)
-            right.append(labeling.labels == truth)
+    for labels, confidence_of, truth in frames:
+        right_slots.append(counts.add(labels, truth, num_labels))
+        confidences.append(confidence_of)
+        right.append(labels == truth)
     confidence, is_right = np.concatenate(confidences), np.concatenate(right)
+    known = np.isfinite(confidence)
     figures = {
         **counts.figures(),
-        "calibration_error": expected_calibration_error(confidence, is_right),
-        "error_without_least_sure": error_without(confidence, is_right),
+        "calibration_error": expected_calibration_error(confidence[known], is_right[known]),
+        "error_without_least_sure": error_without(confidence[known], is_right[known]),
     }
-    by_marker = right_by_marker / max(1, counts.frames)
+    slots = np.array(right_slots, dtype=np.bool_).reshape(-1, num_labels)
+    by_marker = slots.sum(axis=0) / max(1, counts.frames)
     return LabelingReport(
-        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers(),
-        np.array(right_slots),
-    )  # fmt: skip
+        figures,
+        by_marker,
+        counts.frames,
+        counts.confusion,
+        confidence,
+        is_right,
+        counts.numbers(),
+        slots,
+        names,
+    )
 
 
 def evaluate_markers(
@@ -417,7 +449,9 @@ def evaluate_labeler(
                 "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
                 "(--occlude, --ghosts) and every (--every), which labeled captures take"
             )
-        simulated = [_simulated_take(one, network.marker_names) for one in takes]
+        simulated = list(map(_simulated_take, takes))
+        for hand in (hand for take in simulated for hand in take.hands):
+            _check_markers("the take's glove", hand.layout.names, network.marker_names)
         report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
     elif corruption == CLEAN and all(map(_is_set, given)):
         rows = [_rows(load_dataset(one), network.marker_names)[:: settings.every] for one in given]
@@ -433,18 +467,16 @@ def evaluate_labeler(
     return report
 
 
-def _shown(take: Any) -> str:
-    """A take in an error message: its path, if it was given by one."""
-    return str(take) if isinstance(take, str | Path) else "the take"
+def _shown(given: Any) -> str:
+    """A take or capture in an error message: its path, if it was given by one."""
+    return str(given) if isinstance(given, str | Path) else f"the {type(given).__name__.lower()}"
 
 
-def _simulated_take(given: Take | str | Path, names: tuple[str, ...]) -> Take:
-    """A take with its truth, of a glove whose markers the labeler knows."""
+def _simulated_take(given: Take | str | Path) -> Take:
+    """A take with its truth."""
     take = given if isinstance(given, Take) else load_take(given)
     if take.made_by_tracker:
         raise CaptureError(f"{_shown(given)}: a tracked take, expected the truth of a simulated capture")
-    for hand in take.hands:
-        _check_markers("the take's glove", hand.layout.names, names)
     return take
 
 
@@ -489,3 +521,109 @@ def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None
     """Refuse markers that the labeler does not know."""
     if tuple(has) != tuple(knows):
         raise CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")
+
+
+_SAME_POINT: Final = 1e-3  # [m] between the places of a point in two files of a capture
+_SAME_CAPTURE: Final = 0.5  # least share of the points of a labeled capture that its truth has, too
+
+
+def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Path) -> LabelingReport:
+    """Count errors in the labels of a capture against the truth of the simulated take that it is of.
+
+    Points are matched by frame and place, within 0.001 [m]. Slots are those of all hands of the truth. A
+    point that the capture lacks counts as one without a label; a point that the truth lacks, or that is a
+    rigid body's, as a ghost.
+
+    Args:
+        labeled: A labeled capture with columns `ThumbTip` or `right:ThumbTip`, a tracked take, or the path of
+            one. Columns without a side are, in each frame, those of the hand that more of them fit.
+        truth: The take with its truth, or its path.
+
+    Returns:
+        Figures as shares in [0, 1], by their names, and the counts that they come from, among them the points
+        that only one of the two has. Marker files have no confidence: figures on it are NaN.
+
+    Raises:
+        ArgumentError: An argument is of another type.
+        CaptureError: A file cannot be read, the two are not of one capture, or a marker has no column or two.
+    """
+    check_type("labeled", labeled, (Take, Capture, str, Path), "a Take or Capture, or the path of one")
+    check_type("truth", truth, (Take, str, Path), "a Take, or the path of one")
+    actual, given = _simulated_take(truth), labeled
+    if not isinstance(given, Take | Capture):
+        given = load_take(given) if Path(given).suffix == ".npz" else read_capture(given)
+    what, expected = _shown(labeled), "expected the labels and the truth of one capture"
+    if given.num_frames != actual.num_frames:
+        raise CaptureError(
+            f"{what} has {given.num_frames} frames and {_shown(truth)} {actual.num_frames}, {expected}"
+        )
+    if isinstance(given, Take):
+        points, columns = given.point_list, given.label_names
+    else:
+        shape, columns = given.positions.shape[:2], given.names
+        numbers, nothing = np.broadcast_to(np.arange(shape[1]), shape), np.full(shape, np.nan)
+        points = PointList.of_tables(given.positions, np.full(shape, -1), numbers, nothing)
+    true_points, names = actual.point_list, actual.label_names[: actual.hand_labels[-1].stop]
+    partner = _partners(points, true_points)
+    alone = partner < 0
+    if alone.sum() > (1.0 - _SAME_CAPTURE) * len(alone):
+        raise CaptureError(
+            f"{what} shares {(~alone).sum()} of its {len(alone)} points with {_shown(truth)}, {expected}"
+        )
+    # The points of the truth, and after them those that only the capture has.
+    count = len(true_points.labels)
+    true = np.full(count + alone.sum(), -1)
+    true[:count] = np.where(true_points.labels < len(names), true_points.labels, -1)
+    partner[alone] = np.arange(count, len(true))
+    labels, confidence = np.full(len(true), -1), np.full(len(true), np.nan)
+    labels[partner] = _labels_of_columns(points, columns, true[partner], actual, what)
+    confidence[partner] = points.confidence
+    frames = np.concatenate([true_points.frames, points.frames[alone]])
+    order = np.argsort(frames, kind="stable")
+    starts = np.searchsorted(frames[order], np.arange(1, given.num_frames))
+    by_frame = (np.split(one[order], starts) for one in (labels, confidence, true))
+    report = _count(names, zip(*by_frame, strict=True))
+    report.numbers["points_of_truth_alone"] = count - int((~alone).sum())
+    report.numbers["points_of_capture_alone"] = int(alone.sum())
+    return dataclasses.replace(report, seconds=actual.times.astype(np.int64))
+
+
+def _partners(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:
+    """The index of each point among the others, one to one by frame and place; -1 for none."""
+    mine, theirs = (np.column_stack([one.points, one.frames]) for one in (points, others))
+    distance, nearest = cKDTree(theirs).query(mine, distance_upper_bound=_SAME_POINT)
+    order = np.argsort(distance, kind="stable")
+    taken, first = np.unique(nearest[order], return_index=True)
+    there = taken < len(theirs)
+    partner = np.full(len(mine), -1)
+    partner[order[first[there]]] = taken[there]
+    return partner
+
+
+def _labels_of_columns(
+    points: PointList, columns: Sequence[str], true: Int[np.ndarray, "P"], actual: Take, what: str
+) -> Int[np.ndarray, "P"]:
+    """The labels of points, which number columns of these names, as labels of the true take's hands."""
+    known = {name: label for label, name in enumerate(actual.label_names[: actual.hand_labels[-1].stop])}
+    options = np.full(
+        (len(actual.hands), len(columns) + 1), -1
+    )  # the last entry is for points without a label
+    absent = np.zeros(len(columns) + 1, dtype=np.bool_)  # columns of a hand that the truth lacks
+    for column, name in enumerate(columns):
+        side, marker = (part.strip() for part in name.rpartition(":")[::2])
+        absent[column] = side in SIDES and side not in actual.sides
+        for hand, of in enumerate(actual.sides):
+            options[hand, column] = known.get(f"{side if side in actual.sides else of}:{marker}", -1)
+    held = options[0, (options[0] >= 0) & ~absent]
+    if len(held) == 0 or len(set(held)) < len(held):
+        found = "two columns of one marker" if len(held) else "no columns of markers"
+        raise CaptureError(
+            f"{what} has {found}, expected one for each of {', '.join(known)}, with or without the side"
+        )
+    choices = options[:, points.labels]
+    fitting = np.stack(
+        [np.bincount(points.frames[one == true], minlength=actual.num_frames) for one in choices]
+    )
+    labels: NDArray[np.int64] = choices[fitting.argmax(axis=0)[points.frames], np.arange(len(true))]
+    # A marker that is given to a hand which is not there is a mistake, whatever its name.
+    return np.where(absent[points.labels] & (true >= 0), -1, labels)

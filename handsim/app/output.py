@@ -7,7 +7,7 @@ import re
 import shutil
 import tempfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -16,9 +16,16 @@ from typing import Any, Final
 from upath import UPath
 
 from handsim.app.workers import Job
-from handsim.errors import ArgumentError, HandSimError, shortened
-from handsim.files.inputs import checksum
-from handsim.files.outputs import claim, remove_abandoned, remove_leftovers, temporary_beside
+from handsim.errors import ArgumentError, DatasetError, HandSimError, shortened
+from handsim.files.inputs import checksum, load_json
+from handsim.files.outputs import (
+    claim,
+    json_text,
+    remove_abandoned,
+    remove_leftovers,
+    save_json,
+    temporary_beside,
+)
 
 Make = Callable[[Path, int], int]
 """Writes the files of a number to a folder, and returns the number."""
@@ -26,6 +33,32 @@ Place = Path | UPath
 """A folder of this machine, or of an object store."""
 _PASSWORD: Final = re.compile(r"[^/@]*:[^/]*@")
 _HERE: Final = ("", "file", "local")
+CHECKSUMS: Final = "checksums-*.json"
+"""Files that jobs write last, each with the SHA-256 of all the files that its job has made."""
+
+
+def checksums_name(number: int) -> str:
+    """Name of the file with the checksums of a job's files."""
+    return CHECKSUMS.replace("*", f"{number:05d}")
+
+
+def save_checksums(path: Path, files: Mapping[str, Path]) -> None:
+    """Write the SHA-256 of files by their names in the output, which marks a finished job."""
+    save_json(path, {name: checksum(files[name]) for name in sorted(files)})
+
+
+def load_checksums(path: Path) -> dict[str, str]:
+    """The checksums that `save_checksums` wrote; none if they are missing or damaged."""
+    try:
+        content = load_json(path)
+        return content if path.read_text("utf-8") == json_text(content) else {}
+    except (DatasetError, OSError, UnicodeDecodeError):
+        return {}
+
+
+def changed_files(record: Mapping[str, str], files: Mapping[str, Path]) -> list[str]:
+    """Names of files that are missing or have other checksums than those of a record."""
+    return [name for name in record if not files[name].is_file() or checksum(files[name]) != record[name]]
 
 
 def place_of(out: str | Place) -> Place:

@@ -26,7 +26,7 @@ from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset
-from train.evaluation import CLEAN, evaluate_labeler, percent
+from train.evaluation import CLEAN, SEEN, evaluate_labeler, percent
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.generation import generate_dataset
@@ -126,7 +126,7 @@ def _draw_camera_view(out: Path) -> Section:
 def _generate_and_label(
     work: Path, labeler: Labeler, seed: int, num_frames: int, report: Callable[[str], None]
 ) -> tuple[Dataset, Section]:
-    """Generate a small training set and label it, clean and corrupted; returns it and a table."""
+    """Generate a small training set and label it, as seen and corrupted; returns it and a table."""
 
     def tell(done: int, total: int) -> None:
         report(f"generating frames: {done} of {total}")
@@ -135,7 +135,7 @@ def _generate_and_label(
     dataset = generate_dataset(work / "dataset", glove=GLOVE, num_frames=num_frames, seed=seed, progress=tell)
     seconds = time.perf_counter() - start
     columns = {}
-    for title, corruption in (("clean", CLEAN), ("occluded", _PAPER)):
+    for title, corruption in ((SEEN, CLEAN), ("occluded", _PAPER)):
         report(f"labeling {num_frames} frames, {title}")
         rng = np.random.default_rng(seed)
         columns[title] = evaluate_labeler(labeler, dataset, corruption, rng=rng).figures

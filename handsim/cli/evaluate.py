@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from handsim.app.messages import print_line
+from handsim.app.messages import print_line, print_table
+from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs, save_json
 from train.settings import EvaluateSettings
+
+if TYPE_CHECKING:
+    from train.evaluation import LabelingReport
 
 
 def evaluate(
@@ -18,10 +23,11 @@ def evaluate(
     *,
     glove: str = "dense19",
     labeler: str | None = None,
+    truth: Path | None = None,
     json: Path | None = None,
     threads: int = 1,
 ) -> None:
-    """Measure a labeler on labeled captures, corrupted as in the paper.
+    """Measure a labeler on labeled captures, corrupted as in the paper; or labels against a simulated truth.
 
     Args:
         captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, the .truth.npz of takes,
@@ -31,27 +37,61 @@ def evaluate(
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
+        truth: The .truth.npz of a simulated take. Labels that a capture of it already has, or a tracked take
+            .npz, are counted against it; no glove and no labeler are used.
         json: File for the figures.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
-    import numpy as np
-
-    from train.evaluation import evaluate_labeler, print_figures
+    from train.evaluation import evaluate_labeler, evaluate_labels, print_figures
     from train.labelers.protocol import label_on
     from train.labelers.storage import load_labeler
 
-    label_on(threads)
-    check_outputs((*captures, glove, labeler), [json])
-    network = load_labeler(glove, labeler)
-    report = evaluate_labeler(network, captures, settings=settings)
-    by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
-    if json is not None:
-        # JSON has no NaN, which stands where there was nothing to count.
-        figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
-        found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
-        save_json(json, {"glove": glove, **settings.record(), **found, "slot_accuracy_by_marker": by_marker})
+    check_outputs((*captures, glove, labeler, truth), [json])
+    if truth is None:
+        label_on(threads)
+        report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)
+        found: dict[str, Any] = {"glove": glove, **settings.record()}
+    elif len(captures) != 1 or labeler is not None or settings != EvaluateSettings():
+        raise ArgumentError(
+            f"--truth is given with {len(captures)} captures, expected one and none of --labeler, --occlude, "
+            "--ghosts, --every and --seed: the labels of a capture are counted as they are"
+        )
+    else:
+        report = evaluate_labels(captures[0], truth)
+        found = {"truth": str(truth)}
+    by_marker = dict(zip(report.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
+    # JSON has no NaN, which stands where there was nothing to count.
+    figures = {name: None if math.isnan(value) else value for name, value in report.figures.items()}
+    found |= {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
+    found["slot_accuracy_by_marker"] = by_marker
     hard = f", occlude {settings.occlude}, ghosts {settings.ghosts}"
     hard = hard if settings.occlude or settings.ghosts else ""
-    print_figures({"share": report.figures}, title=f"{report.num_frames} hands in frames{hard}")
+    what = "hands in frames" if truth is None else "frames"
+    print_figures({"share": report.figures}, title=f"{report.num_frames} {what}{hard}")
+    if truth is not None:
+        found |= _against_truth(report)
+    if json is not None:
+        save_json(json, found)
     worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
     print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
+
+
+def _against_truth(report: LabelingReport) -> dict[str, Any]:
+    """Print the share of right slots of all markers and of each, and return their intervals."""
+    from train.evaluation import percent
+
+    rows, seconds = [["marker", "slots right [%]", "95 % interval"]], report.seconds
+    intervals: dict[str, tuple[float, float] | None] = {}
+    shares = [report.figures["slot_accuracy"], *report.slot_accuracy_by_marker]
+    for index, name in enumerate(("all", *report.marker_names)):
+        interval = None
+        if seconds is not None and seconds[0] != seconds[-1]:  # two or more seconds
+            interval = report.interval(seconds, index - 1 if index else None)
+        between = "-" if interval is None else " to ".join(map(percent, interval))
+        rows.append([name, percent(float(shares[index])), between])
+        intervals[name] = interval
+    print_table(rows)
+    alone = [report.numbers[f"points_of_{one}_alone"] for one in ("truth", "capture")]
+    if any(alone):
+        print_line(f"{alone[0]} points only in the truth, {alone[1]} only in the capture")
+    return {"slot_accuracy_interval": intervals.pop("all"), "slot_accuracy_interval_by_marker": intervals}

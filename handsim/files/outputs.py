@@ -352,9 +352,14 @@ _MOST_SHOWN: Final = 4  # settings that a message lists
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file, whole or not at all; JSON knows no NaN and no infinity, which become null."""
+    """Write a JSON file, whole or not at all."""
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(json_text(content), encoding="utf-8")
+
+
+def json_text(content: dict[str, Any]) -> str:
+    """The text of a JSON file; JSON knows no NaN and no infinity, which become null."""
+    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
 
 
 def _finite(value: Any) -> Any:
@@ -384,7 +389,8 @@ def claim(
     """
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():
-        found, expected = _flat(load_json(path)), _flat(json.loads(json.dumps(settings)))
+        stored = load_json(path)
+        found, expected = _flat(stored), _flat(json.loads(json.dumps(settings)))
         keys = sorted((found.keys() | expected) - set(free))
         differing = [key for key in keys if key not in found.keys() & expected or found[key] != expected[key]]
         new, old = expected.get(grows), found.get(grows)
@@ -392,13 +398,13 @@ def claim(
         if differing and not grown:
             hint = f" ({grows} may only grow)" if grows and differing == [grows] else ""
             raise error(
-                f"{shown} holds a {noun} begun with other settings "
+                f"{path.name} says that {shown} holds a {noun} begun with other settings "
                 f"({_differences(differing, found, expected)}); use them or another folder{hint}"
             )
         remove_leftovers(out)
-        if grown:
-            if result is not None:
-                result.unlink(missing_ok=True)
+        if grown and result is not None:
+            result.unlink(missing_ok=True)
+        if grown or path.read_text("utf-8") != json_text(stored):  # damaged without another meaning
             save_json(path, settings)
     elif out.exists() and not out.is_dir():
         raise error(f"{out} is a file, expected a folder")

@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from train import Corruption, Labeling, evaluate_labeler
+from gloves import Capture
+from handsim.errors import CaptureError
+from train import Corruption, Labeling, evaluate_labeler, evaluate_labels, simulate_take
 from train.evaluation import (
     BINS,
     History,
@@ -222,3 +224,81 @@ def test_an_entry_is_the_mean_since_the_one_before_and_steps_that_wait_are_kept(
     history.add(1.0)
     assert history.close(1024, 0.05) == 1.0
     assert history.losses == [(768, 3.0, 0.1), (1024, 1.0, 0.05)]
+
+
+@pytest.fixture(scope="module")
+def take():
+    return simulate_take(num_frames=300, seed=3)
+
+
+def _swapped(take, share):
+    """The take as a capture with sides, in which two markers are exchanged in the first frames."""
+    labeled = take.labeled_capture()
+    positions, names = labeled.positions.copy(), list(labeled.names)
+    pair, frames = [names.index("right:ThumbTip"), names.index("right:IndexTip")], int(share * len(positions))
+    positions[:frames, pair] = positions[:frames, pair[::-1]]
+    return Capture(tuple(names), positions, take.rate)
+
+
+def test_the_truth_as_a_capture_has_no_error(take):
+    for sides in (take.labeled_capture(), _swapped(take, 0.0)):
+        report = evaluate_labels(sides, take)
+        assert report.figures["slot_accuracy"] == report.figures["point_accuracy"] == 1.0
+        assert np.isnan(report.figures["calibration_error"])
+        assert report.interval(report.seconds) == (1.0, 1.0)
+    assert report.marker_names == take.label_names[: len(report.marker_names)]
+
+
+def test_exchanged_labels_are_counted_by_marker_with_an_interval(take):
+    report = evaluate_labels(_swapped(take, 0.5), take)
+    wrong = {
+        name: 1.0 - share
+        for name, share in zip(report.marker_names, report.slot_accuracy_by_marker, strict=True)
+        if share < 1.0
+    }
+    assert set(wrong) == {"right:ThumbTip", "right:IndexTip"}
+    assert all(0.3 < share <= 0.5 for share in wrong.values())  # a frame that lacks both is right
+    thumb = report.marker_names.index("right:ThumbTip")
+    low, high = report.interval(report.seconds, thumb)
+    assert low < report.slot_accuracy_by_marker[thumb] < high
+    assert report.interval(report.seconds)[0] < report.figures["slot_accuracy"] < 1.0
+
+
+def test_columns_without_sides_fit_the_hand_that_is_there(take):
+    (left,) = (mine for mine, side in zip(take.hand_labels, take.sides, strict=True) if side == "left")
+    names = tuple(name.partition(":")[2] for name in take.label_names[left.start : left.stop])
+    report = evaluate_labels(Capture(names, take.observed("left"), take.rate), take)
+    np.testing.assert_array_equal(report.slot_accuracy_by_marker[left.start : left.stop], 1.0)
+    others = np.delete(report.slot_accuracy_by_marker, slice(left.start, left.stop))
+    seen = np.isfinite(take.observed("right")[..., 0]).mean(axis=0)
+    np.testing.assert_allclose(others, 1.0 - seen)
+    right_points = np.isfinite(take.observed("right")[..., 0]).sum()
+    assert report.numbers["points_of_truth_alone"] >= right_points
+
+
+def test_markers_of_a_hand_that_is_not_there_are_mistakes():
+    alone = simulate_take(num_frames=5, hands=("right",), seed=1)
+    labeled = alone.labeled_capture()
+    other = tuple(name.replace("right:", "left:") for name in labeled.names)
+    names = (*other[:1], *labeled.names[1:])
+    report = evaluate_labels(Capture(names, labeled.positions, labeled.rate), alone)
+    seen = np.isfinite(labeled.positions[:, 0, 0]).mean()
+    assert report.slot_accuracy_by_marker[0] == pytest.approx(1.0 - seen)
+    np.testing.assert_array_equal(report.slot_accuracy_by_marker[1:], 1.0)
+
+
+def test_points_of_another_place_are_ghosts_and_those_of_another_capture_are_refused(take):
+    labeled = take.labeled_capture()
+    moved = labeled.positions.copy()
+    moved[:, 0] += 0.01
+    report = evaluate_labels(Capture(labeled.names, moved, labeled.rate), take)
+    seen = int(np.isfinite(moved[:, 0, 0]).sum())
+    assert report.numbers["points_of_capture_alone"] == report.numbers["points_of_truth_alone"] == seen
+    assert report.confusion[-1, 0] == seen  # ghosts that are labeled as the first marker
+    with pytest.raises(CaptureError, match=r"shares 0 of its \d+ points with the take"):
+        evaluate_labels(Capture(labeled.names, labeled.positions[..., ::-1] + 5.0, labeled.rate), take)
+    with pytest.raises(CaptureError, match="the capture has 299 frames and the take 300"):
+        evaluate_labels(Capture(labeled.names, labeled.positions[1:], labeled.rate), take)
+    twice = (labeled.names[1], *labeled.names[1:])
+    with pytest.raises(CaptureError, match="two columns of one marker"):
+        evaluate_labels(Capture(twice, labeled.positions, labeled.rate), take)

@@ -153,7 +153,9 @@ def load_manifest(path: Path) -> Manifest:
                 raise DatasetError(f"the field {field.name} is missing")
         return Manifest.of(None, content)
     except HandSimError as error:
-        raise DatasetError(f"{file} is damaged: {error}; delete it and run handsim generate again") from error
+        raise DatasetError(
+            f"{file} is damaged: {error}; run handsim generate again, which writes it anew"
+        ) from error
 
 
 class Dataset:
@@ -190,7 +192,7 @@ class Dataset:
         if found != self.manifest.num_frames:
             raise DatasetError(
                 f"{path / MANIFEST} says {self.manifest.num_frames} frames, but the shards hold {found}; "
-                "delete it and run handsim generate again"
+                "run handsim generate again, which writes it anew"
             )
 
     def _copied(self, place: UPath) -> Path:

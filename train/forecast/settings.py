@@ -72,7 +72,12 @@ class PlanRigSettings(Settings):
     """Seed of people and motion."""
 
     def check(self) -> None:
-        """Refuse a plan without a mount."""
+        """Refuse a plan without a mount, and a picture of new cameras that are like a rig's first."""
+        if self.keep is not None and (self.size, self.field_of_view) != ((1280, 1280), 60.0):
+            raise ArgumentError(
+                f"given keep {self.keep}, and size or field of view, expected none of them: new cameras are "
+                "like the first one that is kept"
+            )
         if not self.mounts:
             raise ArgumentError(f"mounts is empty, expected some of {', '.join(MOUNTS)}")
 

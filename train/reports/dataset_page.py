@@ -11,10 +11,13 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
+from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
 from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
 from handsim.space.rig import load_rig
 from train.data.shards import Dataset, hands_name
+from train.reports.hand_plot import slips_picture
+from train.simulation.training_frames import GenerateSettings, slipped_gloves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,11 +39,13 @@ def write_dataset_page(
 ) -> Path:
     """Write the page on a training set, with gaps of markers that are `present` in a take at a rate [Hz]."""
     rows, manifest = sample_rows(dataset), dataset.manifest
+    rig = load_rig(manifest.config["rig"])
     sections = [
         _figures_section(dataset, rows),
         _angles_section(rows),
-        _sight_section(rows, dataset),
+        _sight_section(rows, dataset, len(rig.positions)),
         _ghosts_section(rows),
+        _slips_section(dataset),
         _neighbors_section(rows, 2.0 * float(manifest.config["layout"]["radius"])),
     ]
     if present is not None:
@@ -49,8 +54,8 @@ def write_dataset_page(
         path,
         sections,
         title=f"Training set {dataset.path.resolve().name}",
-        lead=f"{manifest.num_frames:,} frames of glove {manifest.config['layout']['name']} before rig "
-        f"{manifest.config['rig']}, seed {manifest.config['seed']}.",
+        lead=f"{manifest.num_frames:,} frames of glove {manifest.config['layout']['name']} before the "
+        f"{len(rig.positions)} cameras of rig {rig.name}, seed {manifest.config['seed']}.",
     )
     return path
 
@@ -145,17 +150,20 @@ def _draw_angles(
     figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=Paint.SOFT)
 
 
-def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
-    """How often each marker is lost, and how many cameras see it."""
+def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset, num_cameras: int) -> Section:
+    """How often each marker is lost, and how many cameras have a free view of it."""
     manifest = dataset.manifest
     least = manifest.min_cameras
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
-    shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
+    shares = camera_shares(rows, num_cameras)
     text = (
-        f"A marker has a point when the rays of at least {least} cameras meet; other hands, "
-        "held objects, merged blobs and lost pictures are included."
+        f"A marker has a point when the rays of at least {least} cameras meet; otherwise it is lost. Cameras "
+        "without a free view, merged blobs, missed blobs and lost pictures are all included."
     )
-    caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
+    caption = (
+        "Left: how often each marker is lost, for whatever reason. Right: how many of "
+        f"{num_cameras} cameras have a free view of it, past hands and held objects alone."
+    )
     size = (10.8, 1.6 + 0.21 * len(lost))
     drawn = picture(size, _draw_visibility, manifest.marker_names, lost, shares, least)
     return Section("Occlusion", text, pictures=[(drawn, caption)])
@@ -174,7 +182,7 @@ def _draw_visibility(
     seen_by: Float[np.ndarray, "M C+1"],
     min_cameras: int,
 ) -> None:
-    """Draw the share of frames without each marker, and beside it the number of cameras that see it."""
+    """Draw the share of frames that lose each marker, and beside it the number of cameras in free view."""
     rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
     left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
@@ -185,7 +193,7 @@ def _draw_visibility(
     left.set_yticks(rows, names, color=Paint.INK, parse_math=False)
     left.set_ylim(len(names) - 0.4, -0.6)
     left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
-    left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
+    left.set_xlabel("frames in which it is lost [%]")
     left.tick_params(axis="y", length=0)
     most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
     shades = right.pcolormesh(
@@ -200,7 +208,7 @@ def _draw_visibility(
     least = min_cameras - 0.5
     right.axvline(least, color=Paint.WARM, linewidth=1.4)
     annotate(right, f"at least {min_cameras}", (least, -0.5), (3, 3), color=Paint.WARM, fontsize=8.0)
-    right.set_xlabel("cameras that see it")
+    right.set_xlabel("cameras with a free view of it")
     right.locator_params(axis="x", integer=True)
     right.tick_params(axis="y", length=0)
     right.spines["left"].set_visible(False)
@@ -251,6 +259,24 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
         _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
     else:
         right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
+
+
+def _slips_section(dataset: Dataset) -> Section:
+    """Where slips of the glove put each marker."""
+    config = dataset.manifest.config
+    names = ("population", "slip_along", "slip_around")
+    given = {name: value for name, value in config.items() if name in names}
+    settings, model = GenerateSettings.from_json(given), HandModel.named("M")
+    slips = slipped_gloves(dataset.layout, model, settings, rng=np.random.default_rng(0))
+    text = (
+        f"Nobody wears a glove as designed: markers slip by {settings.slip_along:g} bone lengths along the "
+        f"bones and {settings.slip_around:g} degrees around them, as standard deviations."
+    )
+    caption = (
+        f"The markers of {len(slips)} people of this population, each at its place on a right hand of size "
+        "M, one color a marker. Left: from the back. Right: from the palm's side."
+    )
+    return Section("Slips", text, pictures=[(slips_picture(dataset.layout, slips), caption)])
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:

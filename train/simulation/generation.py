@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pickle
-import sys
 import warnings
 from collections import Counter
+from collections.abc import Collection
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -17,12 +17,21 @@ import numpy as np
 from gloves.fit import attach_markers
 from gloves.layout import load_layout
 from handsim._plugins import plugin_name
-from handsim.app.output import Output, Place, open_output, place_of
-from handsim.app.workers import check_workers, run_jobs
+from handsim.app.output import (
+    CHECKSUMS,
+    Output,
+    Place,
+    checksums_name,
+    load_checksums,
+    open_output,
+    place_of,
+    save_checksums,
+)
+from handsim.app.workers import check_workers, main_script, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.inputs import load_json
-from handsim.files.outputs import check_free, save_json
+from handsim.files.outputs import check_free, json_text, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
@@ -95,7 +104,7 @@ def make_dataset(
     if isinstance(place, Path):
         _check_space(source, place)
     with open_output(place) as output:
-        damaged = _damaged_files(output)
+        whole = _whole_files(output)
         output.claim(
             CONFIG,
             _record(source),
@@ -104,8 +113,8 @@ def make_dataset(
             grows="num_frames",
             result=MANIFEST,
         )
-        _make_shards(source, output, damaged, workers, progress)
-        return _complete(source, output)
+        _make_shards(source, output, whole, workers, progress)
+        return _complete(source, output, whole)
 
 
 def _resolved(settings: GenerateSettings) -> FrameSource:
@@ -129,9 +138,7 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
         return allowed
     try:
         pickle.dumps(sampler)
-        alone = getattr(sampler, "__module__", "") == "__main__" and not hasattr(
-            sys.modules["__main__"], "__file__"
-        )  # as in a notebook
+        alone = getattr(sampler, "__module__", "") == "__main__" and main_script() is None
     except Exception:  # a user's object may raise anything
         alone = True
     if alone and workers is not None:
@@ -154,33 +161,70 @@ def _record(source: FrameSource) -> dict[str, Any]:
     }
 
 
-def _damaged_files(output: Output) -> set[str]:
-    """Files of a finished set that are no longer what its manifest lists, which are told."""
+def _recorded_files(output: Output) -> dict[str, str]:
+    """Checksums of files of finished shards: those that a shard has written, or else the manifest's."""
+    output.fetch(CHECKSUMS)
+    try:
+        recorded = load_manifest(output.folder).files
+    except DatasetError:  # unfinished, damaged, or of another version
+        recorded = {}
+    own = _shard_records(output)
+    numbers = set(map(_number, own))
+    recorded = {name: one for name, one in recorded.items() if _number(name) not in numbers}
+    return recorded | {name: one for table in own.values() for name, one in table.items()}
+
+
+def _shard_records(output: Output) -> dict[str, dict[str, str]]:
+    """The checksums that shards have written, by the names of their files; none in a damaged file."""
+    records = {path.name: load_checksums(path) for path in output.folder.glob(CHECKSUMS)}
+    return {
+        name: table if table.keys() == set(_names(_number(name))) else {} for name, table in records.items()
+    }
+
+
+def _whole_files(output: Output) -> dict[str, str]:
+    """Checksums of the files of undamaged shards; files that are not as they were made are told."""
     if not output.is_here and MANIFEST in output.sizes():
         (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
-    try:
-        listed = load_manifest(output.folder).files
-    except DatasetError:  # unfinished, or of another version
-        return set()
-    there = output.sizes()
-    damaged = {name for name, known in listed.items() if name in there and output.checksum(name) != known}
-    if damaged:
-        names = ", ".join(sorted(damaged))
-        told = f"{output}: {names} are not what {MANIFEST} lists (other checksums), and are made again"
-        warnings.warn(told, HandSimWarning, stacklevel=4)
-    return damaged
+    recorded, there = _recorded_files(output), output.sizes()
+    damaged = {name for name in recorded if name in there and output.checksum(name) != recorded[name]}
+    lists = MANIFEST if (output.folder / MANIFEST).is_file() else CHECKSUMS
+    _tell(output, damaged, f"are not what {lists} lists (other checksums)")
+    _tell(output, [name for name, table in _shard_records(output).items() if not table], "are damaged")
+    numbers = {_number(name) for name in damaged}
+    return {name: one for name, one in recorded.items() if _number(name) not in numbers}
+
+
+def _number(name: str) -> int:
+    """The number of a shard in the name of one of its files; -1 for other names."""
+    number = Path(name).stem.rpartition("-")[2]
+    return int(number) if number.isdecimal() else -1
+
+
+def _names(shard: int) -> tuple[str, str, str]:
+    """Names of the files of a shard."""
+    return hands_name(shard), redrawn_name(shard), rows_name(shard)
+
+
+def _tell(output: Output, files: Collection[str], what: str) -> None:
+    """Warn of files that are made again."""
+    if files:
+        told = f"{output}: {', '.join(sorted(files))} {what}, and are made again"
+        warnings.warn(told, HandSimWarning, stacklevel=5)
 
 
 def _make_shards(
-    source: FrameSource, output: Output, damaged: set[str], workers: int | Executor, progress: Progress
+    source: FrameSource, output: Output, whole: Collection[str], workers: int | Executor, progress: Progress
 ) -> None:
     """Make the shards that are missing or damaged."""
     total = source.settings.num_frames
-    there = {name: size for name, size in output.sizes().items() if name not in damaged}
+    there = {name: size for name, size in output.sizes().items() if name in whole}
     todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
+    for shard in todo:
+        (output.folder / checksums_name(shard)).unlink(missing_ok=True)
     done = total - sum(_shard_size(total, shard) for shard in todo)
     try:
-        job = output.job(functools.partial(make_shard, source), last=["rows-*"])
+        job = output.job(functools.partial(make_shard, source), last=[CHECKSUMS])
         with interrupts_bare():
             for shard in run_jobs(job, todo, workers):
                 done += _shard_size(total, shard)
@@ -190,20 +234,25 @@ def _make_shards(
         raise Stopped.again(stop, f"{kept}, and the same command goes on after them") from stop
 
 
-def _complete(source: FrameSource, output: Output) -> Manifest:
+def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Manifest:
     """Write the manifest of a set with all its shards."""
     shards = _shards(source.settings.num_frames)
     output.fetch("redrawn-*.json")
+    recorded = whole | _recorded_files(output)
     names = sorted(name(shard) for shard in shards for name in (rows_name, hands_name))
     manifest = Manifest(
         config=load_json(output.folder / CONFIG),
         marker_names=source.layout.names,
         num_frames=source.settings.num_frames,
         min_cameras=source.settings.min_cameras,
-        files={name: output.checksum(name) for name in names},
+        files={name: recorded[name] for name in names},
         redrawn=load_redrawn(output.folder, len(shards)),
     )
-    save_json(output.folder / MANIFEST, dataclasses.asdict(manifest))
+    path, content = output.folder / MANIFEST, dataclasses.asdict(manifest)
+    if path.is_file() and path.read_bytes() != json_text(content).encode():
+        told = f"{output}: {MANIFEST} is not what the shards give, and is written anew"
+        warnings.warn(told, HandSimWarning, stacklevel=4)
+    save_json(path, content)
     output.publish(MANIFEST)
     return manifest
 
@@ -252,5 +301,6 @@ def make_shard(source: FrameSource, out: Path, shard: int) -> int:
         block["hand"] += first
     save_array(out / hands_name(shard), hands)
     save_json(out / redrawn_name(shard), dict(sorted(redrawn.items())))
-    save_array(out / rows_name(shard), rows)  # last: a shard with rows is finished
+    save_array(out / rows_name(shard), rows)
+    save_checksums(out / checksums_name(shard), {name: out / name for name in _names(shard)})
     return shard

@@ -47,6 +47,21 @@ def test_two_hands_have_columns_of_their_own_and_are_evaluated_each(take, tmp_pa
     assert found["frames"] == 2 * FRAMES and found["figures"]["slot_accuracy"] > 0.97
 
 
+def test_labels_in_a_file_are_counted_against_the_truth(take, tmp_path, capsys):
+    take.save(tmp_path / "take.truth.npz")
+    label(tmp_path, take.capture(), capsys)
+    figures = tmp_path / "figures.json"
+    command = ["evaluate", str(tmp_path / "out.trc"), "--truth", str(tmp_path / "take.truth.npz")]
+    assert main([*command, "--json", str(figures)]) == 0
+    found, said = json.loads(figures.read_text()), capsys.readouterr().out
+    assert found["frames"] == FRAMES and 0.97 < found["figures"]["slot_accuracy"] <= 1.0
+    assert found["numbers"]["points_of_truth_alone"] == found["numbers"]["points_of_capture_alone"] == 0
+    assert found["slot_accuracy_interval"] is None  # the capture is shorter than a second
+    assert "right:ThumbTip" in said and "all" in said
+    assert main(["evaluate", str(tmp_path / "in.c3d"), *command[2:]]) == 1
+    assert "no columns of markers" in capsys.readouterr().err
+
+
 def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
     (left,) = (n for n, hand in enumerate(take.hands) if hand.side == "left")
     positions = take.observed(take.hand_labels[left]).copy()

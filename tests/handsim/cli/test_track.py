@@ -25,11 +25,13 @@ from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
 from gloves.takes.take import LOST
 from handsim import HandModel, sample_shape
+from handsim.app import messages
 from handsim.cli.main import main
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
 from track import Recorder, ReplayServer, captures, load_user, open_source, track_capture
 from track.rigid_body import load_body
+from track.streams import natnet
 from track.viewer.editors import Corrector
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
@@ -287,6 +289,29 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     assert lines[2] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
 
 
+def test_a_server_may_start_after_the_tracker(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(natnet, "_PATIENCE", 0.5)
+    started, took = [], messages.LiveStatus.show
+
+    def show(status: messages.LiveStatus, line: str, *, now: bool = False) -> None:
+        took(status, line, now=now)
+        if "no NatNet server answers" in line and not started:
+            started.append(ReplayServer(capture.with_suffix(".truth.npz"), loop=True, port=port))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    monkeypatch.setattr(messages.LiveStatus, "show", show)
+    out, address = tmp_path / "live.npz", f"natnet://127.0.0.1:{port}"
+    try:
+        assert main(["track", "--live", address, "--size", "M", "--seconds", "0.3", "--out", str(out)]) == 0
+    finally:
+        for server in started:
+            server.close()
+    assert "it is waited for, Ctrl-C ends it" in capsys.readouterr().err
+    assert load_take(out).num_frames > 1
+
+
 LATE = """
 import time
 import numpy as np
@@ -311,6 +336,27 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     options = ["--size", "M", "--seconds", "0.5", "--out", str(out)]
     assert main(["track", "--live", "late_source:Late", *options]) == 0
     assert load_take(out).num_frames == 30, "not from the first silence"
+
+
+EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
+EMPTY = EMPTY.replace(
+    "class Late:",
+    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
+
+class Late:
+    without_points = "is the cover off?"
+""",
+)
+
+
+@pytest.mark.parametrize("size", ["auto", "M"])
+def test_a_stream_whose_frames_have_no_points_is_told_at_once(size, tmp_path, monkeypatch, capsys):
+    (tmp_path / f"empty_{size}.py").write_text(EMPTY)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    main(["track", "--live", f"empty_{size}:Late", "--size", size, "--out", str(tmp_path / "live.npz")])
+    said = "frames arrive, but no point was in any of them; is the cover off?"
+    assert capsys.readouterr().err.splitlines().count(said) == 1
 
 
 def _numbers_in(part):
@@ -418,7 +464,8 @@ def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch)
     with ReplayServer(SimpleNamespace(points=take.points[:1], ids=take.ids[:1], rate=120.0)) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
         assert main(arguments) == 1
-    assert "1 frames came, expected two or more" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "1 frames came, expected two or more" in said
     assert not list(tmp_path.iterdir())
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim import HandModel, HandSimWarning, Population, join_qpos, load_rig
+from handsim.app.output import CHECKSUMS
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import checksum
@@ -146,6 +147,22 @@ def test_a_damaged_file_is_told_and_made_again(finished, tmp_path, name, num_fra
         make_dataset(dataclasses.replace(CONFIG, num_frames=num_frames), out, workers=1)
     assert checksum(out / name) == checksum(finished / name)
     assert len(Dataset(out)) == num_frames
+
+
+def test_a_set_of_a_version_without_checksums_of_shards_is_checked_against_its_manifest(finished, tmp_path):
+    out = tmp_path / "older"
+    shutil.copytree(finished, out)
+    for path in out.glob(CHECKSUMS):
+        path.unlink()
+    kept = (out / rows_name(0)).stat().st_mtime_ns
+    (out / rows_name(1)).write_bytes((out / rows_name(1)).read_bytes()[::-1])
+    with pytest.warns(HandSimWarning, match=r"rows-00001.npy are not what manifest.json lists"):
+        grown = make_dataset(dataclasses.replace(CONFIG, num_frames=900), out, workers=1)
+    assert (
+        grown.files.items()
+        > {name: checksum(finished / name) for name in (rows_name(0), rows_name(1))}.items()
+    )
+    assert (out / rows_name(0)).stat().st_mtime_ns == kept and len(Dataset(out)) == 900
 
 
 def test_the_gloves_radius_reaches_the_optics(tmp_path):
