@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
@@ -129,6 +127,12 @@ def _events_of(
     they have the same two labels in one frame and the next.
     """
     points = np.flatnonzero(one != other)
+    if not len(points):
+        return _Events(points, points)
+    # These take longer to load than most captures need to be labeled.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     rows = frames[points]
     first, second = (labels[points].astype(np.int64) + 1 for labels in (one, other))
     span = max(first.max(initial=0), second.max(initial=0)) + 1

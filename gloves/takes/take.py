@@ -621,6 +621,8 @@ class Take:
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
+        A hand without any label has no columns if the other hand has one.
+
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
                 `ThumbTip`, and no frame may hold two hands.
@@ -629,9 +631,16 @@ class Take:
             CaptureError: There are no points.
         """
         names, labels = self.label_names, self.point_list.labels.astype(np.int64)
+        num_markers = len(self.hands[0].layout.names)
         if not sides:
             names = self.hands[0].layout.names
-            labels = np.where(labels >= 0, labels % len(names), -1)
+            labels = np.where(labels >= 0, labels % num_markers, -1)
+        else:
+            seen = np.isin(np.arange(len(self.hands)), labels[labels >= 0] // num_markers)
+            kept = np.ones(len(names), dtype=np.bool_)
+            kept[: num_markers * len(seen)] = np.repeat(seen | ~seen.any(), num_markers)
+            names = tuple(name for name, keeps in zip(names, kept, strict=True) if keeps)
+            labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
         return labeled_columns(frames, rows, names, self.rate)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from handsim.app.messages import print_line, progress_bar
+from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
@@ -63,7 +63,9 @@ def view(
         if out is not None:
             check_take_file(out, live=True)
             check_outputs((rig, *options.files()), (out,))
-        _view_live(live, TrackerSetup.of(options.settings()), host, port, rig, out)
+        with named_steps(""):  # a glove may have to be learned
+            setup = TrackerSetup.of(options.settings())
+        _view_live(live, setup, host, port, rig, out)
         return
     _check_still(str(file), options, video, time)
     content = open_content(str(file), out=out, size=options.size, rig=rig, time=time)

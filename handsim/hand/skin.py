@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 def edge_table(quads: Int[np.ndarray, "Q 4"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "Q 4"]]:
     """Edges of a quad mesh (lower vertex first) and the edge from each corner of a quad to the next one."""
     ends = np.stack([quads, np.roll(quads, -1, axis=1)], axis=-1).reshape(-1, 2)
-    edges, inverse = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
-    return edges, inverse.reshape(quads.shape)
+    count = int(quads.max()) + 1
+    numbers, inverse = np.unique(ends.min(axis=1) * count + ends.max(axis=1), return_inverse=True)
+    return np.stack(np.divmod(numbers, count), axis=1), inverse.reshape(quads.shape)
 
 
 def catmull_clark(

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from handsim._checks import check_type
-from handsim.errors import ArgumentError, HandSimError, RigError, choices
+from handsim.errors import ArgumentError, HandSimError, RigError, choices, shortened
 from handsim.files.inputs import (
     check_keys,
     number_list,
@@ -164,7 +164,22 @@ def _written(values: Sequence[float]) -> str:
     return f"[{', '.join(repr(float(value) + 0.0) for value in values)}]"
 
 
+TOML_MATRIX: Final = "matrix"
+"""The key of a camera's K in the TOML files of Pose2Sim and anipose."""
+
+
+def foreign_camera(table: Mapping[str, Any]) -> str | None:
+    """The name of a camera's table in a TOML file of Pose2Sim or anipose, None in any other file."""
+    return next((key for key, one in table.items() if isinstance(one, dict) and TOML_MATRIX in one), None)
+
+
 def _parse(table: Mapping[str, Any], stem: str) -> RigFile:
+    foreign = foreign_camera(table)
+    if foreign is not None:
+        raise RigError(
+            f"[{shortened(foreign)}] with a {TOML_MATRIX} is a camera of Pose2Sim or anipose, expected "
+            "[[camera]]; handsim rig import makes a rig of such a file"
+        )
     check_keys(table, "the file", _TOP, optional=_TOP)
     name = table.get("name", stem)
     if not isinstance(name, str) or not name or not name.isprintable():

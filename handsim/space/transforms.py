@@ -93,6 +93,12 @@ def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) 
     return rotation
 
 
+def cross(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """The vector product (3,) of two vectors; numpy's function for arrays takes twenty times as long."""
+    (x, y, z), (u, v, w) = first.tolist(), second.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
+from handsim.space.transforms import cross
 from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, nearest_faces, project
@@ -52,9 +53,9 @@ def shadow_map(
     seen: Bool[np.ndarray, "V"],
 ) -> ShadowMap:
     """The shadow map of a surface for a lamp in this unit direction, with room for its seen vertices."""
-    aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
+    aside = cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
-    rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
+    rotation = np.stack([aside, cross(aside, towards), towards])  # rows run down, as in pictures
     corners, to_map, scale = _onto_map(points, rotation, seen if seen.any() else ~seen)
     nearest = np.empty((3, _TEXELS, _TEXELS), np.float32)
     nearest[0], _ = nearest_faces([(corners, faces)], (_TEXELS, _TEXELS), farthest=-np.inf)

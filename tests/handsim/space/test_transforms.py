@@ -5,7 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from handsim.space.transforms import euler_angles, euler_matrix, pose_matrices, rotation_quaternions
+from handsim.space.transforms import (
+    cross,
+    euler_angles,
+    euler_matrix,
+    pose_matrices,
+    quaternion_matrix,
+    rotation_quaternions,
+)
 
 TURN = st.floats(-np.pi, np.pi)
 
@@ -41,4 +48,14 @@ def test_quaternions_of_nearly_rotations_are_those_of_the_nearest_ones(rng):
     left, _, right = np.linalg.svd(bent)
     np.testing.assert_allclose(
         Rotation.from_quat(rotation_quaternions(bent), scalar_first=True).as_matrix(), left @ right, atol=1e-9
+    )
+
+
+def test_single_vectors_and_quaternions_give_what_arrays_of_them_give(rng):
+    first, second = rng.normal(size=(2, 3))
+    np.testing.assert_array_equal(cross(first, second), np.cross(first, second))
+    many = rng.normal(size=(3, 2, 4))
+    np.testing.assert_array_equal(quaternion_matrix(many)[1, 1], quaternion_matrix(many[1, 1]))
+    np.testing.assert_allclose(
+        quaternion_matrix(np.array([1.0, 1.0, 0.0, 0.0])) @ [0, 1, 0], [0, 0, 1], atol=1e-12
     )
