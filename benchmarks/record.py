@@ -90,12 +90,12 @@ class Conditions:
     def __str__(self) -> str:
         """Sentences of a page on the run."""
         seeds = ", ".join(map(str, self.seeds))
-        trial = "This was a try with a few frames. " if self.is_quick else ""
-        left_out = f"without {', '.join(self.left_out)}" if self.left_out else "with nothing left out"
+        few = " a few frames of" if self.is_quick else ""
+        left_out = f"Left out: {'; '.join(self.left_out)}" if self.left_out else "Nothing was left out"
         threads = ", ".join(f"{library} {count}" for library, count in self.threads.items())
         return (
-            f"{trial}This run was of the seeds {seeds}, {left_out}, on {self.processors} processors with "
-            f"{self.vectors}. Threads: {threads}. {self.load[0]:.1f} processes wanted to run before it, and "
+            f"This run was of{few} the seeds {seeds}, on {self.processors} processors with {self.vectors}. "
+            f"{left_out}. Threads: {threads}. {self.load[0]:.1f} processes wanted to run before it, and "
             f"{self.load[1]:.1f} at its end."
         )
 

@@ -424,7 +424,8 @@ def main(
     for name in only:
         speeds.begin(name)
         globals()[name](speeds)
-    missing = [f"the section {name}" for name in get_args(Section) if name not in only]
+    sections = [name for name in get_args(Section) if name not in only]
+    missing = [f"the sections {', '.join(sections)}"] if sections else []
     if "solvers" in only and not inverse_kinematics.HAS_MINK:
         missing.append("mink")
     if "paper" in only and cnn is None:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Annotated, Any, Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -33,6 +33,7 @@ from handsim.files.inputs import (
     text_of,
 )
 from handsim.files.outputs import as_text, atomic_write
+from handsim.settings import Limits
 from handsim.space.camera import (
     Camera,
     CameraArrays,
@@ -277,6 +278,10 @@ MAX_CAMERAS: Final = 32
 """A marker's visibility is one bit per camera in 32 bits."""
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
+LONGEST_SIDE: Final = 50.0
+"""No volume or room is longer, and no middle of one farther from the origin [m]."""
+Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
+"""The middle of such a space [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"

@@ -59,7 +59,7 @@ def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
     conditions = Conditions(
         seeds=(3, 4),
         is_quick=False,
-        left_out=("the section rays", "mink"),
+        left_out=("the sections rays, labels", "mink"),
         processors=6,
         vectors="AVX2",
         threads={"torch": "1", "OpenBLAS": "5"},
@@ -68,13 +68,12 @@ def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
     path = save_figures("speed", {}, tmp_path, conditions)
     origin = json.loads(path.read_text("utf-8"))
     assert speed_run(tmp_path) == (
-        "This run was of the seeds 3, 4, without the section rays, mink, on 6 processors with AVX2. "
-        "Threads: torch 1, OpenBLAS 5. 0.0 processes wanted to run before it, and 1.3 at its end. "
+        "This run was of the seeds 3, 4, on 6 processors with AVX2. Left out: the sections rays, labels; "
+        "mink. Threads: torch 1, OpenBLAS 5. 0.0 processes wanted to run before it, and 1.3 at its end. "
         f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
     )
     whole = str(dataclasses.replace(conditions, left_out=(), is_quick=True))
-    assert whole.startswith(
-        "This was a try with a few frames. This run was of the seeds 3, 4, with nothing left out"
-    )
+    assert whole.startswith("This run was of a few frames of the seeds 3, 4, on 6 processors")
+    assert " Nothing was left out. " in whole
     save_figures("speed", {}, tmp_path)
     assert speed_run(tmp_path).startswith(f"Commit {origin['commit']}")

@@ -245,16 +245,28 @@ def test_slips_leave_lateral_markers_on_the_skin_of_their_digit(rng):
 
 
 def stray(worn: Attachment, model: HandModel) -> list[str]:
-    """Markers whose nearest bone is of another digit; what the palm carries or lies nearest to is its own."""
-    feet = worn.points - worn.layout.heights[:, None] * worn.normals
-    digits = np.array([BONES[BONE_NAMES.index(marker.bone)].digit for marker in worn.layout.markers])
-    starts, ends = np.moveaxis(model.capsules.posed(model.rest_transforms[None])[0], 1, 0)
+    """Markers whose nearest bone is of another digit.
+
+    Metacarpals are the palm's and their finger's; the thumb has the index finger's and the wrist, too. What
+    the palm carries is its own.
+    """
+    feet, capsules = worn.points - worn.layout.heights[:, None] * worn.normals, model.capsules
+    starts, ends = np.moveaxis(capsules.posed(model.rest_transforms[None])[0], 1, 0)
     shares = ((feet[:, None] - starts) * (ends - starts)).sum(-1) / ((ends - starts) ** 2).sum(-1)
     away = feet[:, None] - starts - np.clip(shares, 0.0, 1.0)[..., None] * (ends - starts)
-    nearest = model.capsules.bones[np.linalg.norm(away, axis=-1).argmin(axis=1)]
-    of_palm = (digits < 0) & ((nearest == PALM) | (worn.main_bones == PALM))
-    right = of_palm | (digits == nearest_digits(feet, model))
-    return [worn.layout.names[index] for index in np.flatnonzero(~right)]
+    distances = np.linalg.norm(away, axis=-1)
+    metacarpals = iter(({1, 0}, {2}, {3}, {4}, {0}, {0}))
+    owners = [
+        {-1} | next(metacarpals) if bone == PALM else {BONES[bone].digit} for bone in capsules.bones.tolist()
+    ]
+    found = []
+    for index, marker in enumerate(worn.layout.markers):
+        own = [BONES[BONE_NAMES.index(marker.bone)].digit in one for one in owners]
+        # Where two bones meet, as in a knuckle, both are equally near.
+        near = distances[index, own].min() <= distances[index].min() + 1e-9
+        if not near and not (marker.bone == "palm" and worn.main_bones[index] == PALM):
+            found.append(marker.name)
+    return found
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,20 @@ class SceneMotion:
             held = dataclasses.replace(held, motion=motion)
         return SceneMotion(hands, held, self.rate)
 
+    def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
+        """The scene moved by one offset, or by one for each frame [m]; without markers of others."""
+        hands = []
+        for hand in self.hands:
+            qpos = hand.qpos.copy()
+            qpos[:, :3] += offsets
+            hands.append(GlovedHand(hand.fit, qpos))
+        held = self.moving_object
+        if held is not None:
+            poses = held.motion.T_world_body.copy()
+            poses[:, :3, 3] += offsets
+            held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+        return dataclasses.replace(self, hands=tuple(hands), moving_object=held, others=None)
+
 
 def sample_scene_motion(
     kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator

@@ -24,7 +24,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
 from handsim.settings import Expected, Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
+from handsim.space.rig import ROOM_CENTER, CameraRig, Center, list_rigs
 from handsim.space.transforms import pose_matrices, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
@@ -81,8 +81,10 @@ class GenerateSettings(Settings):
     """Standard deviation of the markers' slip along the bones [bone lengths]."""
     slip_around: Annotated[float, Limits(0.0, 90.0)] = 10.0
     """The same around the bones [deg]."""
+    center: Center = ROOM_CENTER
+    """Middle of the cube that wrists move in, in the rig's room [m]."""
     volume: Annotated[float, Limits(0.0, 10.0)] = 0.3
-    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    """Half side of that cube [m]."""
     population: Population = field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = field(default_factory=PoseMix)
     sampler: Annotated[PoseSampler | str, SAMPLER] | None = None
@@ -197,11 +199,11 @@ def simulate_frames(
     *,
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
-) -> None:
+) -> tuple[GloveFit, ...]:
     """Fill rows with random poses of one person's gloved hands, as rig and optical system capture them.
 
     Of a scene with two hands, the first half of the rows is the right hand's. Impossible scenes are counted
-    in `redrawn`, by reason.
+    in `redrawn`, by reason. Returns the hands with their gloves as worn.
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
@@ -225,6 +227,7 @@ def simulate_frames(
         for name in HandFrames._fields:
             part[name] = getattr(frames, name)[: len(part)]
         begin += len(qpos)
+    return fits
 
 
 def sample_frame_scene(
@@ -246,9 +249,12 @@ def sample_frame_scene(
     try:
         if kind == 1:
             left, right = models
-            return FrameScene((right, left), sample_two_hand_poses(right, left, -(-num_rows // 2), rng=rng))
+            both = sample_two_hand_poses(right, left, -(-num_rows // 2), rng=rng)
+            for qpos in both:
+                qpos[:, :3] += np.subtract(settings.center, ROOM_CENTER)
+            return FrameScene((right, left), both)
         if kind == 2:
-            return sample_holding_hand(model, num_rows, settings.volume, rng=rng)
+            return sample_holding_hand(model, num_rows, settings, rng=rng)
     except PoseError:
         if redrawn is not None:
             redrawn[NO_TOUCH if kind == 1 else NO_GRASP] += 1
@@ -267,7 +273,7 @@ def sample_single_hand(
 
     A sampler of whole poses also places the wrists, unless it leaves all of them at the origin.
     """
-    position = ROOM_CENTER + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
+    position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     if sampler is None:
         angles = sample_valid_angles(model, num_frames, settings.poses, rng=rng)
     else:
@@ -281,14 +287,14 @@ def sample_single_hand(
 
 
 def sample_holding_hand(
-    model: HandModel, num_frames: int, volume: float, *, rng: np.random.Generator
+    model: HandModel, num_frames: int, settings: GenerateSettings, *, rng: np.random.Generator
 ) -> FrameScene:
-    """Poses of a hand that holds a random object, in a cube of half side `volume` [m]."""
+    """Poses of a hand that holds a random object, anywhere in the volume."""
     names = object_names()
     rigid_object = named_object(names[rng.integers(len(names))])
     hold = settle_hold(model, rigid_object, rng=rng)
     angles, T_wrist_object = sample_held_poses(model, rigid_object, hold, num_frames, rng=rng)
-    position = ROOM_CENTER + rng.uniform(-volume, volume, size=(num_frames, 3))
+    position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     quaternion = random_quaternions(num_frames, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
     return FrameScene((model,), (qpos,), rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
