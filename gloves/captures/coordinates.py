@@ -43,7 +43,6 @@ _COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their pos
 _GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
 _GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
 _AT_REST: Final = 0.4  # of the next step: the first step of a marker that speeds up smoothly is a third
-_STILL: Final = 0.1  # share of the frames, from which frames in which nothing moves are the capture's nature
 
 
 def findings_sentence(findings: Mapping[str, int]) -> str:
@@ -166,9 +165,6 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
     edges = np.diff(flags, axis=1)
     columns, first = np.nonzero(edges == 1)  # the first and the last frame of each run of equal positions
     last = np.nonzero(edges == -1)[1]
-    alive = (steps[2:-2] > 0.0).any(axis=1)
-    alive |= (~alive).mean() < _STILL  # frames without a single point, all held
-    others = np.concatenate([[0], np.cumsum(alive)])
     ends = [
         np.where(step > _AT_REST * np.nan_to_num(steps[beyond, columns]), step, 0.0)
         for at, beyond in ((first + 1, first), (last + 2, last + 3))
@@ -181,13 +177,17 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         held &= last > first + 1
     else:
         held = abruptly[0] | abruptly[1]
-    held &= others[last] > others[first]
-    columns, first, last = columns[held], first[held], last[held]
-    marks = np.zeros((num_frames + 1, num_columns), dtype=np.int32)
-    # before the marker came, all are held; otherwise the first was measured
-    marks[first + (first > 0), columns] += 1
-    marks[last + 1, columns] -= 1
-    return np.cumsum(marks, axis=0)[:-1] > 0
+    alive = (steps[2:-2] > 0.0).any(axis=1)
+    for _ in range(2):
+        others = np.concatenate([[0], np.cumsum(alive)])
+        chosen = held & (others[last] > others[first])
+        marks = np.zeros((num_frames + 1, num_columns), dtype=np.int32)
+        # before the marker came, all are held; otherwise the first was measured
+        marks[(first + (first > 0))[chosen], columns[chosen]] += 1
+        marks[last[chosen] + 1, columns[chosen]] -= 1
+        missing = np.cumsum(marks, axis=0)[:-1] > 0
+        alive |= missing[1:].any(axis=1)  # where nothing moves, all are held beside one that is
+    return missing
 
 
 def _grid(moves: Float[np.ndarray, "T-1 N 3"]) -> float:

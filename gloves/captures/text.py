@@ -105,7 +105,7 @@ def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
 
 
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
-    """The lines with tabs between their cells and without quotes.
+    """The same list of lines, now with tabs between their cells and without quotes.
 
     In a file with tabs, quotes are quotes only if its first cell is quoted. `first` is the number of the
     first line in the file. With `wider`, rows may have more cells than the line above them.
@@ -114,18 +114,18 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         return lines
     if separator == b",":
         _check_decimals(lines, first, wider)
-    plain = []
-    for number, line in enumerate(lines, first):
+    for index, line in enumerate(lines):  # in place: large files would be held twice
+        number = first + index
         if b'"' not in line:
-            plain.append(line.replace(TAB, b" ").replace(separator, TAB))
+            lines[index] = line.replace(TAB, b" ").replace(separator, TAB)
             continue
         check_width(line.count(separator) + 1, number)
         try:
             row = next(csv.reader([line.decode("latin-1")], delimiter=separator.decode()), [])
         except csv.Error as error:
             raise CaptureError(f"line {number} cannot be read: {error}") from error
-        plain.append(TAB.join(cell.replace("\t", " ").encode("latin-1") for cell in row))
-    return plain
+        lines[index] = TAB.join(cell.replace("\t", " ").encode("latin-1") for cell in row)
+    return lines
 
 
 def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:

@@ -157,6 +157,8 @@ def _record(source: FrameSource) -> dict[str, Any]:
         del record["sampler"]
     if settings.center == ROOM_CENTER:  # sets of versions without this setting go on
         del record["center"]
+    if not settings.flesh:
+        del record["flesh"]
     return record | {
         "rig": rig_setting(rig),
         "rig_digest": rig.digest(),  # releases may change a shipped rig

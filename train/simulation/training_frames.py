@@ -14,24 +14,29 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit, settle_glove, wear
+from gloves.fit import GlovedHand, GloveFit, settle_glove, wear
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.reconstruction import FrameOptics, OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
+from handsim.hand.shape import ADULTS, BONES, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
 from handsim.settings import Expected, Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.rig import ROOM_CENTER, CameraRig, Center, list_rigs
-from handsim.space.transforms import pose_matrices, random_quaternions
+from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
 from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
 """Reason to draw another person."""
+# Fitted to the published captures of Han et al. 2018, as the speed of real-like takes (docs/room.md).
+NOISE: Final = 0.00125
+"""Standard deviation of the markers' independent noise per axis [m]."""
+FLESH: Final = 0.0008
+"""RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
 _MAX_PEOPLE: Final = 1000
 _SHOWN_PEOPLE: Final = 100  # whose slips are drawn
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
@@ -92,6 +97,9 @@ class GenerateSettings(Settings):
     an entry point. Whole poses (T, 27) say where the hands are; joint angles (T, 20) [rad], and wrists left
     at the origin, are put anywhere."""
     scenes: SceneMix = field(default_factory=SceneMix)
+    flesh: bool = False
+    """Whether markers move with the skin, as in real-like takes of `simulate`: by 0.8 mm per axis that depend
+    on the digit's angles, and 1.25 mm of noise."""
     ghosts: GhostConfig = field(default_factory=GhostConfig)
     optics: FrameOptics = field(default_factory=FrameOptics)
     blob_loss: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.15)
@@ -192,6 +200,19 @@ def slipped_gloves(
     return tuple(settle_glove(fit.layout, model) for (fit,) in worn)
 
 
+def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
+    """Displacement of a hand's markers in the world [m]: one part depends on the pose, the other is noise."""
+    turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
+    moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
+    for marker, bone in enumerate(hand.fit.attachment.main_bones):
+        digit = BONES[bone].digit
+        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
+        way *= FLESH / max(np.sqrt((way**2).mean()), 1e-9)
+        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
+    return moved
+
+
 def simulate_frames(
     block: NDArray[np.void],
     models: tuple[HandModel, ...],
@@ -218,7 +239,7 @@ def simulate_frames(
         min_rays=settings.min_cameras,
         min_rays_to_start=settings.min_cameras,
     )
-    observed = observe_scene(scene, fits, rig, optics, settings.ghosts, rng=rng)
+    observed = observe_scene(scene, fits, rig, optics, settings.ghosts, flesh=settings.flesh, rng=rng)
     begin = 0
     for model, qpos, frames in zip(scene.hands, scene.qpos, observed, strict=True):
         part = block[begin : begin + len(qpos)]
@@ -307,11 +328,18 @@ def observe_scene(
     optics: OpticsConfig,
     ghosts: GhostConfig,
     *,
+    flesh: bool = False,
     rng: np.random.Generator,
 ) -> tuple[HandFrames, ...]:
-    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers."""
+    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers.
+
+    With `flesh`, markers move with the skin.
+    """
     bones = [fit.model.forward_kinematics(qpos) for fit, qpos in zip(fits, scene.qpos, strict=True)]
     worn = [fit.attachment.markers(fit.model, frames) for fit, frames in zip(fits, bones, strict=True)]
+    if flesh:
+        for fit, qpos, part in zip(fits, scene.qpos, worn, strict=True):
+            part[0][:] += move_skin(GlovedHand(fit, qpos), rng=rng)
     markers, normals = (np.concatenate(parts, axis=1) for parts in zip(*worn, strict=True))
     posed = [fit.model.capsules.posed(frames) for fit, frames in zip(fits, bones, strict=True)]
     segments = np.concatenate(posed, axis=1)

@@ -65,7 +65,7 @@ def filled(positions: np.ndarray, hidden: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("suffix", WRITABLE)
 def test_gaps_that_hold_the_last_position_are_missing(moving, rng, tmp_path, suffix):
     hidden = gaps(rng)
-    hidden[80:83] = True  # frames without a point
+    hidden[80:83] = hidden[78:85, 0] = True  # frames without a point
     hidden[100:, 3] = True
     path = tmp_path / f"take{suffix}"
     write_capture(path, with_positions(moving, filled(moving.positions, hidden)))
@@ -98,6 +98,8 @@ def test_what_is_still_stays(moving):
     lifted[:, 4:8, 2] += rise[:, None]
     lifted[100:, 4:8] += (np.arange(FRAMES - 100) * 1e-3)[:, None, None]
     untouched(with_positions(moving, lifted))
+    there_and_back = moving.positions[np.r_[:60, 59:-1:-1]]
+    untouched(with_positions(moving, there_and_back))  # with one frame twice
 
 
 @pytest.mark.parametrize("millimeters", [0.1, 0.25, 1.0])

@@ -35,7 +35,7 @@ from train.data.shards import MANIFEST, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH
+from train.simulation.training_frames import FLESH, NO_GRASP, NO_REST, NO_TOUCH, NOISE
 
 CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
@@ -123,6 +123,18 @@ def test_gloves_are_kept_as_each_person_wore_them(finished):
             ]
     assert 0.05 < np.std(slips) < 0.12
     assert all((finished / hands_name(shard)).stat().st_size < 20_000 for shard in range(len(dataset.shards)))
+
+
+def test_markers_move_with_flesh_where_that_is_asked_for(tmp_path):
+    given = {"num_frames": 200, "frames_per_hand": 50, "workers": 1}
+    plain, moved = (generate_dataset(tmp_path / str(flesh), flesh=flesh, **given) for flesh in (False, True))
+    assert "flesh" not in plain.manifest.config and moved.manifest.config["flesh"] is True
+    (rows,), hands, gloves = moved.shards, moved.hands(0), moved.gloves(0)
+    away = []
+    for number in np.unique(rows["hand"]):
+        mine = rows[rows["hand"] == number]
+        away.append(mine["markers"] - attach(gloves[number], hands[number]).markers(mine["qpos"])[0])
+    assert np.sqrt((np.concatenate(away) ** 2).mean()) == pytest.approx(np.hypot(NOISE, FLESH), rel=0.15)
 
 
 def test_a_set_of_a_version_that_kept_no_gloves_is_read(finished, tmp_path):
