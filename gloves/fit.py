@@ -239,9 +239,9 @@ def vary_layout(
 
     On the palm markers shift along and across by half of `along`.
     """
+    draws = np.clip(rng.standard_normal((layout.num_markers, 3)), -2.0, 2.0).tolist()
 
-    def moved(marker: MarkerPlace) -> MarkerPlace:
-        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0).tolist()
+    def moved(marker: MarkerPlace, slip: float, roll: float, side: float) -> MarkerPlace:
         palm = marker.bone == BONE_NAMES[PALM]
         return dataclasses.replace(
             marker,
@@ -250,7 +250,8 @@ def vary_layout(
             across=marker.across + 0.5 * along * side if palm else 0.0,
         )
 
-    return dataclasses.replace(layout, markers=tuple(moved(marker) for marker in layout.markers))
+    moves = zip(layout.markers, draws, strict=True)
+    return dataclasses.replace(layout, markers=tuple(moved(marker, *draw) for marker, draw in moves))
 
 
 def wear(

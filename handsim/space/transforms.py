@@ -123,9 +123,14 @@ def rigid(
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation matrices."""
-    from scipy.spatial.transform import Rotation
+    from handsim.kernels import write_matrix_quaternions
 
-    quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    quaternions: NDArray[np.float64] = np.empty((len(rotations), 4))
+    matrices = np.ascontiguousarray(rotations, dtype=np.float64)
+    if not write_matrix_quaternions(matrices, quaternions):  # to the nearest rotations
+        from scipy.spatial.transform import Rotation
+
+        quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
     return quaternions
 
 

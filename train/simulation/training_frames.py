@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, GloveFit, settle_glove, wear
@@ -156,7 +156,7 @@ def sample_hands(
     """
     for _ in range(_MAX_PEOPLE):
         shape = sample_shape(population, side=SIDES[0], rng=rng)
-        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
+        models = HandModel(shape), HandModel(shape.with_side(SIDES[1]))
         try:
             resting_angles(models[0])
         except PoseError:
@@ -173,7 +173,7 @@ def sample_hands(
 def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
     """Right and left hand of a random adult."""
     shape = sample_shape(ADULTS, side="right", rng=rng)
-    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
+    return HandModel(shape), HandModel(shape.with_side("left"))
 
 
 def wear_gloves(
@@ -355,11 +355,18 @@ def observe_scene(
     for number, (centers, _) in enumerate(worn):
         columns = slice(number * centers.shape[1], (number + 1) * centers.shape[1])
         strays = sample_ghosts(centers, rig, segments, radii, ghosts, min_cameras=optics.min_rays, rng=rng)
-        distance = np.linalg.norm(found.false_points[:, :, None] - centers[:, None], axis=-1).min(axis=2)
-        near = np.where((distance < GHOST_REACH)[..., None], found.false_points, np.nan)
+        near = np.where(_near(found.false_points, centers)[..., None], found.false_points, np.nan)
         kept = keep_some(np.concatenate([strays, near], axis=1), rng=rng)
         hands.append(HandFrames(centers, cameras[:, columns], found.positions[:, columns], kept))
     return tuple(hands)
+
+
+def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]) -> Bool[np.ndarray, "T P"]:
+    """Which points, of which most are NaN, are within `GHOST_REACH` of a marker center of their frame."""
+    near: NDArray[np.bool_] = np.isfinite(points[..., 0])
+    distance = np.linalg.norm(points[near][:, None] - centers[near.nonzero()[0]], axis=-1)
+    near[near] = distance.min(axis=1) < GHOST_REACH
+    return near
 
 
 @cache
