@@ -225,9 +225,7 @@ class Tracker:
             enough = labeled >= self.config.fewest_labels
             if estimate is not None and enough and estimate.rms <= self.config.most_rms:
                 rms = state.rms_without_bias(estimate)  # by the biases that the pose was fitted with
-                settled = _weigh_labels(
-                    frame.points, markers, estimate.positions, state.variance, evidence
-                )
+                settled = _weigh_labels(frame.points, markers, estimate.positions, state.variance, evidence)
                 state.update(estimate, settled, frame.time)
                 outcomes.append(_Outcome(Status.TRACKED, rms))
                 continue

@@ -272,7 +272,8 @@ def _marker_covariance(
     """Fill the covariance of a marker in the world [m^2]: that of the unknowns, and its own variance."""
     first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
-    jacobian, in_world, unknowns = work.jacobian[marker], np.zeros((3, count)), np.empty(count, dtype=np.int64)
+    jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
+    unknowns = np.empty(count, dtype=np.int64)
     for number in range(count):
         unknowns[number] = first + number if number < last - first else NUM_JOINTS + number - (last - first)
         for i in range(3):
