@@ -134,9 +134,12 @@ def _gate(
 
 
 def fit_labels(
-    frame: FrameState, hand: int, state: HandState, prediction: Prediction
+    frame: FrameState, hand: int, state: HandState, prediction: Prediction, *, is_sure: bool = False
 ) -> tuple[FrameState, HandEstimate]:
-    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first."""
+    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first.
+
+    With a sure prediction nothing else is tried; most labels being far off it, the RMS distance is NaN.
+    """
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
     while True:
@@ -147,10 +150,15 @@ def fit_labels(
             break
         if estimate.rms > _RESTART_RMS and not restarted:
             restarted = True
-            restart = state.solver.solve(targets[None], iterations=_RESTART_STEPS)
-            if restart.rms[0] < 0.5 * estimate.rms:
-                start = restart.qpos[0]
-                continue
+            if is_sure:
+                if np.nanmedian((estimate.residuals**2).sum(axis=1)) > _RESTART_RMS**2:
+                    estimate = estimate._replace(rms=np.nan)
+                    break
+            else:
+                restart = state.solver.solve(targets[None], iterations=_RESTART_STEPS)
+                if restart.rms[0] < 0.5 * estimate.rms:
+                    start = restart.qpos[0]
+                    continue
         markers[worst] = -1
         dropped = True
     return frame.with_markers(hand, markers) if dropped else frame, estimate
@@ -250,8 +258,9 @@ class LabelerReview:
         confidence: NDArray[np.float64],
     ) -> _Proposal | None:
         """Fit the labeler's labels; None if those of the frame are likelier or the same."""
+        named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
         proposed, estimate = fit_labels(
-            frame.with_markers(track.hand, named), track.hand, track.state, track.prediction
+            named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
         )
         before, after = frame.markers(track.hand), proposed.markers(track.hand)
         if (after == before).all() or np.isnan(estimate.rms):
