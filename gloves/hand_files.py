@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout
@@ -23,7 +24,13 @@ MESH_ENDINGS: Final = (".glb", ".obj", ".ply", ".stl")
 _USUAL_GLOVE: Final = "dense19"
 
 
-def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = False) -> None:
+def write_hand(
+    path: Path,
+    hand: HandModel | GloveFit,
+    *,
+    actuators: bool = False,
+    start: Float[np.ndarray, "27"] | None = None,
+) -> None:
     """Write a hand in the flat pose; meters, radians, kilograms.
 
     Args:
@@ -31,6 +38,7 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
             coordinates of the .mot of a take), or .glb (its skin with bones and weights, y up).
         hand: The hand; markers of its glove become sites of the .xml and markers of the .osim.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
+        start: Pose that the .osim begins in [m, rad]; flat when not given.
 
     Raises:
         ArgumentError: The name ends otherwise, or servos are asked for in a file that has none.
@@ -55,7 +63,7 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
             return
         sites = hand.attachment.sites(model) if isinstance(hand, GloveFit) else ()
         if suffix == ".osim":
-            temporary.write_text(hand_osim(model, sites), "utf-8")
+            temporary.write_text(hand_osim(model, sites, start), "utf-8")
             return
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
         import mujoco

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import colorsys
 import importlib
 import io
 import os
@@ -197,6 +198,11 @@ def color_scale(worst: float, best: float) -> ScalarMappable:
     colors = [Paint.WARM, Paint.AMBER, Paint.PALE, Paint.BLUE]
     scale = LinearSegmentedColormap.from_list("scale", colors if worst < best else colors[::-1])
     return ScalarMappable(Normalize(min(worst, best), max(worst, best)), scale)
+
+
+def distinct_colors(count: int) -> list[tuple[float, float, float]]:
+    """Different colors (sRGB in [0, 1]); hues follow the order, and neighbors differ in brightness."""
+    return [colorsys.hsv_to_rgb(0.92 * one / count, 1.0, 0.9 if one % 2 else 0.6) for one in range(count)]
 
 
 def color_bar(figure: Figure, colors: ScalarMappable, label: str, **place: Any) -> Axes:

@@ -19,6 +19,7 @@ from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
+from handsim.pages import distinct_colors
 from handsim.space.camera import Camera, pinhole
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import rigid
@@ -239,10 +240,12 @@ SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
     "back": (0.0, 0.0, -1.0),
     "palm": (0.0, 0.0, 1.0),
     "thumb side": (0.0, -1.0, -0.25),
+    "little finger side": (0.0, 1.0, -0.25),
 }
 _GAP: Final = 0.025  # between hands in a row [m]
 _WIDTH, _COLUMNS = 2000, 4  # of a picture of rows [px]; gloves in a row
 _HEIGHT: Final = 900  # of a glove from one side [px]
+_SLIPS_HEIGHT: Final = 600  # of the slips of a glove from one side [px]
 _CAMERA_SIZE: Final = (1100, 900)  # [px], without names
 _LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
 
@@ -313,24 +316,50 @@ def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:
     return draw_row(rows, direction=(0.0, -0.75, 1.0))
 
 
-def draw_glove(fit: GloveFit, *, sides: Sequence[str] = tuple(SIDES_OF_HAND)) -> Picture:
-    """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows."""
-    colors = marker_colors(fit.layout)
-    hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
-    vertices, markers = hand.vertices(), fit.markers(hand.qpos[None])[0][0]
-    mirror = np.array([1.0, 1.0 if fit.side == "right" else -1.0, 1.0])
-    pictures = []
+def draw_glove(
+    fit: GloveFit, *, sides: Sequence[str] = tuple(SIDES_OF_HAND), slips: Sequence[GloveFit] = ()
+) -> Picture:
+    """A glove on a flat hand from some of `SIDES_OF_HAND`, with the names of the markers that each shows.
+
+    With `slips`, the glove as many people wear it, put on the same hand, a second row has their markers as
+    dots, and each marker has a color of its own.
+    """
+    colors = np.array(distinct_colors(fit.layout.num_markers)) if slips else marker_colors(fit.layout)
+    qpos = join_qpos(gesture("spread")[None])[0]
+    hand, bare = PosedHand(fit, qpos, "glove", colors if slips else MARKER_COLOR), PosedHand(fit.model, qpos)
+    markers, slack = fit.markers(qpos[None])[0][0], 1.5 * fit.layout.radius
+    pictures, dots = [], np.concatenate([one.markers(qpos[None])[0][0] for one in slips] or [markers])
+    below = []
     for side in sides:
-        ahead = mirror * SIDES_OF_HAND[side]
-        across = np.cross(ahead, FINGERS_UP) / np.linalg.norm(ahead)
-        shape = float(np.ptp(vertices @ across) / np.ptp(vertices[:, 0]))
-        size = (round(_HEIGHT * max(0.45, shape)), _HEIGHT)
-        view = view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
-        shown = unoccluded(view, hand, markers, slack=1.5 * fit.layout.radius)
+        view = _side_view(hand, side, np.concatenate([markers, dots]), _HEIGHT)
+        shown = unoccluded(view, hand, markers, slack=slack)
         pixels = np.where(shown[:, None], view.project(markers), np.nan)
         picture = with_names(draw_things(view, hand), pixels, fit.layout.names, colors)
         pictures.append(titled(picture, side))
-    return side_by_side(pictures, gap=40)
+        if slips:
+            view = _side_view(hand, side, np.concatenate([markers, dots]), _SLIPS_HEIGHT)
+            picture = draw_things(view, bare)
+            shown = unoccluded(view, bare, dots, slack=slack)
+            for pixel, color in zip(
+                np.rint(view.project(dots[shown])).astype(int),
+                np.tile(colors, (len(slips), 1))[shown],
+                strict=True,
+            ):
+                cv2.circle(picture, pixel.tolist(), 2, byte_color(tuple(color)), -1, cv2.LINE_AA)
+            picture = titled(picture, f"slips of {len(slips)} people")
+            spare = pictures[-1].shape[1] - picture.shape[1]
+            below.append(pad(picture, (0, 0), (spare // 2, spare - spare // 2)))
+    return np.concatenate([side_by_side(row, gap=40) for row in (pictures, below) if row])
+
+
+def _side_view(hand: PosedHand, side: str, markers: Float[np.ndarray, "N 3"], height: int) -> Camera:
+    """The view from one of `SIDES_OF_HAND` of a flat hand and markers [m], with a picture's height [px]."""
+    vertices = hand.vertices()
+    ahead = np.array([1.0, 1.0 if hand.model.shape.side == "right" else -1.0, 1.0]) * SIDES_OF_HAND[side]
+    across = np.cross(ahead, FINGERS_UP) / np.linalg.norm(ahead)
+    shape = float(np.ptp(vertices @ across) / np.ptp(vertices[:, 0]))
+    size = (round(height * max(0.45, shape)), height)
+    return view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
 
 
 def draw_camera(

@@ -20,7 +20,18 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.takes.take import RigidBody, Take
 from handsim._checks import check_choice, check_type
-from handsim.app.output import Make, Output, Place, open_output, place_of
+from handsim.app.output import (
+    CHECKSUMS,
+    Make,
+    Output,
+    Place,
+    changed_files,
+    checksums_name,
+    load_checksums,
+    open_output,
+    place_of,
+    save_checksums,
+)
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
@@ -36,7 +47,15 @@ from render.depth_sensor import sample_depth_noise
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
-from render.formats.writer import CONFIG, FORMATS, WRITERS, format_folder, open_writer
+from render.formats.writer import (
+    CONFIG,
+    FORMATS,
+    WRITERS,
+    format_folder,
+    open_writer,
+    shard_files,
+    whole_shards,
+)
 from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import enclose, photo_files
@@ -223,6 +242,7 @@ def sample_choices(
 
 
 SHEET: Final = "contact_sheet.png"
+_MERGED: Final = "checksums.json"  # of what all shards together make
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
@@ -306,18 +326,22 @@ def render_take(
         drew = _draw_shards(output, formats, make, counts, workers, progress)
         output.fetch(INDEX, _LEFT_OUT.format("*"))
         lost = frozenset(left_out_frames(output.folder))
-        there = (output.folder / SHEET).is_file() if output.is_here else SHEET in output.sizes()
-        if there and not drew:  # the sheet comes last
+        if not drew and _is_complete(output):
             return views * sum(frame not in lost for shard in shards for frame in shard)
-        for name in formats:
-            open_writer(name, format_folder(output.folder, formats, name)).finish()
+        merged = [
+            path
+            for name in formats
+            for path in open_writer(name, format_folder(output.folder, formats, name)).finish()
+        ]
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
         if not any(drawn):
             raise HandSimError(
                 f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an "
                 "object; give another placement, distance or seed"
             )
-        _write_sheet(output.folder, drawing, drawn)
+        merged += _write_sheet(output.folder, drawing, drawn)
+        files = {path.relative_to(output.folder).as_posix(): path for path in merged}
+        save_checksums(output.folder / _MERGED, files)
         output.publish(SHEET)
     return views * sum(map(len, drawn))
 
@@ -332,12 +356,12 @@ def _draw_shards(
 ) -> bool:
     """Draw the missing shards; whether there were any. `counts` are the numbers of pictures of all shards."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
-    done, total = _finished(output.folder, formats), sum(counts)
+    done, total = _finished(output, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     tell = _Counter(output.folder, count, total, progress)
     try:
-        job = output.job(make, last=[INDEX, f"*{TAR}"])
+        job = output.job(make, last=[INDEX, f"*{TAR}", CHECKSUMS])
         with tell, interrupts_bare():
             for drawn, number in enumerate(run_jobs(job, todo, workers)):
                 count += counts[number]
@@ -449,9 +473,30 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
     check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
 
 
-def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
-    done = [open_writer(name, format_folder(folder, formats, name)).done() for name in formats]
-    return frozenset.intersection(*done)
+def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
+    """The shards that need not be drawn; damaged files are told. Stores themselves check what they keep."""
+    done, changed = whole_shards(output.folder, formats)
+    _tell_changed(output, changed, "drawn again")
+    return done
+
+
+def _is_complete(output: Output) -> bool:
+    """Whether the files of all shards together are there as they were written."""
+    sheet, path = output.folder / SHEET, output.folder / _MERGED
+    if not output.is_here:
+        return SHEET in output.sizes()
+    if not path.exists() and not any(output.folder.glob(CHECKSUMS)):  # of an earlier version
+        return sheet.is_file()
+    record = load_checksums(path)
+    changed = changed_files(record, {name: output.folder / name for name in record})
+    _tell_changed(output, changed if record or not path.exists() else [_MERGED], "written again")
+    return bool(record) and not changed
+
+
+def _tell_changed(output: Output, names: Sequence[str], doing: str) -> None:
+    if names:
+        told = f"{output}: {', '.join(names)} are damaged (other checksums), and are {doing}"
+        warnings.warn(told, HandSimWarning, stacklevel=5)
 
 
 @functools.lru_cache(maxsize=1)
@@ -491,17 +536,20 @@ def _render_shard(
             save_json(out / _CUT_OFF.format(f"{shard:05d}"), {"pictures": cut})
 
     kept = list(counted()) if len(formats) > 1 else counted()
+    record = out / checksums_name(shard)
+    record.unlink(missing_ok=True)
     for name in formats:
-        writer = open_writer(name, format_folder(out, formats, name))
-        if shard not in writer.done():
-            writer.write(shard, kept)
+        open_writer(name, format_folder(out, formats, name)).write(shard, kept)
+    notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF)]
+    there = {path.name: path for path in notes if path.is_file()}
+    save_checksums(record, shard_files(out, formats, shard) | there)
     return shard
 
 
-def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> None:
-    """Write a contact sheet of a few pictures."""
+def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> list[Path]:
+    """Write a contact sheet of a few pictures, if they have any to show."""
     if not {"rgb", "depth"} & set(drawing.config.passes):
-        return
+        return []
     frames: list[RenderedFrame] = []
     filled = [number for number, shard in enumerate(shards) if shard]
     for shard in np.array(filled)[np.unique(np.linspace(0, len(filled) - 1, _ON_SHEET).round().astype(int))]:
@@ -509,3 +557,4 @@ def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> None:
         chosen = mine[:1] if len(filled) >= _ON_SHEET else mine[:: max(1, len(mine) // 3)][:3]
         frames += drawing.frames(int(shard), enumerate(chosen))
     write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))
+    return [out / SHEET]

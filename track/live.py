@@ -19,7 +19,7 @@ from gloves.takes.take import Take, load_take
 from handsim.app.messages import LiveStatus, named_steps
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
-from track.frames import FARTHEST, StreamedFrame, TrackedFrame
+from track.frames import StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
@@ -30,7 +30,6 @@ _MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for such frames
 _PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
 _LAGS: Final = 100_000  # newest frames whose lag is kept
-_MANY_FAR: Final = 0.5  # share of points out of range above which the unit is questioned
 _FOREIGN: Final = "foreign_packets"
 _PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
 """Counts of packets that were left out, in words."""
@@ -106,7 +105,8 @@ def track_live(
         LiveStatus() as status,
         ExitStack() as stack,
     ):
-        setup, frames = _measured_setup(stream, setup, status, seconds)
+        doubt = _Doubt(stream, status)
+        setup, frames = _measured_setup(stream, setup, status, seconds, doubt)
         tracker = setup.tracker()
         for output in outputs:
             output.start(tracker.hands, tracker.bodies)
@@ -117,7 +117,7 @@ def track_live(
             stack.enter_context(_recording_kept(recorder))
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
         status.show("waiting for the first frame")
-        pace, asked, count = _Pace(), False, 0
+        pace, count = _Pace(), 0
         for frame in frames:
             if seconds is not None and not frame.silent:
                 until = min(until, frame.arrived + seconds)
@@ -136,9 +136,7 @@ def track_live(
                 unsent = sum(sum(output.counts.values()) for output in outputs)
                 line = _status_line(frame, tracked, stream.counts, unsent, pace)
                 status.show(line, now=frame.silent or dropping)
-            if not asked and (doubt := _unit_doubt(stream)):
-                asked = True
-                status.say(doubt)
+            doubt.tell()
         stream.end(until)
         counts, take, step = stream.counts, None, 1
         if recorder is not None:
@@ -150,19 +148,18 @@ def track_live(
     notes = [*_notes(counts, step, pace, stream.order.interval)]
     for output in outputs:
         notes += output.notes()
-    doubt = _unit_doubt(stream)
-    return LiveTake(take, count, (*notes, doubt) if doubt else tuple(notes))
+    return LiveTake(take, count, (*notes, *filter(None, [stream.point_doubt])))
 
 
 def _measured_setup(
-    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None
+    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None, doubt: _Doubt
 ) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
     """The setup with the hands as measured in the first frames of a stream, and all its frames."""
     gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
     if not setup.is_auto:
         stream.forgive()
         return setup, stream
-    first = _first_frames(stream, setup.fewest_points, seconds, status)
+    first = _first_frames(stream, setup.fewest_points, seconds, status, doubt)
     setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
     status.say(f"size of the hands: {setup.user}")
     return setup, _first_and_others(first, stream)
@@ -177,7 +174,7 @@ def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterato
 
 
 def _first_frames(
-    stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus
+    stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus, doubt: _Doubt
 ) -> list[StreamedFrame]:
     """The first frames of a stream, until there were enough points for one second, or for ten seconds."""
     frames: list[StreamedFrame] = []
@@ -185,9 +182,12 @@ def _first_frames(
     status.show("waiting for hands, to measure their size")
     for frame in stream:
         now = monotonic()
+        doubt.tell()
         if frame.silent and frames:
             break
-        if not frame.silent:
+        if frame.silent:
+            status.show(_silence_line(stream.counts), now=True)
+        else:
             frames.append(frame)
             began = min(began, now)
         if len(frame.points) >= fewest_points:
@@ -206,6 +206,19 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         recorder.close()
         raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
+
+
+class _Doubt:
+    """Says once what is wrong with the points of a stream."""
+
+    def __init__(self, stream: LiveStream, status: LiveStatus) -> None:
+        self._stream, self._status, self._told = stream, status, False
+
+    def tell(self) -> None:
+        """Say it as soon as it is known."""
+        if not self._told and (doubt := self._stream.point_doubt):
+            self._told = True
+            self._status.say(doubt)
 
 
 class _Pace:
@@ -274,14 +287,11 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
         yield f"the following figures are of one half second in {step}"
 
 
-def _unit_doubt(stream: LiveStream) -> str:
-    """A question about the unit if many points are out of range, else an empty string."""
-    if stream.far_points <= _MANY_FAR * stream.points or not stream.far_points:
-        return ""
-    return (
-        f"{stream.far_points} of {stream.points} points lie {FARTHEST:.0f} m or more from the origin and are "
-        "left out; are they millimeters? Set the unit of the stream to meters"
-    )
+def _silence_line(counts: dict[str, int]) -> str:
+    """A line on a stream from which no frame comes."""
+    if foreign := counts.get(_FOREIGN):
+        return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
+    return "no frames arrive; is the server playing?"
 
 
 def _status_line(
@@ -289,9 +299,7 @@ def _status_line(
 ) -> str:
     """A line on the status of a live stream."""
     if frame.silent:
-        if foreign := counts.get(_FOREIGN):
-            return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
-        return "no frames arrive; is the server playing?"
+        return _silence_line(counts)
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]

@@ -420,6 +420,8 @@ class TrainingState:
         try:
             with zipfile.ZipFile(stored) as archive:
                 check_members(archive, len(found))
+                if archive.testzip() is not None:
+                    raise ValueError("a checksum is another one")
             stored.seek(0)
             content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
             self._check(content)

@@ -40,6 +40,7 @@ _MAGIC: Final = b"handsim recording 1\n"
 _SIZE: Final = struct.Struct("<I")
 _BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
 _MARK: Final = b"blk\n"
+_CHECKSUM: Final = "checksum"
 _INTERVAL: Final = 0.5  # [s] between two blocks
 _MAX_HEADER: Final = 1 << 26  # bytes
 _FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
@@ -76,11 +77,12 @@ class GrowingArchive(Closing):
         self._points = self._block = self._written = 0
         self._due = math.inf
         text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
-        parts = [json.dumps(text).encode()]
+        parts = list[bytes]()
         for array in arrays.values():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
             parts.append(buffer.getvalue())
+        parts.insert(0, json.dumps(text | {_CHECKSUM: _head_checksum(text, parts)}).encode())
         if max(map(len, parts)) > _MAX_HEADER:  # it could not be read again
             raise CaptureError(f"{path}: the settings take more than {_MAX_HEADER} bytes")
         make_folder_of(path)
@@ -160,7 +162,12 @@ class GrownArchive:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise ValueError("not a recording")
             self.header: dict[str, Any] = json.loads(_take_part(file))
-            self._arrays = {str(name): _take_array(file) for name in self.header.pop("arrays")}
+            parts = [_take_part(file) for _ in self.header["arrays"]]
+            known = self.header.pop(_CHECKSUM, None)  # which earlier versions did not write
+            if known not in (None, _head_checksum(self.header, parts)):
+                raise ValueError("a header with another checksum")
+            names = map(str, self.header.pop("arrays"))
+            self._arrays = dict(zip(names, map(_array_of, parts), strict=True))
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._end = file.tell()
             self._blocks = list(self._scan(file, check))
@@ -266,9 +273,13 @@ def _take_part(file: io.BufferedReader) -> bytes:
     return content
 
 
-def _take_array(file: io.BufferedReader) -> NDArray[Any]:
-    """The next part as an array from its .npy format; a `ValueError` unless the sizes agree."""
-    content = _take_part(file)
+def _head_checksum(header: Mapping[str, Any], parts: Sequence[bytes]) -> int:
+    """CRC-32 of the header and the arrays that a growing archive begins with."""
+    return zlib.crc32(b"".join((json.dumps(header).encode(), *parts)))
+
+
+def _array_of(content: bytes) -> NDArray[Any]:
+    """An array from its .npy format; a `ValueError` unless the sizes agree."""
     buffer = io.BytesIO(content)
     check_npy_header(buffer, len(content))
     buffer.seek(0)

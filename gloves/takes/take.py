@@ -73,7 +73,7 @@ from handsim.motion_files.motion import (
 )
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.transforms import UpAxis
+from handsim.space.transforms import UpAxis, file_axes
 
 
 class MotionFormat(NamedTuple):
@@ -84,6 +84,12 @@ class MotionFormat(NamedTuple):
     """How a hand without a pose is written, in words."""
     steady: bool = False
     """Whether frames are written without times, so that they must come at a steady rate."""
+
+    def take_of(self, take: Take, rate: float | None) -> Take:
+        """The poses of a take that are written, at a rate if given."""
+        poses = take.poses_alone(rate)
+        steady = not self.steady or is_steady(poses.times, poses.rate)
+        return poses if steady else poses.poses_alone(poses.rate)
 
 
 def motion_format(path: Path) -> MotionFormat:
@@ -96,24 +102,24 @@ def motion_format(path: Path) -> MotionFormat:
 
 
 def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
-    """Write the keypoints of all hands as markers, in the take's own axes whatever `up` is."""
-    positions, names = [], []
+    """Write the keypoints of all hands as markers in every frame, with y up, for OpenSim."""
+    turn, positions, names = file_axes(up), [], []
     for hand in motion.hands:
-        keypoints = hand_keypoints(hand.model, hand.qpos)
-        positions.append(np.where(hand.present[:, None, None], keypoints, np.nan))
+        positions.append(hand_keypoints(hand.model, hand.qpos) @ turn.T)
         names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
     write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
 
 
+HELD: Final = "held at its last pose"
 MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
-    ".bvh": MotionFormat(write_bvh, "held at its last pose", steady=True),
+    ".bvh": MotionFormat(write_bvh, HELD, steady=True),
     ".usda": MotionFormat(write_usd, "invisible"),
     ".usdc": MotionFormat(write_usd, "invisible"),
     ".csv": MotionFormat(write_joint_csv, "blank"),
     ".parquet": MotionFormat(write_joint_parquet, "null"),
-    ".trc": MotionFormat(_write_joint_trc, "blank", steady=True),
-    ".mot": MotionFormat(write_mot, "NaN"),
+    ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
+    ".mot": MotionFormat(write_mot, HELD),
     OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
 }
 """The formats, by the endings of file names."""
@@ -668,10 +674,7 @@ class Take:
         check_choice(up, get_args(UpAxis), noun="axis that points up")
         path = Path(path)
         form = motion_format(path)
-        motion = self.poses_alone(None if rate is None else float(rate))
-        if form.steady and not is_steady(motion.times, motion.rate):
-            motion = motion.poses_alone(motion.rate)
-        form.write(path, posed_motion(motion), up)
+        form.write(path, posed_motion(form.take_of(self, None if rate is None else float(rate))), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take as an .npz file, whole or not at all, which `load_take` reads.

@@ -56,6 +56,11 @@ def load_checksums(path: Path) -> dict[str, str]:
         return {}
 
 
+def changed_files(record: Mapping[str, str], files: Mapping[str, Path]) -> list[str]:
+    """Names of files that are missing or have other checksums than those of a record."""
+    return [name for name in record if not files[name].is_file() or checksum(files[name]) != record[name]]
+
+
 def place_of(out: str | Place) -> Place:
     """The folder of a name: on this machine, or of an object store, as s3://bucket/prefix."""
     if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):

@@ -9,8 +9,10 @@ import multiprocessing
 import os
 import pickle
 import platform
+import re
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
@@ -20,7 +22,7 @@ from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, Final
 
 from handsim._checks import check_count
@@ -33,6 +35,9 @@ Job = Callable[[int], int]
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
 _AGAIN: Final = "run the same command again to go on"
+_GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
+_GUARDED: Final = re.compile(r"__name__\s*==\s*[\"']__main__|__main__[\"']\s*==\s*__name__")
+_MAIN: Final = "__main__"
 
 
 def usable_cores() -> int:
@@ -41,7 +46,12 @@ def usable_cores() -> int:
 
 
 def check_workers(workers: int | None) -> int:
-    """Number of processes, by default one per core."""
+    """Number of processes, by default one per core.
+
+    A process that runs a script again while it starts ends here, before it does what its parent does.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(f"a process that starts runs this script again: {_GUARD}")
     if workers is None:
         return usable_cores()
     check_count("workers", workers, 1)
@@ -59,11 +69,46 @@ def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> I
         return
     count = check_workers(workers)
     here = len(todo) if count == 1 or len(todo) == 2 else 1
+    if todo[here:]:
+        _check_main(job)
     for number in todo[:here]:
         yield job(number)
     if todo[here:]:
         with LocalProcesses(min(count, len(todo) - here)) as processes:
             yield from _share_out(job, todo[here:], processes)
+
+
+def _check_main(job: Job) -> None:
+    """Refuse a job that is defined where workers cannot import it without doing the same as this process."""
+    try:
+        needs_main = _MAIN.encode() in pickle.dumps(job)
+    except Exception:  # the executor tells what cannot be pickled
+        return
+    if needs_main and not _is_guarded():
+        defined = f"{script} defines" if (script := main_script()) else "this session, not a module, defines"
+        raise ArgumentError(f"{defined} what the workers use: {_GUARD}")
+
+
+def main_script() -> Path | None:
+    """The file that Python runs; None in a notebook, at a prompt, or where it reads standard input."""
+    script = Path(getattr(sys.modules[_MAIN], "__file__", None) or "")
+    return script if script.is_file() else None
+
+
+def _is_guarded() -> bool:
+    """Whether workers can run the main script again without its calls."""
+    script = main_script()
+    return script is not None and bool(_GUARDED.search(script.read_text(encoding="utf-8", errors="replace")))
+
+
+@contextmanager
+def _main_left_out() -> Iterator[None]:
+    """Let processes started in the block not run the main script, as they usually do."""
+    main, sys.modules[_MAIN] = sys.modules[_MAIN], ModuleType(_MAIN)
+    try:
+        yield
+    finally:
+        sys.modules[_MAIN] = main
 
 
 def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[int]:
@@ -115,7 +160,8 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
-        with one_thread(), without_signals():  # submit starts a process if none is idle
+        main_module = contextlib.nullcontext() if _is_guarded() else _main_left_out()
+        with one_thread(), without_signals(), main_module:  # submit starts a process if none is idle
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(

@@ -27,7 +27,8 @@ def export(
             of a user .xml (MuJoCo), .urdf, .osim (OpenSim) or .glb; of a labeler .onnx, which labels without
             torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
-        up: The axis of the take that points up; y for captures of Motive's default.
+        up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
+            .usda, .usdc, .csv and .parquet have the take's axes.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
@@ -51,7 +52,7 @@ def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None
     take = load_take(source)
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
-    motion = take.poses_alone(fps)
+    motion = form.take_of(take, fps)
     motion.export(out, up=up)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)

@@ -95,7 +95,7 @@ def check_glove(
     out: Path | None = None,
     size: Literal["XS", "S", "M", "L", "XL"] = "M",
 ) -> None:
-    """Check a layout on hands of all five sizes, and draw it from the back, the palm and the thumb's side.
+    """Check a layout on hands of all five sizes, and draw it from all sides with its slips on 100 people.
 
     Args:
         glove: A .toml file or a shipped name.
@@ -122,9 +122,15 @@ def check_glove(
         )
     from render.captions import write_png
     from render.illustrations import draw_glove
+    from train.simulation.training_frames import GenerateSettings, slipped_gloves
 
-    write_png(picture, draw_glove(nominal_fit(layout, size, layout.sides[-1])))
-    print_line(f"{picture}: the glove on a hand of size {size}")
+    fit, rng = nominal_fit(layout, size, layout.sides[-1]), np.random.default_rng(0)
+    slips = slipped_gloves(layout, fit.model, GenerateSettings(), rng=rng)
+    write_png(picture, draw_glove(fit, slips=slips))
+    print_line(
+        f"{picture}: the glove on a hand of size {size}; below, where the slips of `handsim generate` put "
+        f"each marker on {len(slips)} people"
+    )
 
 
 def _fitted(layout: MarkerLayout, size: str) -> GloveFit:

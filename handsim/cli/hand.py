@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending, check_outputs, written_together
-from handsim.hand.shape import NUM_JOINTS, Side
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, Side
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
@@ -32,8 +35,8 @@ def hand(
 
     Args:
         out: The hand: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, .osim (OpenSim: the
-            coordinates of the .mot of handsim export), or .glb (its skin with bones and weights, y up);
-            meters, radians, kilograms.
+            coordinates of the .mot of handsim export, in a take's first pose), or .glb (its skin with bones
+            and weights, y up); meters, radians, kilograms.
         size: Size of the hand, M when neither it nor a file is given.
         side: Which hand; the right one, or the only one of a file, when not given.
         shape: A user's file of `handsim calibrate`, for that user's hand instead of a size.
@@ -60,10 +63,10 @@ def hand(
                 f"given {option} and --out {out}, expected an --out that ends in {wanted} with it"
             )
     check_outputs([glove, shape, take], (out, mesh))
-    chosen, words = _chosen_hand(size, side, shape, take, glove)
+    chosen, words, start = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
     with written_together():
-        write_hand(out, chosen, actuators=actuators)
+        write_hand(out, chosen, actuators=actuators, start=start)
         if mesh is not None:
             write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0
@@ -81,8 +84,8 @@ def hand(
 
 def _chosen_hand(
     size: Size | None, side: Side | None, shape: Path | None, take: Path | None, glove: str | None
-) -> tuple[HandModel | GloveFit, str]:
-    """The hand of the options, in its glove if it has one, and its origin in words."""
+) -> tuple[HandModel | GloveFit, str, Float[np.ndarray, "27"] | None]:
+    """The hand of the options, in its glove if it has one, its origin in words, and a take's first pose."""
     from gloves.fit import nominal_fit
     from gloves.takes.take import load_take
     from handsim.hand.model import HandModel
@@ -96,12 +99,15 @@ def _chosen_hand(
     if source is not None:
         if glove is not None:
             raise ArgumentError(f"given --glove {glove} and {named[0]}, expected one of them")
-        user = load_user(source) if take is None else User(load_take(source).hands)
+        moving = None if take is None else load_take(take)
+        user = load_user(source) if moving is None else User(moving.hands)
         try:
             fit = user.of_side(side)
         except ArgumentError as error:
             raise ArgumentError(f"{source}: {error}") from error
-        return fit, f"of {source}, {User((fit,))}"
+        poses = np.empty((0, NUM_QPOS)) if moving is None else moving.qpos[:, moving.hand_index(fit.side)]
+        poses = poses[np.isfinite(poses).all(axis=1)]
+        return fit, f"of {source}, {User((fit,))}", poses[0] if len(poses) else None
     size, side = size or "M", side or "right"
     hand = HandModel.named(size, side=side) if glove is None else nominal_fit(load_layout(glove), size, side)
-    return hand, f"of size {size}"
+    return hand, f"of size {size}", None

@@ -34,8 +34,8 @@ _HELP: Final = {
     "glove list": "List the marker layouts that come with handsim: markers, labeler and source of each.",
     "glove show": "Show a layout's markers.",
     "glove new": "Write a commented layout file as a start for a glove of your own.",
-    "glove check": "Check a layout on hands of all five sizes, and draw it from the back, the palm and the "
-    "thumb's side.",
+    "glove check": "Check a layout on hands of all five sizes, and draw it from all sides with its slips on "
+    "100 people.",
     "glove score": "Say how well a layout can be labeled and what it tells of each joint; nothing is "
     "trained.",
     "glove improve": "Look for a better layout near a given one: move, add or drop markers.",

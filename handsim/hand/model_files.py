@@ -8,7 +8,8 @@ or fixes.
 OpenSim's model has a body per bone, custom joints, capsules and markers. Its coordinates are those of the
 `.mot` that `handsim.motion_files` writes: `right_wrist_tx` to `tz` [m], `right_wrist_rx` to `rz` (rotations
 about x, y and z of the body, in this order), then `right_` and the name of each joint. A bone with two joints
-is moved by one custom joint about both axes, the first one first. The ground has the axes of the take, z up.
+is moved by one custom joint about both axes, the first one first. The ground has y up, as OpenSim's window
+and gravity.
 """
 
 from __future__ import annotations
@@ -20,10 +21,17 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import KEYPOINT_BONES, KEYPOINT_NAMES, HandModel, Site, hand_keypoints, join_qpos
 from handsim.hand.shape import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
-from handsim.space.transforms import body_fixed_angles, euler_angles, quaternion_matrix
+from handsim.space.transforms import (
+    UpAxis,
+    body_fixed_angles,
+    euler_angles,
+    file_axes,
+    quaternion_matrix,
+)
 
 _SMALL_SHARE: Final = 0.01
 _MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
@@ -122,7 +130,7 @@ def number_text(value: float) -> str:
 
 
 _VERSION: Final = "40000"  # of the document: OpenSim 4.0 and later read it
-_GRAVITY: Final = "0 0 -9.80665"
+_GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
 _FARTHEST: Final = 5.0  # [m] of the wrist from the origin
 _MOST_TURN: Final = 2.0 * np.pi  # [rad] of the wrist
@@ -135,8 +143,21 @@ def coordinate_names(side: Side) -> tuple[str, ...]:
     return tuple(f"{side}_{name}" for name in (*wrist, *JOINT_NAMES))
 
 
-def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
-    """The text of a .osim file: meters, radians, kilograms."""
+def coordinate_values(qpos: Float[np.ndarray, "T 27"], up: UpAxis) -> NDArray[np.float64]:
+    """The coordinates (T, 26) of poses of a hand [m, rad], without jumps of a turn."""
+    turn = file_axes(up)
+    turns = np.unwrap(body_fixed_angles(turn @ quaternion_matrix(qpos[:, 3:7])), axis=0)
+    return np.concatenate([qpos[:, :3] @ turn.T, turns, qpos[:, 7:]], axis=1)
+
+
+def hand_osim(
+    model: HandModel, markers: Sequence[Site] = (), start: Float[np.ndarray, "27"] | None = None
+) -> str:
+    """The text of a .osim file: meters, radians, kilograms.
+
+    The hand begins in the pose `start`, flat with the back up when not given. OpenSim's inverse kinematics
+    begins there too, and finds the wrist's angles on the branch of those of a .mot that begins so.
+    """
     side = model.shape.side
     document = ET.Element("OpenSimDocument", Version=_VERSION)
     root = ET.SubElement(document, "Model", name=f"{side}_hand")
@@ -149,17 +170,21 @@ def hand_osim(model: HandModel, markers: Sequence[Site] = ()) -> str:
     )
     for bone in range(len(BONES)):
         _add_body(bodies, model, bone)
+    flat = join_qpos(np.zeros((1, NUM_JOINTS)))
+    values = coordinate_values(flat if start is None else start[None], "z")[0]
+    starts = dict(zip(coordinate_names(side), values, strict=True))
     # The palm turns about its own axes and moves along those of the ground, in which it is free.
     names = coordinate_names(side)[:6]
     joint = _add_osim_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
-    _add_motion(joint, [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)])
+    axes = [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)]
+    _add_motion(joint, axes, starts)
     for bone in range(1, len(BONES)):
-        _add_knuckle(joints, model, bone)
+        _add_knuckle(joints, model, bone, starts)
     for site in markers:
         for name in (site.name, f"{side}:{site.name}"):
             _add_marker(placed, name, side, site.bone, site.position)
     # Joints and tips, each in the frame of the bone that begins, or ends, there.
-    at_rest = hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0]
+    at_rest = hand_keypoints(model, flat)[0]
     frames = np.linalg.inv(model.rest_transforms)[list(KEYPOINT_BONES)]
     local = np.einsum("kij,kj->ki", frames[:, :3, :3], at_rest) + frames[:, :3, 3]
     for name, bone, position in zip(KEYPOINT_NAMES, KEYPOINT_BONES, local, strict=True):
@@ -209,7 +234,7 @@ def _add_osim_capsule(
         _add(frame, "orientation", vector_text(body_fixed_angles(turn.as_matrix()[None])[0]))
 
 
-def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
+def _add_knuckle(joints: ET.Element, model: HandModel, bone: int, starts: Mapping[str, float]) -> None:
     """Add the one or two hinges that connect a bone with its parent bone."""
     side, skeleton = model.shape.side, model.skeleton
     hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == bone]
@@ -224,6 +249,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int) -> None:
     _add_motion(
         joint,
         [*zip([*names, "", ""][:3], axes, strict=True), *(("", axis) for axis in np.eye(3))],
+        starts,
         {name: skeleton.ranges[index] for name, index in zip(names, hinges, strict=True)},
     )
 
@@ -245,6 +271,7 @@ def _add_osim_joint(
 def _add_motion(
     joint: ET.Element,
     axes: Sequence[tuple[str, Float[np.ndarray, "3"]]],
+    starts: Mapping[str, float],
     ranges: Mapping[str, Float[np.ndarray, "2"]] = MappingProxyType({}),
 ) -> None:
     """Coordinates of a custom joint: three rotations in turn, then three translations; '' is none.
@@ -262,6 +289,7 @@ def _add_motion(
             widest = (-_MOST_TURN, _MOST_TURN) if number < 3 else (-_FARTHEST, _FARTHEST)
             _add(coordinate, "range", " ".join(map(number_text, ranges.get(name, widest))))
             _add(coordinate, "clamped", "false")
+            _add(coordinate, "default_value", number_text(starts[name]))
             _add(element, "coordinates", name)
         _add(element, "axis", vector_text(axis))
         if name:

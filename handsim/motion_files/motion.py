@@ -2,7 +2,8 @@
 
 A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name.
 Numbers of a hand without a pose are empty in a .csv and null in a .parquet. OpenSim's .mot has a row per
-frame, angles in degrees, and NaN without a pose.
+frame, angles in degrees, and y up as OpenSim's world; a hand without a pose keeps its last one, because
+OpenSim ends at NaN.
 
 BVH has no unit and no comments, so the root is named `world_cm`: lengths are centimeters, which animation
 programs expect, with y up. Its children are the palms of the hands and the things, which have positions; all
@@ -34,15 +35,14 @@ from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.model_files import coordinate_names
+from handsim.hand.model_files import coordinate_names, coordinate_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import (
     UpAxis,
-    body_fixed_angles,
     euler_angles,
+    file_axes,
     pose_matrices,
-    quaternion_matrix,
     rotation_quaternions,
 )
 
@@ -120,13 +120,6 @@ class Motion(NamedTuple):
     def seconds(self) -> Float[np.ndarray, "T"]:
         """Time since the first frame [s]."""
         return np.asarray(self.times - self.times[0])
-
-
-def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world to axes with y up (glTF, BVH, OpenXR), about x."""
-    if up == "y":
-        return np.eye(3)
-    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
@@ -310,13 +303,11 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
 
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the angles of all hands, in the take's axes whatever `up` is."""
+    """Write the coordinates of all hands in every frame."""
     columns, names = [motion.seconds[:, None]], ["time"]
     for hand in motion.hands:
-        turns = np.unwrap(body_fixed_angles(quaternion_matrix(hand.qpos[:, 3:7])), axis=0)
-        angles = np.rad2deg(np.concatenate([turns, hand.qpos[:, 7:]], axis=1))
-        columns.append(np.concatenate([hand.qpos[:, :3], angles], axis=1))
-        columns[-1][~hand.present] = np.nan
+        values = coordinate_values(hand.qpos, up)
+        columns += [values[:, :3], np.rad2deg(values[:, 3:])]
         names += coordinate_names(hand.side)
     table = np.concatenate(columns, axis=1)
     header = [

@@ -40,12 +40,11 @@ from handsim.motion_files.motion import (
     PosedHand,
     changes,
     corner_normals,
-    file_axes,
     local_rotations,
     smooth_quaternions,
     split_vertices,
 )
-from handsim.space.transforms import UpAxis
+from handsim.space.transforms import UpAxis, file_axes
 
 _MATERIALS: Final = (SKIN, THING)
 Target = Literal["vertices", "indices"]

@@ -18,6 +18,13 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
 
 
+def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world to axes with y up (glTF, BVH, OpenXR, OpenSim), about x."""
+    if up == "y":
+        return np.eye(3)
+    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) about one unit axis by `angle` (...) [rad] (Rodrigues' formula)."""
     x, y, z = axis

@@ -164,10 +164,12 @@ class CocoWriter(FolderWriter):
         record["image"] |= self._add_pictures(folder, frame, name)
         return record
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Write `annotations.json`."""
+        path = self.folder / "annotations.json"
         with one_sentence(self.folder, "writing the annotations"):
-            save_text(self.folder / "annotations.json", _coco_file(self._records, CATEGORY))
+            save_text(path, _coco_file(self._records, CATEGORY))
+        return [path]
 
 
 class YoloWriter(CocoWriter):
@@ -178,11 +180,12 @@ class YoloWriter(CocoWriter):
         _write(folder / _LABELS / f"{frame.key}.txt", label_lines(frame).encode())
         return record
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Write `annotations.json` and `data.yaml`."""
-        super().finish()
+        path = self.folder / "data.yaml"
         with one_sentence(self.folder, "writing data.yaml"):
-            save_text(self.folder / "data.yaml", [_DATA_YAML])
+            save_text(path, [_DATA_YAML])
+        return [*super().finish(), path]
 
 
 def _coco_file(records: Callable[[], Iterable[dict[str, Any]]], category: dict[str, Any]) -> Iterator[str]:
@@ -301,7 +304,7 @@ class InterhandWriter(CocoWriter):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, part=SPLIT)
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Write the files in `annotations`."""
         annotations = self.folder / "annotations"
         start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
@@ -324,3 +327,4 @@ class InterhandWriter(CocoWriter):
             table = {name: {number: one[name] for number, one in cameras.values()} for name in fields}
             save_text(Path(f"{start}_camera.json"), [to_json({str(CAPTURE): table}) + "\n"])
             save_text(annotations / "skeleton.txt", [skeleton_lines()])
+        return [path for path in annotations.rglob("*") if path.is_file()]

@@ -9,7 +9,7 @@ the right length.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,11 +81,20 @@ class FreihandWriter:
         """Shards that are complete."""
         return shards_in(self.parts)
 
-    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard."""
-        if str(shard) in self._numbers():
-            raise HandSimError(f"{self.folder}: shard {shard} is numbered already and cannot be written anew")
+    def files(self, shard: int) -> dict[str, Path]:
+        """The files of a shard by the names that they had before they were numbered."""
         folder = self.parts / shard_name(shard)
+        paths = [path for path in folder.rglob("*") if path.is_file()]
+        files = {path.relative_to(self.folder).as_posix(): path for path in paths}
+        for source, target in self._moves(shard, *self._numbers().get(str(shard), (0, 0))):
+            if target.is_file() and not source.exists():
+                files[source.relative_to(self.folder).as_posix()] = target
+        return files
+
+    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
+        """Write a shard, or write it anew; one that is numbered keeps its number of entries."""
+        folder = self.parts / shard_name(shard)
+        _, numbered = self._numbers().get(str(shard), (0, None))
         with one_sentence(self.folder, f"writing shard {shard}"), new_folder(folder) as temporary:
             entries: list[dict[str, Any]] = []
             for kind in _KINDS:
@@ -95,9 +104,14 @@ class FreihandWriter:
                     for kind, content in _pictures(frame, hand).items():
                         (temporary / kind / f"{len(entries):08d}{_KINDS[kind]}").write_bytes(content)
                     entries.append(entry)
+            if numbered not in (None, len(entries)):
+                raise HandSimError(
+                    f"{self.folder}: shard {shard} is numbered already with {numbered} entries, and cannot "
+                    f"be written anew with {len(entries)}"
+                )
             save_index(temporary, entries)
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Number the pictures and write the lists."""
         with one_sentence(self.folder, "numbering the pictures"):
             numbers = self._numbered()
@@ -108,6 +122,7 @@ class FreihandWriter:
                 folders = (self.parts / shard_name(int(shard)) for shard in shards)
                 entries = (entry[name] for folder in folders for entry in load_index(folder))
                 save_text(self.folder / f"{SET}_{name}.json", json_list(entries))
+        return [self.parts / _NUMBERS, *(self.folder / f"{SET}_{name}.json" for name in LISTS)]
 
     def _numbers(self) -> dict[str, list[int]]:
         """First number and count of every shard that has been numbered."""
@@ -120,6 +135,11 @@ class FreihandWriter:
             raise DatasetError(f"{path}: damaged: it holds no JSON; render into another folder") from error
         if not isinstance(numbers, dict) or not all(map(_is_pair, numbers.values())):
             raise DatasetError(f"{path}: damaged: it holds no numbers; render into another folder")
+        after = 0
+        for shard, (first, count) in sorted(numbers.items(), key=lambda entry: entry[1]):
+            if first != after or count < 0 or not shard.isdecimal() or int(shard) not in self.done():
+                raise DatasetError(f"{path}: damaged: its numbers do not follow; render into another folder")
+            after += count
         return numbers
 
     def _numbered(self) -> dict[str, list[int]]:
@@ -127,21 +147,30 @@ class FreihandWriter:
         numbers = self._numbers()
         after = max((first + count for first, count in numbers.values()), default=0)
         for shard in sorted(self.done()):
+            count = len(load_index(self.parts / shard_name(shard)))
             if str(shard) not in numbers:
-                count = len(load_index(self.parts / shard_name(shard)))
                 numbers[str(shard)] = [after, count]
                 after += count
+            elif numbers[str(shard)][1] != count:
+                raise DatasetError(
+                    f"{self.parts / _NUMBERS}: damaged: shard {shard} has {count} entries, not "
+                    f"{numbers[str(shard)][1]}; render into another folder"
+                )
         save_text(self.parts / _NUMBERS, [to_json(numbers) + "\n"])
         return numbers
 
     def _move(self, shard: int, first: int, count: int) -> None:
+        for source, target in self._moves(shard, first, count):
+            if source.exists():  # it does not after an earlier `finish`, nor without such a picture
+                target.parent.mkdir(parents=True, exist_ok=True)
+                source.replace(target)
+
+    def _moves(self, shard: int, first: int, count: int) -> Iterator[tuple[Path, Path]]:
+        """Where each picture of a shard is written, and where it is once it has its number."""
         for kind, suffix in _KINDS.items():
-            target = self.folder / SET / kind
             for index in range(count):
                 source = self.parts / shard_name(shard) / kind / f"{index:08d}{suffix}"
-                if source.exists():  # it does not after an earlier `finish`, nor without such a picture
-                    target.mkdir(parents=True, exist_ok=True)
-                    source.replace(target / f"{first + index:08d}{suffix}")
+                yield source, self.folder / SET / kind / f"{first + index:08d}{suffix}"
 
 
 def _is_pair(value: Any) -> bool:

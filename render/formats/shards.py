@@ -147,6 +147,12 @@ class FolderWriter:
         """Shards that are complete."""
         return shards_in(self.pictures)
 
+    def files(self, shard: int) -> dict[str, Path]:
+        """The files of a shard by their names in the folder."""
+        places = (self.pictures / shard_name(shard), *self.beside(shard).values())
+        paths = (path for place in places if place.is_dir() for path in place.iterdir() if path.is_file())
+        return {path.relative_to(self.folder).as_posix(): path for path in paths}
+
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew."""
         with one_sentence(self.folder, f"writing shard {shard}"), self.new_shard(shard) as temporary:
@@ -176,8 +182,9 @@ class FolderWriter:
         """Where a shard's depth, ids and so on are, if there are any."""
         return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Nothing to merge, unless a format overrides this."""
+        return []
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         """Write one frame into a shard's folder of that name."""

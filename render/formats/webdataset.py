@@ -215,10 +215,15 @@ class WebdatasetWriter:
         """Shards that are complete."""
         return shards_in(self.folder, suffix=TAR)
 
+    def files(self, shard: int) -> dict[str, Path]:
+        """The tar of a shard by its name."""
+        name = f"{shard_name(shard)}{TAR}"
+        return {name: self.folder / name}
+
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew; frames of one number follow one another."""
         persons, numbers = dict[str, HandShape](), set[int]()
-        path = self.folder / f"{shard_name(shard)}{TAR}"
+        (path,) = self.files(shard).values()
         with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as add:
             for number, group in itertools.groupby(frames, key=lambda frame: frame.number):
                 if number in numbers:
@@ -233,8 +238,9 @@ class WebdatasetWriter:
                 record = {"mano": [], "umetrack": umetrack_hand(*persons.values())}
                 add(HAND_SHAPES, to_json(record).encode())
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Do nothing, because tars are complete in themselves."""
+        return []
 
 
 def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:

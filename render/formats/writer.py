@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from handsim._checks import check_choice, check_type
+from handsim.app.output import CHECKSUMS, changed_files, checksums_name, load_checksums, save_checksums
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, save_json
@@ -68,10 +69,13 @@ class FrameWriter(Protocol):
     def done(self) -> frozenset[int]:
         """Numbers of the shards that are complete."""
 
+    def files(self, shard: int) -> dict[str, Path]:
+        """The files of a shard that is complete by their names in the folder, which stay when files move."""
+
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew."""
 
-    def finish(self) -> None:
+    def finish(self) -> list[Path]:
         """Merge all complete shards into the files that the format requires; may be called again."""
 
 
@@ -105,6 +109,38 @@ def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """The writer of one of `FORMATS` into a folder."""
     check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name].open(Path(folder))
+
+
+def shard_files(folder: Path, formats: Sequence[str], shard: int) -> dict[str, Path]:
+    """The files of a shard in all formats of a rendering by their names in its folder."""
+    found: dict[str, Path] = {}
+    for name in formats:
+        own = format_folder(folder, formats, name)
+        files = open_writer(name, own).files(shard).items()
+        found |= {(own / file).relative_to(folder).as_posix(): path for file, path in files}
+    return found
+
+
+def whole_shards(folder: Path, formats: Sequence[str]) -> tuple[frozenset[int], list[str]]:
+    """Complete shards of a rendering whose files are as they were written, and the files that are not.
+
+    All complete shards count in a folder of an earlier version, which wrote no checksums.
+    """
+    done = frozenset.intersection(
+        *(open_writer(name, format_folder(folder, formats, name)).done() for name in formats)
+    )
+    if not any(folder.glob(CHECKSUMS)):
+        return done, []
+    whole, changed = [], []
+    for shard in sorted(done):
+        path = folder / checksums_name(shard)
+        record, files = load_checksums(path), shard_files(folder, formats, shard)
+        found = changed_files(record, {name: files.get(name, folder / name) for name in record})
+        if not record and path.exists():
+            found = [path.name]
+        changed += found
+        whole += [shard] if record and not found else []
+    return frozenset(whole), changed
 
 
 CONFIG: Final = "render.json"
@@ -151,10 +187,23 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
         raise HandSimError(f"{out} is not empty; name a new folder")
     needed = sum(file.stat().st_size for one in parts for file in one.rglob("*") if file.is_file())
     check_free(out, needed, "the merged pictures", "merge fewer renderings", error=HandSimError)
-    count = 0
+    shards = []
+    for folder in parts:
+        whole, changed = whole_shards(folder, formats)
+        if changed:
+            raise DatasetError(
+                f"{folder}: {', '.join(changed)} are damaged (other checksums); the command that rendered it "
+                "makes them again"
+            )
+        shards.append(sorted(whole))
+    count = sum(map(len, shards))
+    if not count:
+        raise HandSimError(f"{', '.join(map(str, parts))}: no finished shards of the format {formats[0]}")
     for name in formats:
-        count = _merge_format(name, parts, [one["frames"] for one in settings], formats, out)
+        _merge_format(name, parts, shards, [one["frames"] for one in settings], formats, out)
         open_writer(name, format_folder(out, formats, name)).finish()
+    for number in range(count):
+        save_checksums(out / checksums_name(number), shard_files(out, formats, number))
     frames = sum(one["frames"] for one in settings)
     save_json(out / CONFIG, {"formats": formats, "frames": frames, "merged": settings})
     return count
@@ -172,14 +221,19 @@ def _settings(folder: Path) -> dict[str, Any]:
 
 
 def _merge_format(
-    name: str, folders: Sequence[Path], frames: Sequence[int], formats: Sequence[str], out: Path
-) -> int:
-    """Copy all shards of one format, and return their number."""
+    name: str,
+    folders: Sequence[Path],
+    shards: Sequence[Sequence[int]],
+    frames: Sequence[int],
+    formats: Sequence[str],
+    out: Path,
+) -> None:
+    """Copy the shards of one format."""
     number, offset = 0, 0
     target = open_writer(name, format_folder(out, formats, name))
-    for folder, count in zip(folders, frames, strict=True):
+    for folder, chosen, count in zip(folders, shards, frames, strict=True):
         source = open_writer(name, format_folder(folder, formats, name))
-        for shard in sorted(source.done()):
+        for shard in chosen:
             with one_sentence(out, f"copying shard {shard} of {folder}"):
                 if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
                     _copy_folder(source, shard, target, number, offset)
@@ -189,9 +243,6 @@ def _merge_format(
                     _copy_tar(start, end, offset)
             number += 1
         offset += count
-    if not number:
-        raise HandSimError(f"{', '.join(map(str, folders))}: no finished shards of the format {name}")
-    return number
 
 
 def _copy_tar(start: Path, end: Path, offset: int) -> None:

@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves import Attachment, GloveFit
+from gloves import Attachment, GloveFit, MarkerLayout, MarkerPlace, attach, load_layout
+from gloves.fit import settle_glove, vary_layout
 from handsim import Camera, HandModel, join_qpos, look_at
+from handsim.pages import distinct_colors
 from handsim.space.camera import pinhole
 from poses.shapes import gesture
-from render.illustrations import Balls, PosedHand, draw_things, unoccluded, view_along
+from render.illustrations import Balls, PosedHand, draw_glove, draw_things, unoccluded, view_along
 
 SIZE = (320, 240)
 SMALL = (160, 120)
@@ -91,3 +93,23 @@ def test_what_stands_before_a_point(model: HandModel) -> None:
     middle = hand.vertices().mean(axis=0)
     points = middle + np.array([[0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
     assert unoccluded(view, hand, points, slack=0.03).tolist() == [True, False, True, False]
+
+
+def test_slips_of_a_marker_are_dots_of_its_color_on_the_side_where_it_is(model: HandModel) -> None:
+    tips = load_layout("tips8").markers
+    pad = MarkerPlace("Pad", "index_middle", 0.5, np.pi)
+    fit = attach(MarkerLayout("with a pad", (pad, *tips), 0.003), model)
+    slips = [
+        settle_glove(vary_layout(fit.layout, along=0.05, around=0.1, rng=np.random.default_rng(seed)), model)
+        for seed in range(20)
+    ]
+    color = np.rint(255 * np.array(distinct_colors(fit.layout.num_markers)[0]))
+
+    def dots(side: str) -> int:
+        with_slips = draw_glove(fit, sides=(side,), slips=slips)
+        lower = with_slips[len(draw_glove(fit, sides=(side,))) :]
+        assert len(lower) > 300
+        return int((np.abs(lower.astype(int) - color).max(axis=-1) < 30).sum())
+
+    assert dots("palm") > 40
+    assert dots("back") == 0

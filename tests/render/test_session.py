@@ -346,7 +346,8 @@ def test_a_full_disk_is_one_sentence_and_finished_tars_are_kept(path, tmp_path):
             render_take(path, tmp_path / "out", ["webdataset"], PLAIN, workers=1, progress=fill)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["render.json", "shard-00000.tar"]
+    finished = ["checksums-00000.json", "render.json", "shard-00000.tar"]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == finished
     kept = (tmp_path / "out" / "shard-00000.tar").read_bytes()
     assert render_take(path, tmp_path / "out", ["webdataset"], PLAIN, workers=1) == 8
     assert (tmp_path / "out" / "shard-00000.tar").read_bytes() == kept

@@ -112,6 +112,22 @@ def test_a_recording_that_was_cut_off_is_read(tmp_path):
         recorded(tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore::gloves.takes.archives.CutOffWarning")
+def test_of_a_damaged_recording_whole_blocks_are_read(tmp_path):
+    recorder = recorded(tmp_path)
+    recorder.close()
+    whole, expected = recorder.part.read_bytes(), in_memory()
+    for place in np.linspace(0, len(whole) - 4, 60, dtype=int):
+        flipped = bytes(one ^ 1 for one in whole[place : place + 4])
+        recorder.part.write_bytes(whole[:place] + flipped + whole[place + 4 :])
+        try:
+            take = load_take(recorder.part)
+        except CaptureError as error:
+            assert "take.npz.part" in str(error)
+        else:
+            assert_equal(take, expected)
+
+
 @pytest.mark.parametrize("frames", [0, 1])
 def test_too_few_frames_leave_nothing(frames, tmp_path):
     recorder = recorded(tmp_path, frames=frames)

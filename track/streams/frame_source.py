@@ -55,6 +55,8 @@ class ArrivingFrames(ABC):
     """Whether frames come at their own pace, however slow their reader is."""
     error: Exception | None = None
     """Why no further frame comes, if the source failed."""
+    without_points = "does the camera system see markers?"
+    """What to do when frames come and no point is in any of them."""
 
     def __init__(self) -> None:
         self.lost = 0
@@ -95,11 +97,13 @@ class ArrivingFrames(ABC):
 class SourceStream(ArrivingFrames):
     """The checked frames of a source, which is iterated in a thread of its own.
 
-    With `waits`, a source that is faster than the times of its frames is made to wait.
+    With `waits`, a source that is faster than the times of its frames is made to wait. A source may say what
+    to do when no points come, in an attribute `without_points`.
     """
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
         super().__init__()
+        self.without_points = str(getattr(source, "without_points", self.without_points))
         check_methods(name, source, ("__iter__", "close"), "__iter__ and close of a frame source")
         self._source, self._name, self._waits = source, name, waits
         self._changed = threading.Condition()

@@ -43,6 +43,8 @@ GROUP: Final = "handsim.frame_sources"
 """Entry points of packages that bring frame sources."""
 MOST_LAG: Final = 0.03
 """Longest time that a frame waits for a reader that was held up [s]."""
+_EMPTY: Final = 2.0  # time of frames without any point after which that is told [s]
+_MANY_FAR: Final = 0.5  # share of points out of range above which the unit is questioned
 _SILENCE: Final = 2.0  # time without a frame after which a silent frame comes [s]
 _LEAST_LAG: Final = 0.01  # longest time that a frame waits for a slow reader [s]
 _TOO_SLOW: Final = 0.1  # a reader is slow if frames have waited for it so long without a break [s]
@@ -167,6 +169,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self._frames, self._silence, self._ended = frames, silence, ended
         self._ahead = 0.0  # [s] of this time over the stream's
         self._last: StreamedFrame | None = None  # on this clock
+        self._began = math.inf  # [s], when the first frame was passed on
         self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, with times of arrival [s]
         self._kept_up = time.monotonic()  # [s], when the reader last waited for a frame
         self._end_at = math.inf  # [s], when the stream was ended from here
@@ -194,6 +197,18 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             "points_out_of_range": self.far_points,
             **self._frames.counts,
         }
+
+    @property
+    def point_doubt(self) -> str:
+        """A sentence where the points of the stream are none or too far away; an empty one else."""
+        if not self.points and time.monotonic() > self._began + _EMPTY:
+            return f"frames arrive, but no point was in any of them; {self._frames.without_points}"
+        if self.far_points <= _MANY_FAR * self.points:
+            return ""
+        return (
+            f"{self.far_points} of {self.points} points lie {FARTHEST:.0f} m or more from the origin and are "
+            "left out; are they millimeters? Set the unit of the stream to meters"
+        )
 
     def __next__(self) -> StreamedFrame:
         """Wait for the next frame; after each period of silence a silent frame.
@@ -278,6 +293,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             self._ahead += begin - now
             now = begin
         near = (np.abs(frame.points) < FARTHEST).all(axis=1)
+        self._began = min(self._began, time.monotonic())
         self.points += len(near)
         self.far_points += int((~near).sum())
         if not near.all():

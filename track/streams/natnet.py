@@ -1,7 +1,8 @@
 """NatNet, the protocol in which OptiTrack servers (Motive) stream markers: packets, a client and a server.
 
 Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Of a
-frame only the lists of markers are read. Every count is checked against the remaining bytes before use.
+frame only the lists of markers are read, and as long as these are empty, because Motive can switch off
+both, the points of marker sets and assets. Every count is checked against the remaining bytes before use.
 """
 
 from __future__ import annotations
@@ -157,13 +158,16 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
     return struct.pack("<i", count) + (struct.pack("<i", len(content)) if sized else b"") + content
 
 
-def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> StreamedFrame:
-    """Read the observed markers of a frame, without those that the server filled in."""
+def parse_frame(
+    payload: bytes, version: Version, arrived: float = np.nan, *, assets: bool = False
+) -> StreamedFrame:
+    """Read the observed markers of a frame, or those of its `assets`, without what the server filled in."""
     reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
     number = reader.integer()
+    in_sets, in_assets = b"", b""
     for _ in range(reader.count(5, extra)):  # marker sets: names, and markers once more
         reader.skip_text()
-        reader.items(12)
+        in_sets += reader.items(12)
     older = np.frombuffer(reader.items(12, extra), dtype="<f4").reshape(-1, 3)
     reader.items(_BODY, extra)
     for _ in range(reader.count(8, extra)):  # skeletons
@@ -172,7 +176,7 @@ def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> St
     for _ in range(reader.count(12, extra) if extra else 0):  # assets
         reader.integer()
         reader.items(_BODY)
-        reader.items(size)
+        in_assets += reader.items(size)
     markers = np.frombuffer(reader.items(size, extra), dtype=_MARKER)
     for _ in range(2):  # force plates, other devices
         for _ in range(reader.count(8, extra)):
@@ -184,6 +188,10 @@ def parse_frame(payload: bytes, version: Version, arrived: float = np.nan) -> St
     reader.take(24 + 2 * extra + 2)  # clocks, flags
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
+    if assets:
+        markers = np.frombuffer(in_assets, dtype=_MARKER)
+        older = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
+        older = older[older.any(axis=1)]  # zeros stand for a marker that is not seen
     points, ids = _seen(markers, older)
     return StreamedFrame(number, time, points, ids, arrived=arrived)
 
@@ -271,6 +279,8 @@ class PointStream(ArrivingFrames):
     when hands are measured, a thread empties the socket before it overflows.
     """
 
+    without_points = "switch on Labeled Markers and Unlabeled Markers in Motive's streaming pane"
+
     def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
         super().__init__()
         self.server = server
@@ -280,6 +290,7 @@ class PointStream(ArrivingFrames):
         self.foreign = 0
         """Number of packets of other senders."""
         self._sockets, self._address = sockets, address
+        self._has_lists = False  # whether a list of markers has ever held a point
         self._version = min(server.version, NEWEST)
         self._asked = self._kept_alive = self._heard = time.monotonic()
         self._reading = threading.Lock()
@@ -367,6 +378,9 @@ class PointStream(ArrivingFrames):
                 other: Version = OLDEST if self._version == NEWEST else NEWEST
                 frame = parse_frame(payload, other, arrived)
                 self._version = other
+            self._has_lists |= len(frame.points) > 0
+            if not self._has_lists:
+                frame = parse_frame(payload, self._version, arrived, assets=True)
         except DamagedPacket:
             self.damaged += 1
             return None

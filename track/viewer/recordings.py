@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import itertools
 import re
 from abc import ABC, abstractmethod
@@ -20,6 +19,7 @@ from gloves.takes.take import STATUSES, RigidBody, Take, label_names
 from handsim.callbacks import Progress, no_progress
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
+from handsim.pages import distinct_colors
 from handsim.space.rig import CameraRig, list_rigs, load_rig
 from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
@@ -265,12 +265,9 @@ def label_colors(names: Sequence[str]) -> UInt8[np.ndarray, "K 3"]:
     """A color for each label, equal for both hands, and the color of unlabeled points at the end."""
     bare = [name.rsplit(":", 1)[-1] for name in names]
     order = {name: number for number, name in enumerate(dict.fromkeys(bare))}
-    # Hues follow the order of the glove, so that digits differ; neighbors differ in brightness.
-    colors = [
-        colorsys.hsv_to_rgb(0.92 * order[name] / max(len(order), 1), 1.0, 0.9 if order[name] % 2 else 0.6)
-        for name in bare
-    ]
-    labeled = np.round(255 * np.array(colors).reshape(-1, 3)).astype(np.uint8)
+    colors = distinct_colors(len(order))  # in the order of the glove, so that digits differ
+    chosen = np.array([colors[order[name]] for name in bare]).reshape(-1, 3)
+    labeled = np.round(255 * chosen).astype(np.uint8)
     return np.concatenate([labeled, np.array([GHOST_COLOR], dtype=np.uint8)])
 
 

@@ -292,11 +292,16 @@ def _read(weights: Path, card: Path) -> _Stored:
 
     try:
         content = json.loads(read_bytes(card, error=WeightsError, most=_MAX_CARD_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise WeightsError(f"{card} is damaged or not a labeler's: it holds no JSON") from error
+    try:
         names = checked_names(content["marker_names"])
         config = _CONFIGS[content.get("labeler", "set")](**content["network"])
         if len(names) != config.num_labels:
             raise WeightsError(f"{card} names {len(names)} markers for {config.num_labels} labels")
         expected = _shapes_of(config)
+        if content.get("sha256", digest := _digest(content, weights.read_bytes())) != digest:
+            raise ValueError(f"its weights and {card.name} do not have the SHA-256 that the card names")
         if weights.stat().st_size < _BYTES_PER_WEIGHT * sum(map(math.prod, expected.values())):
             raise ValueError("it is too short for the network that its card describes")
         tensors = load_file(weights)
@@ -326,6 +331,12 @@ def _read(weights: Path, card: Path) -> _Stored:
     return _Stored(config, content, tensors, prior)
 
 
+def _digest(card: dict[str, Any], weights: bytes) -> str:
+    """SHA-256 of all that decides labels: the markers, the network and its weights."""
+    described = json.dumps([card["marker_names"], card.get("labeler"), card["network"]])
+    return hashlib.sha256(described.encode() + weights).hexdigest()
+
+
 def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a network's weights."""
     if isinstance(config, SetLabelerConfig):
@@ -350,11 +361,11 @@ def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None
     prior = getattr(network, "prior", None)
     if isinstance(prior, PosePrior):
         tensors |= {_PRIOR + name: torch.from_numpy(table) for name, table in prior.tensors().items()}
+    content = _with_metadata(save(tensors), weights_metadata(card))
     with written_together():
         with atomic_write(folder / WEIGHTS) as temporary:
-            # The writer of safetensors does not report a full disk.
-            temporary.write_bytes(_with_metadata(save(tensors), weights_metadata(card)))
-        save_json(folder / CARD, card)
+            temporary.write_bytes(content)  # the writer of safetensors does not report a full disk
+        save_json(folder / CARD, card | {"sha256": _digest(card, content)})
 
 
 def weights_metadata(card: dict[str, Any]) -> dict[str, str]:

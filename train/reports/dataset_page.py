@@ -11,10 +11,13 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
+from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
 from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
 from handsim.space.rig import load_rig
 from train.data.shards import Dataset, hands_name
+from train.reports.hand_plot import slips_picture
+from train.simulation.training_frames import GenerateSettings, slipped_gloves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,6 +45,7 @@ def write_dataset_page(
         _angles_section(rows),
         _sight_section(rows, dataset, len(rig.positions)),
         _ghosts_section(rows),
+        _slips_section(dataset),
         _neighbors_section(rows, 2.0 * float(manifest.config["layout"]["radius"])),
     ]
     if present is not None:
@@ -255,6 +259,24 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
         _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
     else:
         right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
+
+
+def _slips_section(dataset: Dataset) -> Section:
+    """Where slips of the glove put each marker."""
+    config = dataset.manifest.config
+    names = ("population", "slip_along", "slip_around")
+    given = {name: value for name, value in config.items() if name in names}
+    settings, model = GenerateSettings.from_json(given), HandModel.named("M")
+    slips = slipped_gloves(dataset.layout, model, settings, rng=np.random.default_rng(0))
+    text = (
+        f"Nobody wears a glove as designed: markers slip by {settings.slip_along:g} bone lengths along the "
+        f"bones and {settings.slip_around:g} degrees around them, as standard deviations."
+    )
+    caption = (
+        f"The markers of {len(slips)} people of this population, each at its place on a right hand of size "
+        "M, one color a marker. Left: from the back. Right: from the palm's side."
+    )
+    return Section("Slips", text, pictures=[(slips_picture(dataset.layout, slips), caption)])
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import attach_markers
+from gloves.fit import GloveFit, attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONES, PALM
-from handsim.pages import Paint, color_bar, color_scale, picture
+from handsim.pages import Paint, color_bar, color_scale, distinct_colors, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +26,7 @@ HAND_CAPTION: Final = (
 )
 MAX_LETTERS: Final = 20
 """Longest marker name that is drawn in full."""
+_SLIPS_SIZE: Final = (10.8, 6.6)  # [inch]
 _MAX_ARROWS: Final = 12
 _MARGIN: Final = 34.0  # around the hand [points]
 _BEND: Final = 0.22  # of the arrows, so that the two between a pair of markers lie side by side
@@ -164,6 +165,47 @@ def _draw_hand(
     for name, dot, center in zip(labels, dots, centers, strict=True):
         _draw_name(panel, name, dot, center)
     color_bar(figure, colors, "slots right [%]", cax=figure.add_axes(_BAR))
+
+
+def slips_picture(layout: MarkerLayout, slips: Sequence[GloveFit]) -> str:
+    """A picture of the hand of size M from the back and the palm's side, with the markers of gloves on it."""
+    points = np.stack([fit.attachment.points for fit in slips])
+    below = np.stack([fit.attachment.normals[:, 2] < 0.0 for fit in slips])
+    return picture(_SLIPS_SIZE, _draw_slips, flat_hand(layout), layout.names, _projected(points), below)
+
+
+def _draw_slips(
+    figure: Figure,
+    hand: FlatHand,
+    names: tuple[str, ...],
+    dots: Float[np.ndarray, "P M 2"],
+    below: NDArray[np.bool_],
+) -> None:
+    """Draw the markers of many gloves [m], one color a marker; those `below` (P, M) on the right."""
+    figure.set_layout_engine("none")  # as in _draw_hand
+    panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()
+    panel.set(xlim=(0.0, width), ylim=(0.0, height))
+    panel.set_axis_off()
+    everything = np.concatenate([*hand.outlines, dots.reshape(-1, 2)])
+    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
+    scale = float(((np.array([0.5 * width, height]) - 2.0 * _MARGIN) / size).min())
+    colors, middles, shown = distinct_colors(len(names)), [], []
+    for center, flip, there in ((0.25, 1.0, ~below), (0.75, -1.0, below)):
+        turn = np.array([flip, 1.0])
+        shift = np.array([center * width, 0.5 * height]) - scale * turn * (low + size / 2.0)
+        seen = hand._replace(outlines=[turn * loop for loop in hand.outlines], bones=turn * hand.bones)
+        seen.draw(panel, scale=scale, shift=shift, bone_width=2.0)
+        for marker, color in enumerate(colors):
+            mine = scale * turn * dots[there[:, marker], marker] + shift
+            panel.plot(*mine.T, "o", color=color, markersize=2.2, markeredgewidth=0, alpha=0.6)
+            if len(mine) > len(dots) / 2:
+                middles.append(mine.mean(axis=0))
+                shown.append(marker)
+    labels = [short(names[marker]) for marker in shown]
+    centers = place_names(labels, np.array(middles), [], (width, height))
+    for name, middle, center in zip(labels, middles, centers, strict=True):
+        _draw_name(panel, name, middle, center)
 
 
 def short(name: str) -> str:

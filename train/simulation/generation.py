@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pickle
-import sys
 import warnings
 from collections import Counter
 from collections.abc import Collection
@@ -28,7 +27,7 @@ from handsim.app.output import (
     place_of,
     save_checksums,
 )
-from handsim.app.workers import check_workers, run_jobs
+from handsim.app.workers import check_workers, main_script, run_jobs
 from handsim.callbacks import Progress, no_progress
 from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.inputs import load_json
@@ -139,9 +138,7 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
         return allowed
     try:
         pickle.dumps(sampler)
-        alone = getattr(sampler, "__module__", "") == "__main__" and not hasattr(
-            sys.modules["__main__"], "__file__"
-        )  # as in a notebook
+        alone = getattr(sampler, "__module__", "") == "__main__" and main_script() is None
     except Exception:  # a user's object may raise anything
         alone = True
     if alone and workers is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit, wear
+from gloves.fit import GloveFit, settle_glove, wear
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.reconstruction import FrameOptics, OpticsConfig, reconstruct
@@ -33,6 +33,7 @@ from poses.two_hands import sample_two_hand_poses
 NO_REST: Final = "person: fingers overlap at rest"
 """Reason to draw another person."""
 _MAX_PEOPLE: Final = 1000
+_SHOWN_PEOPLE: Final = 100  # whose slips are drawn
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 """Reason to replace a scene of two hands by one of a single hand."""
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
@@ -177,6 +178,16 @@ def wear_gloves(
     return tuple(
         GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
     )
+
+
+def slipped_gloves(
+    layout: MarkerLayout, model: HandModel, settings: GenerateSettings, *, rng: np.random.Generator
+) -> tuple[GloveFit, ...]:
+    """The gloves of a hundred people with the slips of a training set, their places put on one hand."""
+    people = [sample_shape(settings.population, side=model.shape.side, rng=rng) for _ in range(_SHOWN_PEOPLE)]
+    along, around = settings.slip_along, np.deg2rad(settings.slip_around)
+    worn = (wear_gloves(layout, [HandModel(one)], along=along, around=around, rng=rng) for one in people)
+    return tuple(settle_glove(fit.layout, model) for (fit,) in worn)
 
 
 def simulate_frames(

@@ -144,3 +144,44 @@ def test_workers_end_with_their_parent(number, tmp_path):
         parent.send_signal(number)
         parent.stdout.read()  # until the last process that could write is gone
     assert not any(running(int(line[0])) for line in lines)
+
+
+SCRIPT = """
+import operator, sys
+sys.path.insert(0, ROOT)
+print("begin", flush=True)
+from handsim.app.workers import check_workers, run_jobs
+def own(number):
+    return number
+"""
+CALL = "print(sorted(run_jobs({job}, range(5), 2)))\n"
+GUARDED = 'if __name__ == "__main__":\n    ' + CALL
+
+
+@pytest.mark.parametrize("piped", [False, True])
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (CALL.format(job="operator.index"), ""),
+        (GUARDED.format(job="operator.index"), ""),
+        (CALL.format(job="own"), "put the call under `if __name__ == "),
+        (GUARDED.format(job="own"), ""),
+        ("check_workers(2)\n" + GUARDED.format(job="own"), "runs this script again: put the call under "),
+    ],
+)
+def test_a_script_without_a_main_guard(call, said, piped, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.replace("ROOT", repr(str(ROOT))) + call)
+    command = [sys.executable, *([] if piped else [script])]
+    with script.open() as text:
+        done = subprocess.run(
+            command, stdin=text if piped else None, capture_output=True, text=True, check=False
+        )
+    if piped and "(own," in call:
+        said = "this session, not a module, defines what the workers use: put the call under"
+    if said:
+        assert said in done.stderr and "[0" not in done.stdout
+        assert done.stdout.count("begin") == (3 if call.startswith("check") and not piped else 1)
+        return
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "[0, 1, 2, 3, 4]"), done.stderr
+    assert done.stdout.count("begin") == (3 if call.startswith("if") and not piped else 1)

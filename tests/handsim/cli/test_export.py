@@ -62,13 +62,18 @@ def test_truth_of_a_simulated_take_has_its_pen(folder):
     assert motion.sides == ("right", "left") and np.isfinite(motion.qpos).all()
 
 
-def test_trc_holds_the_keypoints_where_the_take_has_them(folder, tmp_path):
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_trc_holds_the_keypoints_with_y_up_and_no_gap(folder, up, tmp_path, capsys):
     out = tmp_path / "joints.trc"
-    assert main(["export", str(folder / "tracked.npz"), "--out", str(out)]) == 0
-    capture, motion = read_capture(out), load_take(folder / "tracked.npz")
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(out), "--up", up]) == 0
+    assert "left hand: without a pose in 2 frames, held at its last pose there" in capsys.readouterr().out
+    capture, expected = read_capture(out), load_take(folder / "tracked.npz").keypoints()
     assert capture.rate == RATE and capture.names[:2] == ("right_wrist", "right_thumb_CMC")
     found = capture.positions.reshape(FRAMES, 2, len(KEYPOINT_NAMES), 3)
-    np.testing.assert_allclose(found, motion.keypoints(), atol=1e-8)  # NaN where ours are
+    expected[3:5, 1] = expected[2, 1]
+    if up == "z":
+        expected = np.stack([expected[..., 0], expected[..., 2], -expected[..., 1]], axis=-1)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 def test_fps_resamples(folder, tmp_path):

@@ -313,6 +313,27 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     assert load_take(out).num_frames == 30, "not from the first silence"
 
 
+EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
+EMPTY = EMPTY.replace(
+    "class Late:",
+    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
+
+class Late:
+    without_points = "is the cover off?"
+""",
+)
+
+
+@pytest.mark.parametrize("size", ["auto", "M"])
+def test_a_stream_whose_frames_have_no_points_is_told_at_once(size, tmp_path, monkeypatch, capsys):
+    (tmp_path / f"empty_{size}.py").write_text(EMPTY)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    main(["track", "--live", f"empty_{size}:Late", "--size", size, "--out", str(tmp_path / "live.npz")])
+    said = "frames arrive, but no point was in any of them; is the cover off?"
+    assert capsys.readouterr().err.splitlines().count(said) == 1
+
+
 def _numbers_in(part):
     """The numbers of the frames that are in a recording; none before its first bytes are written."""
     try:
@@ -418,7 +439,8 @@ def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch)
     with ReplayServer(SimpleNamespace(points=take.points[:1], ids=take.ids[:1], rate=120.0)) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
         assert main(arguments) == 1
-    assert "1 frames came, expected two or more" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "1 frames came, expected two or more" in said
     assert not list(tmp_path.iterdir())
 
 

@@ -68,8 +68,11 @@ def test_numbers_stay_when_shards_come_later(make_frame, tmp_path: Path) -> None
     assert pictures()["00000000.jpg"] == first["00000000.jpg"]
     assert [entry["frame"] for entry in load(tmp_path, "info")] == [5, 1, 2]
     assert not (tmp_path / "training_verts.json").exists()
-    with pytest.raises(HandSimError, match="numbered already"):
-        writer.write(1, [make_frame(5)])
+    writer.write(1, [make_frame(5)])
+    writer.finish()
+    assert pictures()["00000000.jpg"] == first["00000000.jpg"], "written anew it has the same numbers"
+    with pytest.raises(HandSimError, match="numbered already with 1 entries"):
+        writer.write(1, [make_frame(5), make_frame(6)])
 
 
 def test_an_interrupted_finish_goes_on(make_frame, tmp_path: Path) -> None:

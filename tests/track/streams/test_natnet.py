@@ -122,6 +122,21 @@ def test_every_section_is_stepped_over(sized):
 
 
 @pytest.mark.parametrize("sized", [False, True])
+def test_points_of_marker_sets_and_assets_count_where_they_are_asked_for(sized):
+    payload = full_frame([(5, 0.1, 0.2, 0.3, 2)], [(0.1, 0.2, 0.3)], sized=sized)
+    twice = np.array([9.0, 9.0, 9.0], dtype="<f4").tobytes() * 2
+    other = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], dtype="<f4").tobytes()  # zeros: not seen
+    payload = payload.replace(
+        b"Glove\0" + struct.pack("<i", 2) + twice, b"Glove\0" + struct.pack("<i", 2) + other
+    )
+    payload = payload.replace(b"all\0" + struct.pack("<i", 0), b"")
+    payload = payload[:4] + struct.pack("<i", 1) + payload[8:]
+    frame = parse_frame(payload, (4, 1) if sized else (4, 0), assets=True)
+    np.testing.assert_array_equal(frame.points, [[1.0, 2.0, 3.0]])  # the asset's marker is filled in
+    np.testing.assert_array_equal(frame.ids, [-1])
+
+
+@pytest.mark.parametrize("sized", [False, True])
 def test_the_two_layouts_are_not_taken_for_each_other(sized):
     frame = StreamedFrame(1, 2.0, np.arange(30.0).reshape(10, 3), np.arange(10))
     empty = StreamedFrame(1, 2.0, np.empty((0, 3)), np.empty(0, dtype=np.int64))
@@ -270,6 +285,53 @@ def unicast(version: tuple[int, int]) -> ServerInfo:
 def frame(number: int, version: tuple[int, int]) -> bytes:
     points = np.array([[number, 0.0, 1.0]]) / 128.0
     return natnet.pack_frame(StreamedFrame(number, number / 100.0, points, np.array([number])), version)
+
+
+def bare(number: int, version: tuple[int, int], points: np.ndarray) -> bytes:
+    """A frame without markers in its lists; the points are in a marker set, and again in that of all."""
+    content = struct.pack("<i", len(points)) + points.astype("<f4").tobytes()
+    sets = [name + content for name in (b"glove\0", b"all\0") if len(points)]
+    empty = natnet.pack_frame(
+        StreamedFrame(number, number / 100.0, np.empty((0, 3)), np.empty(0, int)), version
+    )
+    _, payload = unpack(empty)
+    there = 12 if version >= (4, 1) else 8
+    size = struct.pack("<i", sum(map(len, sets))) if version >= (4, 1) else b""
+    return pack(
+        Kind.FRAME, payload[:4] + struct.pack("<i", len(sets)) + size + b"".join(sets) + payload[there:]
+    )
+
+
+def say_frames(puppet: Puppet, version: tuple[int, int], frames: list[np.ndarray]) -> None:
+    for number, points in enumerate(frames):
+        puppet.say(bare(number, version, points))
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_points_of_marker_sets_are_used_until_a_list_has_one(version, monkeypatch):
+    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    points = np.array([[0.25, 0.5, 0.75], [0.0, 0.0, 0.0], [0.5, 0.5, 1.0]])
+    with Puppet(unicast(version)) as puppet, opened(puppet.url) as stream:
+        say_frames(puppet, version, [points, points[:0], points])
+        np.testing.assert_array_equal(next(stream).points, points[[0, 2]])
+        assert not len(next(stream).points) and len(next(stream).points) == 2 and not stream.point_doubt
+        puppet.say(frame(3, version))
+        puppet.say(bare(4, version, points))
+        assert len(next(stream).points) == 1 and not len(next(stream).points)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_frames_without_points_name_the_switch(version, monkeypatch):
+    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    with Puppet(unicast(version)) as puppet, opened(puppet.url) as stream:
+        assert not stream.point_doubt, "no frame came"
+        say_frames(puppet, version, [np.empty((0, 3))] * 3)
+        assert [next(stream).number for _ in range(3)] == [0, 1, 2]
+        assert stream.point_doubt.startswith(
+            "frames arrive, but no point was in any of them; switch on Labeled"
+        )
+        puppet.say(frame(3, version))
+        assert len(next(stream).points) == 1 and not stream.point_doubt
 
 
 @pytest.mark.parametrize("version", [(3, 0), (4, 0), (4, 1)])

@@ -72,7 +72,7 @@ def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_pat
     assert len(section.pictures) == 1
     assert report.gap_section(np.ones((9, 2), bool), 120.0).pictures == ()
     page = report.write_dataset_page(tmp_path / "page.html", dataset, present=present, rate=240.0)
-    assert len(pictures(page)) == 5
+    assert len(pictures(page)) == 6
 
 
 def test_a_large_set_is_sampled_evenly_over_its_shards(dataset):
@@ -89,7 +89,7 @@ def test_the_page_shows_the_sets_figures_and_is_the_same_every_time(dataset, tmp
     text = page.read_text("utf-8")
     assert "<title>Training set small</title>" in text
     drawn = pictures(page)
-    assert len(drawn) == 4
+    assert len(drawn) == 5
     for picture in drawn:
         assert len(list(ElementTree.fromstring(picture).iter())) > 100
     assert drawn[0].count('<g id="axes_') == 20  # a panel a hinge
@@ -131,8 +131,8 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
     assert main(command) == 0  # the same command goes on in a folder that holds a report
     assert (out / "report.html").read_bytes() == first
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.json", "hands-00000.npy", "manifest.json", "redrawn-00000.json", "report.html",
-        "rows-00000.npy",
+        "checksums-00000.json", "config.json", "hands-00000.npy", "manifest.json", "redrawn-00000.json",
+        "report.html", "rows-00000.npy",
     ]  # fmt: skip
 
 

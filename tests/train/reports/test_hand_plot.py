@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import base64
+import re
+
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, attach, load_layout
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
 from handsim import HandModel
 from handsim.hand.shape import BONES, bones_of
-from train.reports.hand_plot import HAND_SIZE, arrow_curve, flat_hand, mistakes, name_extent, place_names
+from train import GenerateSettings
+from train.reports.hand_plot import (
+    HAND_SIZE,
+    arrow_curve,
+    flat_hand,
+    mistakes,
+    name_extent,
+    place_names,
+    short,
+    slips_picture,
+)
+from train.simulation.training_frames import slipped_gloves
 
 
 def any_layout(count: int) -> MarkerLayout:
@@ -84,3 +98,13 @@ def test_names_do_not_lie_on_one_another(count):
     assert ((places - half > 0.0) & (places + half < size)).all()
     from_dots = np.abs(places[:, None] - dots) - half[:, None]
     assert from_dots.max(axis=-1).min() > 0.0, "a name lies on a dot"
+
+
+def test_slips_of_every_marker_are_named_once():
+    layout, model = any_layout(64 - len(BONES)), HandModel.named("M")
+    slips = slipped_gloves(layout, model, GenerateSettings(), rng=np.random.default_rng(0))
+    moved = np.stack([fit.attachment.points for fit in slips]) - attach(layout, model).attachment.points
+    assert len(slips) == 100 and np.linalg.norm(moved, axis=-1).max() > 0.003
+    drawn = base64.b64decode(slips_picture(layout, slips).split(",")[1]).decode()
+    names = re.findall(r"<!-- (\S+) -->", drawn)
+    assert sorted(names) == sorted(short(name) for name in layout.names)
