@@ -23,7 +23,6 @@ from track.association.label_consistency import (
     fit_labels,
     gate_labels,
 )
-from train.labelers.protocol import Labeling
 
 RATE = 120.0
 
@@ -208,17 +207,6 @@ def test_without_labels_the_pose_is_the_predicted_one(hand, motion, markers):
     assert gated(state, np.zeros((0, 3)), np.zeros(0, dtype=int), prediction).shape == (0,)
 
 
-def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(hand, motion, markers):
-    state, prediction = followed(hand, motion, markers, 20)
-    shuffled = np.roll(np.arange(19), 5)
-    frame, estimate = fit_labels(frame_of(markers[20], shuffled), 0, state, prediction, is_sure=True)
-    assert np.isnan(estimate.rms)
-    np.testing.assert_array_equal(frame.labels, shuffled)
-    one_off = planted(markers[20], 6, 0.1, 0)
-    sure = fit_labels(frame_of(one_off, np.arange(19)), 0, state, prediction, is_sure=True)
-    assert sure[0].labels[6] == -1 and sure[1].rms < 0.001
-
-
 TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
 KNUCKLE = 4  # of the index finger
 
@@ -322,37 +310,3 @@ def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age, 
         assert found is None
     else:
         np.testing.assert_array_equal(found[0].labels, np.arange(19))
-
-
-class LabelerOfOneConfidence(CountingLabeler):
-    """The labeler of dense19, as sure of every label as one says."""
-
-    def __init__(self, confidence: float) -> None:
-        super().__init__()
-        self._confidence = confidence
-
-    def label_frames(self, frames):
-        found = super().label_frames(frames)
-        return [Labeling(one.labels, np.full(len(one.labels), self._confidence)) for one in found]
-
-
-@pytest.mark.parametrize(("confidence", "asked_of"), [(0.99, [[0, 1], []]), (0.5, [[0], [1]])])
-def test_where_the_labeler_is_unsure_of_a_hand_the_other_has_its_turn_in_the_next_frame(
-    confidence, asked_of, followed, frame_of
-):
-    states = [followed("right"), followed("left", (0.6, 0.0, 0.0))]
-    points = np.concatenate([state.solver.marker_positions(state.qpos) for state in states])
-    labeler = LabelerOfOneConfidence(confidence)
-    review = LabelerReview(labeler, 2, TrackerConfig())
-    for time, expected in zip((0.5, 0.511), asked_of, strict=True):
-        frame, tracks, asked = frame_of(points, np.arange(38), time, hands=2), [], []
-        for number, state in enumerate(states):
-            prediction = state.predict(time)
-            targets = targets_of(points, frame.markers(number), 19)
-            estimate = state.fit(targets, prediction.qpos, prediction)
-            tracks.append(HandTrack(number, state, prediction, estimate))
-        for track in review.longest_first(tracks):
-            before = len(labeler.calls)
-            review.review(frame, track)
-            asked += [track.hand] * (len(labeler.calls) - before)
-        assert asked == expected
