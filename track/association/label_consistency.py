@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from track.association.hand_state import (
 )
 from track.association.initialization import MOST_POINTS
 from track.config import TrackerConfig
-from train.labelers.matching import SURE
 from train.labelers.protocol import Labeler
 
 _GATE: Final = 16.0  # squared Mahalanobis distance of a point that is fitted: four standard deviations
@@ -211,8 +209,6 @@ class LabelerReview:
         self._config = config
         self._wait = np.full(num_hands, _FIRST_REVIEW_WAIT)  # [s] from a hand's last review to its next
         self._last = np.full(num_hands, -np.inf)  # [s] of each hand's last review
-        # The hand of the last review in which the labeler was not sure, and took long, and its time [s].
-        self._unsure = -1, -np.inf
         self._earlier: list[dict[tuple[int, int], int]] = [{} for _ in range(num_hands)]
         # How many reviews in turn found other labels of points likelier, but not by enough.
         self._open: list[frozenset[int]] = [frozenset()] * num_hands  # IDs that it was about
@@ -221,14 +217,8 @@ class LabelerReview:
         """Note that a hand was initialized at a time [s]: its labels are reviewed soon."""
         self._wait[index], self._last[index] = _FIRST_REVIEW_WAIT, time
 
-    def longest_first(self, tracks: Sequence[HandTrack]) -> list[HandTrack]:
-        """The hands in the order of their last reviews, since not every frame has time for all."""
-        return sorted(tracks, key=lambda track: float(self._last[track.hand]))
-
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
         """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
-        if self._unsure[1] == frame.time and self._unsure[0] != track.hand:  # enough for one frame
-            return frame, track
         markers = frame.markers(track.hand)
         near = _near_missing(
             frame.points, frame.labels, markers, track.state.digits, track.estimate.positions
@@ -240,8 +230,6 @@ class LabelerReview:
             return frame, track
         named, confidence = np.full(len(near), -1), np.full(len(near), np.nan)
         labeling = self._labeler.label_frames([frame.points[cloud]])[0]
-        if labeling.confidence.min(initial=1.0) < SURE:
-            self._unsure = track.hand, frame.time
         named[cloud], confidence[cloud] = labeling.labels, labeling.confidence
         if (named == markers).all():
             return frame, track

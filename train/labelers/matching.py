@@ -204,8 +204,7 @@ def balance(
     return plan
 
 
-SURE: Final = 0.95
-"""Probability of each pair from which on a labeling is final; others are tried below it, and take longer."""
+_SURE: Final = 0.95  # pairs with this probability are final
 _MAX_UNSURE: Final = 8  # the least sure pairs of a labeling, each of which is tried without
 _ROUNDS: Final = 3  # pairs that a labeling is tried without
 _WIDTH: Final = 3  # best labelings of a round, from which the next round starts
@@ -224,7 +223,7 @@ def matching_constants() -> dict[str, float]:
     return {
         **SINKHORN,
         "impossible": IMPOSSIBLE,
-        "sure": SURE,
+        "sure": _SURE,
         "most_unsure": _MAX_UNSURE,
         "rounds": _ROUNDS,
         "width": _WIDTH,
@@ -254,7 +253,7 @@ def match_scores(
     num_labels = probabilities.shape[1] - 1
     if (
         prior is None
-        or confidence.min(initial=1.0) > SURE
+        or confidence.min(initial=1.0) > _SURE
         or np.count_nonzero(labels >= 0) < _MIN_LABELED
         or len(points) > 2 * num_labels  # more than one hand
     ):
@@ -390,7 +389,7 @@ def _least_sure(
     for point in range(len(labels)):
         confidence[point] = probabilities[point, labels[point]]
     order = np.argsort(confidence)[:_MAX_UNSURE]
-    return order[confidence[order] < SURE]
+    return order[confidence[order] < _SURE]
 
 
 @kernel
