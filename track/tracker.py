@@ -333,11 +333,9 @@ def _tracked_hand(
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
         return TrackedHand(side, outcome.status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
-    markers, labeled = state.positions.copy(), own >= 0
-    markers[own[labeled]] = frame.points[labeled]
-    present = np.zeros(count, dtype=bool)
-    present[own[labeled]] = True
-    filled = np.flatnonzero(~present)
+    seen = targets_of(frame.points, own, count)
+    is_missing = np.isnan(seen[:, 0])
+    markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
     return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)
 
