@@ -2,13 +2,15 @@
 
 A random 120 Hz motion is followed, every frame from the pose that the same solver found for the one before.
 For the comparison each marker of dense19 is bound to one bone, because a site of MuJoCo is; all stop where a
-step brings the markers less than a micron nearer.
+step brings the markers less than a micron nearer. mink takes part where it is installed (`pip install
+"mink[daqp]"`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.util
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -31,6 +33,7 @@ Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 SMALL = 1e-12  # [m^2] by which the summed squares may still fall when a solver stops
 MOST = 50
 NOISE = 3e-4  # of markers [m]
+HAS_MINK = importlib.util.find_spec("mink") is not None
 
 
 def ours(model: HandModel, glove: Attachment) -> Solver:
@@ -110,6 +113,34 @@ def scipy_marquardt(model: HandModel, glove: Attachment) -> Solver:
     return solve
 
 
+def mink_tasks(model: HandModel, glove: Attachment) -> Solver:
+    """A position task for each marker; daqp solves the quadratic program."""
+    import mink
+
+    compiled, sites = with_sites(model, glove)
+    configuration = mink.Configuration(compiled)
+    tasks = [mink.FrameTask(name, "site", 1.0, 0.0) for name in glove.layout.names]
+
+    def solve(target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
+        configuration.update(start)
+        for task, place in zip(tasks, target, strict=True):
+            # A pose's error is its distance in space only where the orientation is met.
+            rotation = configuration.get_transform_frame_to_world(task.frame_name, "site").rotation()
+            task.set_target(mink.SE3.from_rotation_and_translation(rotation, place))
+        before, tried = np.inf, 0
+        while tried < MOST:
+            tried += 1
+            velocity = mink.solve_ik(configuration, tasks, 1.0, "daqp", damping=1e-9, limits=[])
+            configuration.integrate_inplace(velocity, 1.0)
+            cost = ((configuration.data.site_xpos[sites] - target) ** 2).sum()
+            if abs(before - cost) < SMALL:
+                break
+            before = cost
+        return configuration.q.copy(), tried
+
+    return solve
+
+
 def turning(vector: np.ndarray) -> np.ndarray:
     """Turning rate in the turned frame by the rate of a rotation vector."""
     angle = np.linalg.norm(vector)
@@ -171,6 +202,8 @@ def times(seeds: Sequence[int], frames: int) -> Iterator[tuple[str, str, list[fl
         "numpy": ("the same steps, MuJoCo's Jacobian, numpy", mujoco_marquardt),
         "scipy": ("scipy least_squares, lm", scipy_marquardt),
     }
+    if HAS_MINK:
+        contestants["mink"] = ("mink, daqp", mink_tasks)
     model = HandModel.named("M")
     skin = attach_markers(load_layout("dense19"), model)
     weights = np.zeros_like(skin.bone_weights)

@@ -27,7 +27,6 @@ from benchmarks.record import describe, run
 from gloves import Take
 from track import ReplayServer, StreamedFrame, Tracker, open_sinks, open_source
 from track.streams import LOOPBACK
-from track.tracker import warm_up
 from train import load_labeler, simulate_take
 
 RATE = 120.0
@@ -104,9 +103,9 @@ def main(seconds: float = 600.0) -> None:
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
     command, web, bundles = _free_ports(socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM)
     tracker = Tracker(true_users(take), load_labeler("dense19"))
-    warm_up(tracker.hands, load_labeler("dense19"))
+    tracker.warm_up()
     ranges = [(0, half), (half, frames - half)]
-    with open_sinks([f"ws://{LOOPBACK}:{web}", f"osc://{LOOPBACK}:{bundles}"]) as sinks:
+    with open_sinks([f"ws://{LOOPBACK}:{web}?every=yes", f"osc://{LOOPBACK}:{bundles}"]) as sinks:
         sinks.start(tracker.hands, tracker.bodies)
         jobs: list[tuple[Any, tuple[Any, ...]]] = [
             (serve, (take, command, ranges, sent, over)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import platform
@@ -68,13 +69,47 @@ def resident_memory() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def save_figures(name: str | None, figures: Figures, folder: Path = FOLDER) -> Path | None:
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """What the figures of a run of `benchmarks.speed` depend on."""
+
+    seeds: tuple[int, ...]
+    is_quick: bool
+    """Whether every part was tried with a few frames."""
+    left_out: tuple[str, ...]
+    """Sections, and other software, that were not measured."""
+    processors: int
+    """Processors that the run was allowed to use."""
+    vectors: str
+    """Vector instructions that torch found, such as AVX512."""
+    threads: dict[str, str]
+    """What each library that has threads of its own was told, by library."""
+    load: tuple[float, float]
+    """Processes that wanted to run in the last minute, before the run and at its end."""
+
+    def __str__(self) -> str:
+        """Sentences of a page on the run."""
+        seeds = ", ".join(map(str, self.seeds))
+        few = " a few frames of" if self.is_quick else ""
+        left_out = f"Left out: {'; '.join(self.left_out)}" if self.left_out else "Nothing was left out"
+        threads = ", ".join(f"{library} {count}" for library, count in self.threads.items())
+        return (
+            f"This run was of{few} the seeds {seeds}, on {self.processors} processors with {self.vectors}. "
+            f"{left_out}. Threads: {threads}. {self.load[0]:.1f} processes wanted to run before it, and "
+            f"{self.load[1]:.1f} at its end."
+        )
+
+
+def save_figures(
+    name: str | None, figures: Figures, folder: Path = FOLDER, conditions: Conditions | None = None
+) -> Path | None:
     """Write the figures of one benchmark, in place of those that its file had.
 
     Args:
         name: Name of the file, without its ending; None writes nothing.
         figures: The figures.
         folder: Folder of the files.
+        conditions: What they depend on.
 
     Returns:
         The file.
@@ -89,18 +124,20 @@ def save_figures(name: str | None, figures: Figures, folder: Path = FOLDER) -> P
     commit = subprocess.run(
         ["git", "rev-parse", "--short=7", "HEAD"], cwd=FOLDER, capture_output=True, text=True, check=True
     )
-    head = {
+    head: dict[str, Any] = {
         "command": f"python -m {module} {shlex.join(words)}".strip(),
         "commit": commit.stdout.strip(),
         "machine": describe(),
         "date": date.today().isoformat(),
     }
+    if conditions is not None:
+        head["conditions"] = dataclasses.asdict(conditions)
     rows = {key: {"what": what, "value": _rounded(value)} for key, (what, value) in figures.items()}
     path.write_text(file_text(head, rows), "utf-8")
     return path
 
 
-def file_text(head: Mapping[str, str], figures: Mapping[str, Any]) -> str:
+def file_text(head: Mapping[str, Any], figures: Mapping[str, Any]) -> str:
     """A file's JSON, a line for each figure."""
     lines = [f" {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}," for key, value in head.items()]
     rows = [f"  {json.dumps(key)}: {json.dumps(one, ensure_ascii=False)}" for key, one in figures.items()]

@@ -1,7 +1,7 @@
 """Writes docs/results.md from the figures in benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_times}` and `{speed_rates}` are tables of all of speed.json.
+`{speed_times}` and `{speed_rates}` are tables of all of speed.json, and `{speed_run}` says how it was made.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.record import FOLDER, load_figures
+from benchmarks.record import FOLDER, Conditions, load_figures
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
@@ -35,7 +35,14 @@ def filled(text: str) -> str:
         AttributeError: A field names a figure that its file lacks.
     """
     times, rates = speed_tables()
-    return text.format(**load_figures(), speed_times=times, speed_rates=rates)
+    return text.format(**load_figures(), speed_times=times, speed_rates=rates, speed_run=speed_run())
+
+
+def speed_run(folder: Path = FOLDER) -> str:
+    """Where the figures of speed.json come from, in sentences; what the file does not tell is not told."""
+    kept = json.loads((folder / "speed.json").read_text("utf-8"))
+    origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
+    return f"{Conditions(**kept['conditions'])} {origin}" if "conditions" in kept else origin
 
 
 def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:

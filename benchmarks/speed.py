@@ -11,17 +11,19 @@ tracker: a frame with two hands, for each kind of capture, of the true hands and
     calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
     initialized, and the longest of five frames after a second of darkness.
 labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
-paper: the same by the paper's network (trained, with --cnn), and its images.
+paper: the same by the paper's network (trained, with --cnn), one view of a hand, which is all that is tried
+    where the first one fits, and its images.
 commands: `handsim label` and `handsim track` of captures of 24 and 1,200 frames, and `handsim label --help`.
 training: images that the paper's network learns from, alone and beside a busy process.
 pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
     pictures; a plain pyrender loop and MuJoCo's renderer.
 generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy and SciPy, from nothing, and
-    from eight starts.
+solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy, SciPy, and mink where it is
+    installed (`pip install --constraint constraints.txt "mink[daqp]"`), from nothing, and from eight starts.
 rays: lines of sight past a hand by our kernel and by `mj_multiRay`.
 
-Run it where nothing else runs. --quick tries every part with a few frames and one seed.
+Run it where nothing else runs. --quick tries every part with a few frames and one seed. The conditions of the
+run are printed and saved with its figures: seeds, what was left out, processors, threads and load.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ from benchmarks.agreement import blocked_rays
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
 from benchmarks.paper.trials import hide_points
-from benchmarks.record import Figures, describe, run, save_figures, timed
+from benchmarks.record import Conditions, Figures, describe, run, save_figures, timed
 from benchmarks.tracking import calibrated_users, labeler, twin
 from gloves import GloveFit, Take, load_layout, write_capture
 from gloves.fit import attach_markers
@@ -56,7 +58,6 @@ from gloves.optics.visibility import free_rays
 from handsim import HandModel, join_qpos, load_rig
 from poses.shapes import sample_valid_angles
 from track import Tracker
-from track.tracker import warm_up
 from train import (
     CNNConfig,
     Corruption,
@@ -70,6 +71,7 @@ from train import (
 )
 from train.data.batches import draw_batch
 from train.fabric import start_fabric
+from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.networks import labeler_of, new_network
 from train.labelers.protocol import torch_threads
 from train.labelers.storage import OnnxLabeler, export_onnx, load_network
@@ -144,7 +146,7 @@ def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray])
 def tracker(speeds: Speeds) -> None:
     takes = {kind: [twin(kind, speeds.some(1200, 120), seed) for seed in speeds.seeds] for kind in KINDS}
     for kind, some in takes.items():
-        warm_up(nominal_users(some[0]), labeler())
+        Tracker(nominal_users(some[0]), labeler()).warm_up()
         key = kind.replace("-", "_")
         true = [follow(take, true_users(take)) for take in some]
         speeds.times(f"{key}_true", f"a frame of {kind}, two true hands", np.concatenate(true))
@@ -257,7 +259,12 @@ def paper(speeds: Speeds) -> None:
     with tempfile.TemporaryDirectory() as folder:
         onnx = exported(network, names, folder)
         label(speeds, "cnn_onnx", f"the paper's network, onnxruntime, {how}", onnx, hands)
-    label(speeds, "cnn", f"the paper's network, torch, {how}", labeler_of(network, names), hands)
+    ours = labeler_of(network, names)
+    label(speeds, "cnn", f"the paper's network, torch, {how}", ours, hands)
+    assert isinstance(ours, CNNLabeler)
+    upright = np.eye(3)[None]
+    views = each_time(lambda hand: ours.predict(hand[None], np.ones((1, len(hand)), bool), upright), hands)
+    speeds.times("cnn_view", "one hand in one view, the paper's network, torch", views)
     images = torch.rand(8, 1, 52, 52)
     with torch.inference_mode():
         for count, key in ((1, "image"), (8, "eight_images")):
@@ -413,10 +420,31 @@ def main(
     torch.set_flush_denormal(True)
     print(describe("mujoco", "numba", "torch"))
     speeds = Speeds(seeds[:1] if quick else seeds, cnn, quick=quick)
+    load = os.getloadavg()[0]
     for name in only:
         speeds.begin(name)
         globals()[name](speeds)
-    save_figures(save, speeds.figures)
+    sections = [name for name in get_args(Section) if name not in only]
+    missing = [f"the sections {', '.join(sections)}"] if sections else []
+    if "solvers" in only and not inverse_kinematics.HAS_MINK:
+        missing.append("mink")
+    if "paper" in only and cnn is None:
+        missing.append("trained weights of the paper's network")
+    conditions = Conditions(
+        seeds=speeds.seeds,
+        is_quick=quick,
+        left_out=tuple(missing),
+        processors=len(os.sched_getaffinity(0)),
+        vectors=torch.backends.cpu.get_cpu_capability(),
+        threads={
+            "torch": str(torch.get_num_threads()),
+            "OpenBLAS": os.environ.get("OPENBLAS_NUM_THREADS", "as many as processors"),
+            "OpenMP": os.environ.get("OMP_NUM_THREADS", "as many as processors"),
+        },
+        load=(round(load, 2), round(os.getloadavg()[0], 2)),
+    )
+    print(f"\n{conditions}")
+    save_figures(save, speeds.figures, conditions=conditions)
 
 
 if __name__ == "__main__":

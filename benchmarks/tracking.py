@@ -41,7 +41,6 @@ from benchmarks.paper.trials import initialization_times, recovery_times
 from benchmarks.record import Figures, describe, resident_memory, run, save_figures
 from gloves import GloveFit, Take
 from track import Tracker, calibrate
-from track.tracker import warm_up
 from train import Labeler, load_labeler, simulate_take
 from train.simulation.scenes import KINDS, CalibrationTakeConfig, SimulatedKind
 from train.simulation.takes import simulate_calibration
@@ -235,7 +234,7 @@ def main(
     print(describe("numba", "scipy", "torch"))
     takes = {f"{kind} {seed}": twin(kind, frames, seed) for seed in seeds for kind in kinds}
     for take in takes.values():
-        warm_up(nominal_users(take), labeler())
+        Tracker(nominal_users(take), labeler()).warm_up()
     work = {
         "calibrated": lambda: calibrated(takes, seeds[0], free),
         "drums": lambda: drums(takes, seeds[0]),

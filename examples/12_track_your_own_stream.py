@@ -21,6 +21,7 @@ from train import load_labeler
 def main() -> None:
     hands = [attach("dense19", HandModel.named("M", side=side)) for side in ("right", "left")]
     tracker = Tracker(hands, load_labeler("dense19"))
+    tracker.warm_up()  # the first frames would otherwise wait, and be dropped
     with TemporaryDirectory() as folder:
         with (
             open_source("own_stream:Simulated?frames=240") as source,
@@ -33,7 +34,8 @@ def main() -> None:
                 sinks.send(frame, tracked)
                 recorder.add(frame, tracked)
         print(f"{load_take(Path(folder) / 'live.npz').num_frames} frames recorded")
-        print(f"frames missing: {source.counts['missing_frames']}")
+        counts = source.counts
+        print(f"frames missing: {counts['missing_frames']}, dropped: {counts['dropped_frames']}")
 
 
 if __name__ == "__main__":

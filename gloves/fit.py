@@ -32,7 +32,6 @@ _DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
 # From the wanted place of a marker (1) back to where it was designed (0), and to the middle of its bone (-1).
 _WAY_BACK: Final = (1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0)
-_SIDEWAYS: Final = np.deg2rad(60.0)  # from the back of a bone
 _LONGEST_SLIP: Final = 0.025  # [m]
 _SLACK: Final = 1e-9  # of barycentric weights, so that a ray through an edge meets a face
 
@@ -240,9 +239,9 @@ def vary_layout(
 
     On the palm markers shift along and across by half of `along`.
     """
+    draws = np.clip(rng.standard_normal((layout.num_markers, 3)), -2.0, 2.0).tolist()
 
-    def moved(marker: MarkerPlace) -> MarkerPlace:
-        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0).tolist()
+    def moved(marker: MarkerPlace, slip: float, roll: float, side: float) -> MarkerPlace:
         palm = marker.bone == BONE_NAMES[PALM]
         return dataclasses.replace(
             marker,
@@ -251,7 +250,8 @@ def vary_layout(
             across=marker.across + 0.5 * along * side if palm else 0.0,
         )
 
-    return dataclasses.replace(layout, markers=tuple(moved(marker) for marker in layout.markers))
+    moves = zip(layout.markers, draws, strict=True)
+    return dataclasses.replace(layout, markers=tuple(moved(marker, *draw) for marker, draw in moves))
 
 
 def wear(
@@ -259,9 +259,14 @@ def wear(
 ) -> Attachment:
     """Put on a glove with random shifts (`vary_layout`).
 
-    A shift that would carry a marker off the skin of its digit is shortened until it does not.
+    A shift is shortened until it carries its marker neither off the skin of its digit nor far over the hand,
+    as from the palm around the thumb's muscle.
     """
-    return _settled(layout, vary_layout(layout, along=along, around=around, rng=rng), model)
+    wanted, designed = (
+        vary_layout(layout, along=along, around=around, rng=rng),
+        _settled(layout, layout, model),
+    )
+    return _settled(designed.layout, wanted, model, designed.points)
 
 
 def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
@@ -272,33 +277,27 @@ def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
     return GloveFit(model, _settled(layout, layout, model))
 
 
-def _settled(layout: MarkerLayout, wanted: MarkerLayout, model: HandModel) -> Attachment:
-    """The glove with each marker at its wanted place, or on the way from there to where it was designed."""
+def _settled(
+    layout: MarkerLayout,
+    wanted: MarkerLayout,
+    model: HandModel,
+    designed: Float[np.ndarray, "M 3"] | None = None,
+) -> Attachment:
+    """The glove with each marker at its wanted place, or on the way from there to its place in a layout.
+
+    Markers are within `_LONGEST_SLIP` of the `designed` points [m], if these are given.
+    """
     markers, missed = list(wanted.markers), list(range(layout.num_markers))
     for share in _WAY_BACK:
         for index in missed:
             markers[index] = _on_the_way(layout.markers[index], wanted.markers[index], share)
         worn, missed, _ = _put_on(markers, wanted, model)
-        if share > 0.0 and wanted is not layout:
-            missed = sorted({*missed, *_leaps(layout, worn, model)})
+        if designed is not None:
+            slips = np.linalg.norm(worn.points - designed, axis=1)
+            missed = sorted({*missed, *np.flatnonzero(slips > _LONGEST_SLIP).tolist()})
         if not missed:
             return dataclasses.replace(worn, layout=dataclasses.replace(wanted, markers=tuple(markers)))
     return attach_markers(layout, model)
-
-
-def _leaps(layout: MarkerLayout, worn: Attachment, model: HandModel) -> list[int]:
-    """Markers that a small slip carries far over the skin, as between the palm and the thumb's muscle."""
-    broad = (BONE_NAMES[PALM], "thumb_metacarpal")
-    tried = [
-        index
-        for index, marker in enumerate(layout.markers)
-        if marker.bone in broad and abs(marker.around) > _SIDEWAYS
-    ]
-    if not tried:
-        return []
-    designed, missed, _ = _put_on(layout.markers, layout, model)
-    moved = np.linalg.norm(worn.points - designed.points, axis=1)
-    return [index for index in tried if index not in missed and moved[index] > _LONGEST_SLIP]
 
 
 def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
@@ -334,18 +333,31 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
     found, weights = np.full(len(origins), -1), np.empty((len(origins), 3))
     nearest = np.full(len(origins), np.inf)
     first, second, offset, across, turned = np.empty((5, 3))
+    corners, reach = np.empty((3, len(faces))), np.empty(len(faces))
     for f in range(len(faces)):
         corner = vertices[faces[f, 0]]
         for i in range(3):
+            corners[i, f] = corner[i]
             first[i] = vertices[faces[f, 1], i] - corner[i]
             second[i] = vertices[faces[f, 2], i] - corner[i]
-        # a line through a triangle comes nearer to its first corner than the longer edge there
-        reach = 1.01 * max(_dot(first, first), _dot(second, second))
-        for r in range(len(origins)):
-            for i in range(3):
-                offset[i] = origins[r, i] - corner[i]
-            if _dot(offset, offset) - _dot(offset, directions[r]) ** 2 > reach:
+        # A line through a triangle comes nearer to its first corner than the longer edge there.
+        reach[f] = 1.01 * max(_dot(first, first), _dot(second, second))
+    away = np.empty(len(faces))  # by how much more a line passes the first corner, squared; in one plain loop
+    for r in range(len(origins)):
+        x, y, z = origins[r]
+        dx, dy, dz = directions[r]
+        for f in range(len(faces)):
+            ox, oy, oz = x - corners[0, f], y - corners[1, f], z - corners[2, f]
+            along = ox * dx + oy * dy + oz * dz
+            away[f] = ox * ox + oy * oy + oz * oz - along * along - reach[f]
+        for f in range(len(faces)):
+            if away[f] > 0.0:
                 continue
+            corner = vertices[faces[f, 0]]
+            for i in range(3):
+                first[i] = vertices[faces[f, 1], i] - corner[i]
+                second[i] = vertices[faces[f, 2], i] - corner[i]
+                offset[i] = origins[r, i] - corner[i]
             _cross(directions[r], second, across)
             determinant = _dot(first, across)
             if determinant >= 0.0:  # on the way in, or along the face

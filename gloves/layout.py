@@ -151,8 +151,9 @@ class MarkerLayout:
             raise LayoutError(
                 f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
             )
-        for index, name in enumerate(self.names):
-            if name in self.names[:index]:
+        names = self.names
+        for index, name in enumerate(names):
+            if name in names[:index]:
                 raise LayoutError(f"two markers are named '{name}'; every marker needs a name of its own")
         low, high = _RADIUS_RANGE
         if not low <= self.radius <= high:

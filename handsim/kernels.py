@@ -99,10 +99,8 @@ def point_distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -
 
 
 @kernel(inline=True)
-def segment_distance_squared(
-    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> float:
-    """Squared distance [m^2] between the segments p-q and a-b, each point (3,) [m].
+def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
+    """Squared distance [m^2] between the segments p-q and a-b, each point an array (3,) or a tuple [m].
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
     """
@@ -139,6 +137,50 @@ def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float
 
 
 @kernel
+def write_matrix_quaternions(
+    matrices: Float[np.ndarray, "T 3 3"], quaternions: Float[np.ndarray, "T 4"]
+) -> bool:
+    """Write the unit quaternions (wxyz) of rotation matrices, and whether all of these are rotations.
+
+    Klumpp, Singularity-free extraction of a quaternion from a direction-cosine matrix (1976): the largest of
+    the four components is computed first, and has no sign of its own.
+    """
+    for n in range(len(matrices)):
+        m, q = matrices[n], quaternions[n]
+        trace = m[0, 0] + m[1, 1] + m[2, 2]
+        i = 0
+        for other in range(1, 3):
+            if m[other, other] > m[i, i]:
+                i = other
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if m[i, i] >= trace:
+            q[1 + i] = 1.0 - trace + 2.0 * m[i, i]
+            q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+            q[0] = m[k, j] - m[j, k]
+        else:
+            q[1], q[2], q[3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+            q[0] = 1.0 + trace
+        length = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3] + q[0] * q[0])
+        for row in range(4):
+            q[row] /= length
+        determinant = (
+            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+            - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+            + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+        )
+        is_rotation = determinant > 0.0
+        for row in range(3):
+            for other in range(3):
+                product = 0.0 if row != other else -1.0
+                for column in range(3):
+                    product += m[row, column] * m[other, column]
+                is_rotation = is_rotation and abs(product) < 1e-13
+        if not is_rotation:  # also where it is NaN
+            return False
+    return True
+
+
+@kernel
 def write_axis_angle_matrix(
     matrix: Float[np.ndarray, "_ _"], axis: Float[np.ndarray, "3"], angle: float
 ) -> None:
@@ -167,24 +209,6 @@ def multiply_rotations(
         x, y, z = first[i, 0], first[i, 1], first[i, 2]
         for j in range(3):
             product[i, j] = x * second[0, j] + y * second[1, j] + z * second[2, j]
-
-
-@kernel
-def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float) -> None:
-    """Rotate a frame in place about an axis of its own (Rodrigues' formula on its rows).
-
-    Args:
-        rotation: Orientation (3, 3) of the frame, overwritten.
-        axis: Unit vector (3,) in the frame's own coordinates.
-    """
-    sine, cosine = np.sin(angle), np.cos(angle)
-    x, y, z = axis[0], axis[1], axis[2]
-    for row in range(3):
-        a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
-        along = (1.0 - cosine) * (a * x + b * y + c * z)
-        rotation[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
-        rotation[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
-        rotation[row, 2] = cosine * c + sine * (a * y - b * x) + along * z
 
 
 @kernel
@@ -401,20 +425,30 @@ def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: An
         posed: Where the axes' ends in the world go (3, 2, 3) [m].
         scratch: Room for the arithmetic (4, 3).
     """
-    frame, origin = scratch[:3], scratch[3]
-    frame[:] = wrist[0]
-    origin[:] = wrist[1]
-    joint = 0
-    for bone in range(3):
-        for row in range(3):
-            for column in range(3):
-                origin[row] += frame[row, column] * digit.offsets[bone, column]
-        multiply_rotations(frame, digit.rotations[bone], frame)
-        for _ in range(2 if bone == 0 else 1):
-            rotate_about_axis(frame, digit.axes[joint], angles[joint])
-            joint += 1
-        for end in range(2):
-            for row in range(3):
-                posed[bone, end, row] = origin[row]
-                for column in range(3):
-                    posed[bone, end, row] += frame[row, column] * digit.ends[bone, end, column]
+    for joint in range(4):
+        scratch[joint, 0], scratch[joint, 1] = np.sin(angles[joint]), np.cos(angles[joint])
+    for row in range(3):  # a row of the frames and of the origins needs no other
+        a, b, c, origin = wrist[0][row, 0], wrist[0][row, 1], wrist[0][row, 2], wrist[1][row]
+        joint = 0
+        for bone in range(3):
+            offset, local, ends = digit.offsets, digit.rotations, digit.ends
+            origin = origin + a * offset[bone, 0] + b * offset[bone, 1] + c * offset[bone, 2]
+            a, b, c = (
+                a * local[bone, 0, 0] + b * local[bone, 1, 0] + c * local[bone, 2, 0],
+                a * local[bone, 0, 1] + b * local[bone, 1, 1] + c * local[bone, 2, 1],
+                a * local[bone, 0, 2] + b * local[bone, 1, 2] + c * local[bone, 2, 2],
+            )
+            for _ in range(2 if bone == 0 else 1):  # Rodrigues' formula, about an axis of the frame's own
+                sine, cosine = scratch[joint, 0], scratch[joint, 1]
+                x, y, z = digit.axes[joint, 0], digit.axes[joint, 1], digit.axes[joint, 2]
+                along = (1.0 - cosine) * (a * x + b * y + c * z)
+                a, b, c = (
+                    cosine * a + sine * (b * z - c * y) + along * x,
+                    cosine * b + sine * (c * x - a * z) + along * y,
+                    cosine * c + sine * (a * y - b * x) + along * z,
+                )
+                joint += 1
+            for end in range(2):
+                posed[bone, end, row] = (
+                    origin + a * ends[bone, end, 0] + b * ends[bone, end, 1] + c * ends[bone, end, 2]
+                )

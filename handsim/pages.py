@@ -54,15 +54,16 @@ _PICTURES: Final[dict[str, Any]] = {
     "ytick.color": Paint.LINE,
     "xtick.labelcolor": Paint.SOFT,
     "ytick.labelcolor": Paint.SOFT,
-    "figure.facecolor": Paint.CARD,  # the page's card, light on dark pages too, so that no frame shows
+    "figure.facecolor": Paint.CARD,  # the page's card, which dark pages invert with the figure
     "savefig.facecolor": Paint.CARD,
     "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
 }
 _STYLE: Final = """
 :root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;
   --line: #d9dde3; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #f4f5f7; --line: #3a3f48; }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #212327; --line: #3a3f48; }
+  div.card { --card: #f4f5f7; --line: #d9dde3; filter: invert(.9) hue-rotate(180deg); }
 }
 body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: var(--paper);
   color: var(--ink); font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }

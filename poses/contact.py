@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim.hand.capsules import bounding_spheres, overlap_between
+from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
-from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared
+from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared, squared_distance
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles
@@ -34,8 +34,6 @@ class Digit(NamedTuple):
 
     capsules: NDArray[np.int64]
     """Indices of the digit's capsules in the hand (3,)."""
-    others: NDArray[np.int64]
-    """Indices of the hand's other capsules (K - 3,)."""
     offsets: NDArray[np.float64]
     """Origin of each bone in its parent's frame (3, 3) [m]."""
     rotations: NDArray[np.float64]
@@ -47,7 +45,7 @@ class Digit(NamedTuple):
     radii: NDArray[np.float64]
     """Radii of the digit's capsules (3,) [m]."""
     meets: NDArray[np.bool_]
-    """Capsules of the hand that each capsule of the digit may collide with (3, K)."""
+    """Capsules of the hand's other parts that each capsule of the digit may collide with (3, K)."""
     reach: float
     """Largest distance of the digit's skin from its first joint [m]."""
 
@@ -149,15 +147,13 @@ def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any:
     """Share (T,) of its path that a digit can follow before it meets an obstacle."""
     share = np.ones(len(paths.start))
-    near = np.empty(len(obstacles.radii), dtype=np.int64)
-    centers, sizes = np.empty((len(near), 3)), np.empty(len(near))
+    near, spheres = np.empty((len(obstacles.radii), 9)), np.empty((7, len(obstacles.radii)))
     angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((4, 3))
     for frame in range(len(paths.start)):
         wrist = paths.rotations[frame], paths.positions[frame]
-        count = _within_reach(wrist, parts, obstacles, frame, near)
+        count = _within_reach(wrist, parts, obstacles, frame, near, spheres)
         if count == 0:
             continue
-        bounding_spheres(obstacles.segments[frame], obstacles.radii, centers, sizes)
         bend = np.abs(paths.goal[frame] - paths.start[frame]).sum()
         steps = max(1, int(np.ceil(bend / _STEP)))
         low, high = 0.0, 1.0
@@ -168,7 +164,7 @@ def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any
                     paths.goal[frame, joint] - paths.start[frame, joint]
                 )
             pose_digit_axes(wrist, angles, parts, bones, scratch)
-            if _blocked(bones, parts, obstacles, frame, near[:count], (centers, sizes)):
+            if _blocked(bones, count, near, spheres):
                 high = min(tried, 1.0 - 1e-9)
             else:
                 low = tried
@@ -179,8 +175,14 @@ def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any
 
 
 @kernel
-def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> int:
-    """Write the indices of the obstacles that a digit can reach into `near` (K,), and count them."""
+def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any, spheres: Any) -> int:
+    """Count the obstacles that a digit can reach, and write what `_blocked` needs of them.
+
+    Args:
+        near: Both ends of each obstacle's axis (K, :6) [m], and the squared distances (K, 6:) [m^2] at which
+            the axes of the digit's three bones meet it; -1 for a bone that may not meet it.
+        spheres: Centers (:3, K) [m] of bounding spheres, and the same squares (3:6, K) for these.
+    """
     knuckle = wrist[1].copy()
     for row in range(3):
         for column in range(3):
@@ -189,28 +191,37 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any)
     for j in range(len(obstacles.radii)):
         reach = parts.reach + obstacles.radii[j]
         a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
-        if segment_distance_squared(knuckle, knuckle, a, b) < reach * reach:
-            near[count] = j
-            count += 1
+        if segment_distance_squared(knuckle, knuckle, a, b) >= reach * reach:
+            continue
+        half = 0.5 * np.sqrt(squared_distance(a, b))
+        for i in range(3):
+            near[count, i], near[count, 3 + i], spheres[i, count] = a[i], b[i], 0.5 * (a[i] + b[i])
+            touch = parts.radii[i] + obstacles.radii[j] - obstacles.press
+            apart = touch + half + 0.5 * np.sqrt(squared_distance(parts.ends[i, 0], parts.ends[i, 1]))
+            near[count, 6 + i] = touch * touch if obstacles.meets[i, j] else -1.0
+            spheres[3 + i, count] = apart * apart if obstacles.meets[i, j] else -1.0
+        count += 1
     return count
 
 
 @kernel
-def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any, spheres: Any) -> bool:
-    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`.
+def _blocked(bones: Any, count: int, near: Any, spheres: Any) -> bool:
+    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of `count` obstacles.
 
-    Obstacles whose bounding spheres, centers (K, 3) [m] and radii (K,) [m], it does not meet cannot be met.
+    `near` and `spheres` are those of `_within_reach`; the last row of `spheres` is room for the arithmetic.
     """
-    own, size = np.empty((3, 3)), np.empty(3)
-    bounding_spheres(bones, parts.radii, own, size)
-    for i in range(3):
-        for j in near:
-            apart = size[i] + spheres[1][j] - obstacles.press
-            x, y, z = own[i, 0] - spheres[0][j, 0], own[i, 1] - spheres[0][j, 1], own[i, 2] - spheres[0][j, 2]
-            if obstacles.meets[i, j] and x * x + y * y + z * z < apart * apart:
-                reach = parts.radii[i] + obstacles.radii[j] - obstacles.press
-                a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
-                if segment_distance_squared(bones[i, 0], bones[i, 1], a, b) < reach * reach:
+    for i in range(2, -1, -1):  # the outer bones meet most
+        p = (bones[i, 0, 0], bones[i, 0, 1], bones[i, 0, 2])
+        q = (bones[i, 1, 0], bones[i, 1, 1], bones[i, 1, 2])
+        for n in range(count):
+            x = 0.5 * (p[0] + q[0]) - spheres[0, n]
+            y = 0.5 * (p[1] + q[1]) - spheres[1, n]
+            z = 0.5 * (p[2] + q[2]) - spheres[2, n]
+            spheres[6, n] = x * x + y * y + z * z - spheres[3 + i, n]
+        for n in range(count):
+            if spheres[6, n] < 0.0:  # obstacles whose bounding spheres are not met cannot be met
+                a, b = (near[n, 0], near[n, 1], near[n, 2]), (near[n, 3], near[n, 4], near[n, 5])
+                if segment_distance_squared(p, q, a, b) < near[n, 6 + i]:
                     return True
     return False
 
@@ -273,6 +284,8 @@ def close_fingers(
     rotations, positions = quaternion_matrix(opened[busy, 3:7]), opened[busy, :3]
     own = model.capsules.posed(model.forward_kinematics(opened[busy]))
     others = other.capsules.posed(other.forward_kinematics(other_qpos[busy]))
+    segments = np.concatenate([others, own], axis=1)
+    radii = np.concatenate([other.capsules.radii, model.capsules.radii])
     all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
     for press, joints in _STAGES:
         for digit in _ORDER:
@@ -284,16 +297,12 @@ def close_fingers(
             share[busy] = search_closing(
                 DigitPaths(rotations, positions, angles[busy, columns], goal[busy]),
                 parts,
-                Obstacles(
-                    np.concatenate([others, own[:, parts.others]], axis=1),
-                    np.concatenate([other.capsules.radii, model.capsules.radii[parts.others]]),
-                    np.concatenate([all_of_other, parts.meets[:, parts.others]], axis=1),
-                    press,
-                ),
+                Obstacles(segments, radii, np.concatenate([all_of_other, parts.meets], axis=1), press),
             )
             share = smooth_below(share, window) * strength[:, digit]
             angles[:, columns] += share[:, None] * (goal - angles[:, columns])
-            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, columns], parts)
+            mine = len(other.capsules.radii) + parts.capsules
+            segments[:, mine] = pose_digit((rotations, positions), angles[busy, columns], parts)
     return angles
 
 
@@ -316,13 +325,13 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
     """A digit of a hand (0: thumb) as the compiled searches need it."""
     capsules, skeleton = model.capsules, model.skeleton
     first = 1 + 3 * digit
-    indices = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
+    indices = np.flatnonzero((capsules.bones >= first) & (capsules.bones < first + 3))
     meets = np.zeros((len(capsules.bones),) * 2, dtype=bool)
     pairs = capsules.touching_pairs()
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
+    meets[:, indices] = False
     return Digit(
         capsules=indices,
-        others=np.setdiff1d(np.arange(len(capsules.bones)), indices),
         offsets=skeleton.offsets[first : first + 3],
         rotations=skeleton.rotations[first : first + 3],
         axes=skeleton.axes[4 * digit : 4 * digit + 4],

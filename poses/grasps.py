@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple
 
 import mujoco
@@ -95,19 +96,24 @@ class GraspScene:
         self, angles: Float[np.ndarray, "T 20"], T_wrist_object: Float[np.ndarray, "T 4 4"]
     ) -> NDArray[np.float64]:
         """Deepest overlap [m] of hand and object in every frame (T,)."""
-        data = mujoco.MjData(self.mj_model)
-        qpos = np.concatenate([angles, transform_poses(T_wrist_object)], axis=1)
-        depth = np.zeros(len(qpos))
-        first_object = self.object_geoms[0]
-        for frame, row in enumerate(qpos):
-            data.qpos[:] = row
-            mujoco.mj_kinematics(self.mj_model, data)
-            mujoco.mj_collision(self.mj_model, data)
+        model = self._without_own_contacts
+        data = mujoco.MjData(model)
+        pose, depth = data.qpos, np.zeros(len(angles))
+        for frame, row in enumerate(np.concatenate([angles, transform_poses(T_wrist_object)], axis=1)):
+            pose[:] = row
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
             if data.ncon:
-                contact = data.contact
-                with_object = contact.geom.max(axis=1) >= first_object
-                depth[frame] = max(0.0, -float(contact.dist[with_object].min(initial=0.0)))
+                depth[frame] = max(0.0, -float(data.contact.dist.min()))
         return depth
+
+    @cached_property
+    def _without_own_contacts(self) -> mujoco.MjModel:
+        """The model without contacts of the hand with itself."""
+        model = copy.copy(self.mj_model)
+        model.geom_conaffinity[self.hand_geoms] = 0
+        model.geom_contype[self.object_geoms] = 0
+        return model
 
 
 @lru_cache(maxsize=16)

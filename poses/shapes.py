@@ -246,15 +246,18 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
     return is_valid(load_model(model), check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
 
 
+@functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows."""
+    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
     valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
     if not valid.any():
         raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
-    return np.asarray(tries[valid.argmax()])
+    resting: NDArray[np.float64] = tries[valid.argmax()]
+    resting.setflags(write=False)
+    return resting
 
 
 def make_valid(
@@ -270,6 +273,8 @@ def make_valid(
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
     for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
+        if not len(todo):
+            break
         end = np.where(moving, resting, result[todo])
         helps = is_valid(model, end)
         end, target = end[helps], result[todo[helps]]

@@ -185,9 +185,13 @@ class _Noise:
     ) -> NDArray[np.float64]:
         """Noise (K, n) of scale (n,): `common` times a lasting part plus `wander` times one for each beat."""
         size = (self.count, len(scale))
-        lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
-        new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
-        return scale * (common * lasting + wander * new)
+        lasting = self.rng.standard_normal((1, size[1]) if self.together else size)
+        new = self.rng.standard_normal(size)
+        if wander == 0.0:
+            return scale * (common * lasting.clip(-2.0, 2.0)) + np.zeros(size)
+        if common == 0.0:
+            return scale * (wander * new.clip(-2.0, 2.0))
+        return scale * (common * lasting.clip(-2.0, 2.0) + wander * new.clip(-2.0, 2.0))
 
 
 def _sketch_fingers(

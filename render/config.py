@@ -12,6 +12,7 @@ import numpy as np
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
+from handsim.space.transforms import UpAxis
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.depth_sensor import SENSORS, DepthSensor
 from render.frames import PASSES
@@ -88,6 +89,9 @@ class RenderConfig(Settings):
     """Frames that are written together."""
     seed: Annotated[int, Limits(0)] = 0
     """Seed of all random choices."""
+    up: UpAxis = "z"
+    """The axis of the take, and of your own cameras, that points up; y for captures of Motive's default. The
+    truth of pictures has z up."""
 
     def __post_init__(self) -> None:
         named: dict[str, Any] = {"background": Backgrounds.of(self.background)}
@@ -108,14 +112,37 @@ class RenderConfig(Settings):
             check_choice(name, PASSES, noun="pass")
         if not self.passes:
             raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
+        self._check_used()
+
+    def _check_used(self) -> None:
+        """Refuse settings of pictures that are not drawn."""
+        unused = {
+            "rgb": {
+                "tones": self.tones != ALL_TONES,
+                "background": self.background != Backgrounds(),
+                "color_sensor": self.color_sensor not in (None, ExposureConfig()),
+                "painter": self.painter == "opengl",
+                "shutter": self.shutter is not None,
+            },
+            "depth": {"depth_sensor": self.depth_sensor not in ("auto", None)},
+        }
+        for name, fields in unused.items():
+            given = [field for field, is_given in fields.items() if is_given and name not in self.passes]
+            if given:
+                passes = ", ".join(self.passes)
+                raise ArgumentError(
+                    f"given {', '.join(given)} and the passes {passes}, expected {name} among them"
+                )
 
     def resolved(self) -> RenderConfig:
         """The same without auto: the painter of this machine, and the depth sensor of the placement."""
         painter, sensor, view = self.painter, self.depth_sensor, self.view
         if painter == "auto":  # without colors there is no need to look
             painter = choose_painter() if "rgb" in self.passes else "compiled"
-        if sensor == "auto":
-            set_far = view.distance is not None and view.distance[0] >= _FAR and view.placement != "head"
+        if sensor == "auto" and "depth" not in self.passes:
+            sensor = None
+        elif sensor == "auto":
+            set_far = view.distance is not None and view.distance[0] >= _FAR
             far = view.cameras is None and (view.placement == "rig" or set_far)
             sensor = DepthSensor((FAR_SENSOR if far else NEAR_SENSOR,))
         return dataclasses.replace(self, painter=painter, depth_sensor=sensor)

@@ -132,19 +132,25 @@ def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags)
     `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
     """
     height, width = disparity.shape
-    fixed = np.empty((height, width), np.int16)
+    border = _DOTS[-1]  # around the picture, so that no window ends at its edge
+    fixed = np.empty((height + 2 * border, width + 2 * border), np.int16)
     for row in range(height):
+        inner = fixed[row + border, border : border + width]
         for column in range(width):
-            fixed[row, column] = int(min(disparity[row, column] * np.float32(_FIXED), np.float32(32767.0)))
+            inner[column] = int(min(disparity[row, column] * np.float32(_FIXED), np.float32(32767.0)))
+        fixed[row + border, :border] = inner[0]
+        fixed[row + border, border + width :] = inner[width - 1]
+    for row in range(border):
+        fixed[row] = fixed[border]
+        fixed[height + border + row] = fixed[height + border - 1]
     for row in range(height):
         for column in range(width):
             if not kept[row, column]:
                 continue
-            middle, agreed = fixed[row, column], -1
+            middle, agreed = fixed[row + border, column + border], -1
             for down in _DOTS:
                 for right in _DOTS:
-                    i, j = min(max(row + down, 0), height - 1), min(max(column + right, 0), width - 1)
-                    agreed += abs(fixed[i, j] - middle) <= most
+                    agreed += abs(fixed[row + border + down, column + border + right] - middle) <= most
             # Where all agree, nothing is lost.
             kept[row, column] = agreed >= min(needed[row // 3, column // 3], len(_DOTS) ** 2 - 1)
 
@@ -404,12 +410,13 @@ def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float)
     """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
     height, width = normals.shape[:2]
     cosines = np.zeros((height, width), np.float32)
+    across = (np.arange(width) + 0.5 - cx) / fx
     for row in range(height):
         y = (row + 0.5 - cy) / fy
         for column in range(width):
             nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
             if nx != 0.0 or ny != 0.0 or nz != 0.0:
-                x = (column + 0.5 - cx) / fx
+                x = across[column]
                 along = -(x * nx + y * ny + nz)
                 if along > 0.0:
                     cosines[row, column] = along / np.sqrt(x * x + y * y + 1.0)

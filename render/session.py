@@ -135,8 +135,9 @@ class Drawing:
     def __init__(self, subject: Subject, config: RenderConfig) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
-        self.subject, self.take, self.config = subject, subject.take, config
-        self.viewpoints = Viewpoints(config.view, subject.take, rng=SpawnKey.VIEWPOINTS.rng(config.seed))
+        self.subject, self.config = subject.upright(config.up), config
+        self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
+        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up)
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
@@ -432,6 +433,8 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text
         settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
+    if drawing.config.up == "z":  # as in records of earlier versions
+        del settings["up"]
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:

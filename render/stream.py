@@ -232,7 +232,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
         config = configured(config, None, {} if seed is None else {"seed": seed})
-        if config.depth_sensor == "auto":  # of a stream it measures near hands
+        if config.depth_sensor == "auto" and "depth" in config.passes:  # of a stream it measures near hands
             config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
         self.config = config.resolved()
         self.seed = self.config.seed
@@ -245,7 +245,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         if takes is not None:
             check_type("takes", takes, (Take, str, Path, list, tuple), "a Take or its path, or several")
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
-        self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
+        self._takes = [
+            load_subject(source_of(take, model=model), seed=self.seed).upright(self.config.up)
+            for take in given
+        ]
         if len({len(one.take.hands) for one in self._takes}) > 1:
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")
         if self.config.shutter is not None and not self._takes:

@@ -108,8 +108,8 @@ def _visible(
 def _box(parts: Bytes, number: int) -> Doubles:
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     first = 1 + PARTS_A_HAND * number
-    mine = (parts >= first) & (parts < first + FOREARM)
-    left, top, width, height = cv2.boundingRect(mine.view(np.uint8))
+    mine = cv2.inRange(parts, first, first + FOREARM - 1)
+    left, top, width, height = cv2.boundingRect(mine)
     return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
 
 
@@ -146,10 +146,12 @@ class Moment:
         rows = self.take.qpos[:, number]
         if not np.isfinite(rows[self.frame]).all():
             return None
-        (before, after), share = self._around(rows, shift)
-        if before[3:7] @ after[3:7] < 0.0:
-            after = np.concatenate([after[:3], -after[3:7], after[7:]])
-        pose: Doubles = before + share * (after - before)
+        pose: Doubles = rows[self.frame].copy()
+        if shift != 0.0:
+            (before, after), share = self._around(rows, shift)
+            if before[3:7] @ after[3:7] < 0.0:
+                after = np.concatenate([after[:3], -after[3:7], after[7:]])
+            pose = before + share * (after - before)
         pose[3:7] /= np.linalg.norm(pose[3:7])
         return pose
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,7 @@ from handsim.hand.shape import (
     unpack_hand,
 )
 from handsim.motion_files.motion import read_joint_csv
-from handsim.space.transforms import rotation_quaternions
+from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
 from render.frames import Doubles
@@ -288,6 +289,17 @@ class Subject:
     def __post_init__(self) -> None:
         if not np.isfinite(self.take.qpos[..., 0]).any():
             raise ArgumentError("there is no hand in any frame, expected one to draw")
+
+    def upright(self, up: UpAxis) -> Subject:
+        """The same in a world whose z axis points up, where that of the take has another."""
+        if up == "z":
+            return self
+        take, turn = self.take, upright(up)
+        points = dataclasses.replace(take.point_list, points=take.point_list.points @ turn.T)
+        qpos, poses = turned_poses(take.qpos, turn), turned_poses(take.body_poses, turn)
+        return dataclasses.replace(
+            self, take=dataclasses.replace(take, qpos=qpos, body_poses=poses, point_list=points)
+        )
 
 
 @dataclass(frozen=True, slots=True)

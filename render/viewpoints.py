@@ -23,7 +23,7 @@ from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
 from render.frames import Doubles, Flags, Floats, Integers
 
 _OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
@@ -176,6 +176,12 @@ _ARM_DISTANCE: Final = 0.2  # least distance between its axis and a camera [m]
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
 
 
+_PLACING: Final = ("placement", "camera", "views", "share", "distance")
+"""Options that place cameras, which your own cameras do not need."""
+_UNUSED: Final = {"head": ("share", "distance"), "rig": ("views", "share", "distance")}
+"""Options that a placement has no use for."""
+
+
 @dataclass(frozen=True, slots=True)
 class ViewConfig(Settings):
     """Cameras of a take.
@@ -206,11 +212,22 @@ class ViewConfig(Settings):
     (.yml, .json), or COLMAP's (the folder of cameras.txt and images.txt)."""
 
     def check(self) -> None:
-        """Refuse a placement, a camera or views beside your own cameras, and a rig that is not used."""
-        if self.cameras is not None and (self.placement, self.camera, self.views) != ("still", "vga", 1):
+        """Refuse options that would do nothing beside your own cameras or with this placement."""
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        given = [name for name in _PLACING if getattr(self, name) != defaults[name]]
+        if self.cameras is not None and given:
             raise ArgumentError(
-                f"the cameras are those of {self.own_cameras}; leave out the placement, the camera and the "
-                "views"
+                f"the cameras are those of {self.own_cameras}; leave out the placement, the camera, the "
+                "views, the share and the distance"
+            )
+        unused = [name for name in _UNUSED.get(self.placement, ()) if name in given]
+        if unused:
+            raise ArgumentError(
+                f"given {', '.join(unused)} and the placement {self.placement}, expected another placement"
+            )
+        if self.distance is not None and "share" in given:
+            raise ArgumentError(
+                f"given share {self.share} and distance {self.distance}, expected one of them"
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
@@ -243,10 +260,13 @@ class _Path(NamedTuple):
 class Viewpoints:
     """Cameras of every frame."""
 
-    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
+    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator, up: UpAxis = "z") -> None:
         framing, own = Framing(take), config.cameras
         if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
+            if up != "z":
+                turn = rigid(upright(up), np.zeros(3))
+                cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
         else:

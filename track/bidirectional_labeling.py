@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
@@ -145,8 +143,19 @@ def _events_of(
     links = np.concatenate(
         [[order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]], axis=1
     )
-    graph = coo_array((np.ones(links.shape[1]), links), shape=(len(rows), len(rows)))
-    return _Events(points, connected_components(graph, directed=False)[1])
+    return _Events(points, _components(links, len(rows)))
+
+
+def _components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N"]:
+    """Numbers of the connected parts of a graph of N nodes; scipy.sparse.csgraph takes longer to load."""
+    least, before = np.arange(count), np.full(count, -1)
+    while (least != before).any():
+        before = least.copy()
+        for one, other in (links, links[::-1]):
+            np.minimum.at(least, before[one], before[other])
+        least = least[least]  # halves the way to a part's first node
+    numbers: NDArray[np.int64] = np.unique(least, return_inverse=True)[1]
+    return numbers
 
 
 def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "E"]:

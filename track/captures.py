@@ -104,7 +104,7 @@ def label_capture(
         number_runs(present),
         np.full(present.shape, -1, dtype=np.int16),
         rate=source.rate,
-        settings={**_named(capture), "glove": glove},
+        settings={**_named(capture, source), "glove": glove},
     )
 
     def on_count(count: int) -> None:
@@ -164,7 +164,7 @@ def track_capture(
         setup = _calibrated(record_frames(frames, setup.tracker(), progress=progress).take(source), setup)
     take = record_frames(frames, setup.tracker(), sinks, on_frame, progress).take(source)
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
-    record = {**take.settings, **_named(capture), **setup.settings}
+    record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
     if corrections is None:
         return take
@@ -219,7 +219,8 @@ def calibrate(
         tracker = Tracker([one.hand for one in done], setup.labeler)
         take = record_frames(frames, tracker, progress=on_label).take(source)
         done = calibrate_take(take, setup.start, setup.user, on_part)
-    found = kept_user(take, done, setup.user, f"from {_named(capture).get('capture', 'a capture')}", on_part)
+    name = _named(capture, source).get("capture", "a capture")
+    found = kept_user(take, done, setup.user, f"from {name}", on_part)
     for one in found.calibrations:
         if not one.is_better:
             warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
@@ -280,9 +281,10 @@ def record_frames(
     return recorder
 
 
-def _named(capture: AnyCapture) -> dict[str, str]:
-    """What a take records of the file of its capture."""
-    return {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:
+    """What a take records of the file of its capture, and of what was found in it."""
+    name = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    return {**name, **({"findings": dict(source.findings)} if source.findings else {})}
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:

@@ -21,9 +21,9 @@ from gloves.captures.formats import READABLE, read_capture
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.points import Status
 from gloves.takes.take import Take, load_take
-from handsim._checks import shown_value
+from handsim._checks import check_choice, shown_value
 from handsim.errors import ArgumentError
-from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS, Side
+from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
 
 AnyCapture = Capture | Take | str | Path
@@ -232,6 +232,11 @@ class TrackedHand:
         """Whether there is a pose."""
         return self.status is not Status.LOST
 
+    @property
+    def angles(self) -> dict[str, float]:
+        """The angle of each joint by its name [rad]; NaN where the hand is lost."""
+        return dict(zip(JOINT_NAMES, self.qpos[7:].tolist(), strict=True))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedBody:
@@ -263,6 +268,12 @@ class TrackedFrame:
     """What was wrong with the frame itself, in words; empty for most frames."""
     seconds: float = np.nan
     """Computing time of the tracker [s]; NaN where it was not measured."""
+
+    def hand(self, side: Side) -> TrackedHand:
+        """The hand of a side; an `ArgumentError` if none of that side is tracked."""
+        sides = [hand.side for hand in self.hands]
+        check_choice(side, sides, noun="hand")
+        return self.hands[sides.index(side)]
 
 
 class FrameTracker(Protocol):

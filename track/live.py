@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import monotonic
@@ -23,8 +23,8 @@ from track.frames import StreamedFrame, TrackedFrame
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
+from track.streams import NoServerError
 from track.streams.live_stream import MOST_LAG, LiveStream, open_source
-from track.tracker import warm_up
 
 _MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for such frames
@@ -97,12 +97,12 @@ def track_live(
     if out is not None:
         check_unused(growing_path(out))
     with named_steps("getting ready"):
-        warm_up(setup.user, setup.labeler)
+        setup.tracker().warm_up()
     until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()
     with (
-        open_source(address, ended=lambda: interrupted() or monotonic() >= until) as stream,
         LiveStatus() as status,
+        _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
         ExitStack() as stack,
     ):
         doubt = _Doubt(stream, status)
@@ -124,9 +124,10 @@ def track_live(
             if interrupted() or frame.arrived > until:
                 break
             tracked = tracker.step(frame.points, frame.ids, frame.time)
-            for output in outputs:
+            is_recent = not pace.catches_up(frame, stream.forgiven_until)
+            for output in outputs if is_recent else ():
                 output.send(frame, tracked)
-            pace.add(frame, stream.forgiven_until)
+            pace.add(frame, is_recent)
             if recorder is not None:
                 recorder.add(frame, tracked)
             count += not frame.silent
@@ -149,6 +150,15 @@ def track_live(
     for output in outputs:
         notes += output.notes()
     return LiveTake(take, count, (*notes, *filter(None, [stream.point_doubt])))
+
+
+def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:
+    """Open a stream as soon as its server answers."""
+    while True:
+        try:
+            return open_source(address, ended=ended)
+        except NoServerError as error:  # each try takes some seconds
+            status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
 
 
 def _measured_setup(
@@ -233,14 +243,15 @@ class _Pace:
         """A summary of the last second."""
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
-    def add(self, frame: StreamedFrame, forgiven_until: float) -> None:
-        """Add the lag of a frame, before `forgiven_until` as start-up lag."""
-        if frame.silent:
-            return
+    def catches_up(self, frame: StreamedFrame, forgiven_until: float) -> bool:
+        """Whether a frame came while hands were measured; its lag is forgiven until that time [s]."""
         now = monotonic()
-        lag = now - frame.arrived
-        is_first = not self.lags and lag > MOST_LAG and now < forgiven_until
-        (self.first_lags if is_first else self.lags).append(lag)
+        return now < forgiven_until and now - frame.arrived > MOST_LAG and not (frame.silent or self.lags)
+
+    def add(self, frame: StreamedFrame, is_recent: bool) -> None:
+        """Add the lag of a frame."""
+        if not frame.silent:
+            (self.lags if is_recent else self.first_lags).append(monotonic() - frame.arrived)
 
     def tick(self, counts: dict[str, int]) -> bool:
         """Once a second renew the summary; returns whether frames were dropped in that second."""

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from gloves.takes.take import label_names
 from handsim import __version__
 from handsim._plugins import import_extra
-from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.shape import JOINT_NAMES, Side
+from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses, joint_radii
+from handsim.space.transforms import ProgramAxes, UpAxis, program_axes, transform_poses
 from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.rigid_body import RigidTemplate
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""
 FORMATS: Final = ("json", "msgpack")
+WORLD: Final = "world"
+"""The axes of the camera system."""
 _DECIMALS: Final = 6  # micrometers and microradians
 
 
@@ -43,6 +49,8 @@ class LiveHeader:
     """The rigid bodies in their order."""
     markers: tuple[str, ...]
     """What a point's label counts through: `right:ThumbTip`, ..., the hands' markers before the bodies'."""
+    radii: tuple[tuple[float, ...], ...]
+    """Radius of each hand at each of OpenXR's joints [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +71,8 @@ class LiveHand:
     """Standard deviation of each joint angle [rad]."""
     position_spread: Float[np.ndarray, "21"]
     """Standard deviation of each joint position in each direction [m]."""
+    find_joints: Callable[[], Float[np.ndarray, "26 7"]] = field(repr=False)
+    """Computes positions [m] and wxyz quaternions of OpenXR's joints in the world; for a hand with a pose."""
 
     @property
     def has_pose(self) -> bool:
@@ -136,6 +146,7 @@ class MessageEncoder:
             KEYPOINT_NAMES,
             tuple(body.name for body in bodies),
             label_names(hands, bodies),
+            tuple(tuple(joint_radii(hand.model).tolist()) for hand in hands),
         )
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
@@ -159,7 +170,43 @@ class MessageEncoder:
         if hand.has_pose:
             positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
         pose = hand.qpos[:3], hand.qpos[3:7], hand.qpos[7:], positions
-        return LiveHand(hand.side, hand.status, *pose, hand.angle_spread, hand.keypoint_spread)
+        spreads = hand.angle_spread, hand.keypoint_spread
+        joints = functools.partial(_openxr_joints, self._models[number], hand.qpos)
+        return LiveHand(hand.side, hand.status, *pose, *spreads, joints)
+
+
+def _openxr_joints(model: HandModel, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "26 7"]:
+    return transform_poses(joint_poses(model, qpos[None])[0])
+
+
+_Placed = TypeVar("_Placed", LiveHand, LiveBody)
+
+
+def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
+    """A message with positions, orientations and points in a program's axes and unit."""
+
+    def turned(poses: Float[np.ndarray, "K 7"]) -> NDArray[np.float64]:
+        return np.concatenate([axes.positions(poses[:, :3]), axes.quaternions(poses[:, 3:])], axis=1)
+
+    def placed(thing: _Placed) -> _Placed:
+        place = axes.positions(thing.position), axes.quaternions(thing.quaternion)
+        return dataclasses.replace(thing, position=place[0], quaternion=place[1])
+
+    hands = (
+        dataclasses.replace(
+            placed(hand),
+            positions=axes.positions(hand.positions),
+            position_spread=axes.scale * hand.position_spread,
+            find_joints=functools.partial(lambda one: turned(one.find_joints()), hand),
+        )
+        for hand in message.hands
+    )
+    return dataclasses.replace(
+        message,
+        hands=tuple(hands),
+        bodies=tuple(map(placed, message.bodies)),
+        points=axes.positions(message.points),
+    )
 
 
 class MessageFormat(NamedTuple):
@@ -167,11 +214,30 @@ class MessageFormat(NamedTuple):
 
     header: Callable[[LiveHeader], bytes]
     frame: Callable[[LiveMessage], bytes]
+    end: Callable[[], bytes]
     is_text: bool = False
 
 
-def document_format(name: str, *, points: bool = False) -> MessageFormat:
-    """Messages as documents in one of `FORMATS`, with all points and their labels if `points`."""
+class Content(NamedTuple):
+    """What messages hold beside what all of them do, and in which axes."""
+
+    points: bool = False
+    """All points and their labels."""
+    joints: bool = False
+    """OpenXR's 26 joints of each hand."""
+    axes: str = WORLD
+    """The program in whose axes and unit they are, one of `PROGRAMS`, or the world of the camera system."""
+    up: UpAxis = "z"
+    """The axis of the camera system that points up."""
+
+    @property
+    def program(self) -> ProgramAxes | None:
+        """The axes of the program; None for those of the camera system."""
+        return None if self.axes == WORLD else program_axes(self.axes, self.up)
+
+
+def document_format(name: str, content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
+    """Messages as documents in one of `FORMATS`."""
     encode: Callable[[dict[str, Any]], bytes]
     if name == "msgpack":
         encode = import_extra("msgpack", f"format={name}", "send").Packer().pack
@@ -182,25 +248,33 @@ def document_format(name: str, *, points: bool = False) -> MessageFormat:
             return as_text(document).encode()
 
     return MessageFormat(
-        lambda header: encode(header_document(header)),
-        lambda message: encode(frame_document(message, points=points)),
+        lambda header: encode(header_document(header, content)),
+        lambda message: encode(frame_document(message, content)),
+        lambda: encode({"type": "end", "schema": SCHEMA}),
         is_text=name == "json",
     )
 
 
-def header_document(header: LiveHeader) -> dict[str, Any]:
+def header_document(header: LiveHeader, content: Content = Content()) -> dict[str, Any]:  # noqa: B008
     """The names and units of all numbers in frames."""
+    scale, unit = (1.0, "m") if content.program is None else (content.program.scale, content.program.unit)
+    names = dataclasses.asdict(header)
+    radii = [[round(scale * radius, _DECIMALS) for radius in hand] for hand in names.pop("radii")]
     return {
         "type": "header",
         "schema": SCHEMA,
         "source": f"handsim {__version__}",
-        "units": {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"},
-        **{name: list(values) for name, values in dataclasses.asdict(header).items()},
+        "axes": content.axes,
+        "units": {"length": unit, "angle": "rad", "time": "s", "quaternion": "wxyz"},
+        **{name: list(values) for name, values in names.items()},
+        **({"joints": list(OPENXR_JOINTS), "radii": radii} if content.joints else {}),
     }
 
 
-def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, Any]:
+def frame_document(message: LiveMessage, content: Content = Content()) -> dict[str, Any]:  # noqa: B008
     """A frame, with null for NaN."""
+    if content.program is not None:
+        message = in_axes(message, content.program)
     document = {
         "type": "frame",
         "schema": SCHEMA,
@@ -208,17 +282,18 @@ def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, A
         "time": float(message.time),
         "silent": message.silent,
         "lag": None if math.isnan(message.lag) else round(message.lag, _DECIMALS),
-        "hands": [_hand_document(hand) for hand in message.hands],
+        "hands": [_hand_document(hand, joints=content.joints) for hand in message.hands],
         "bodies": [
             {"name": body.name, "status": str(body.status), "pose": _pose(body)} for body in message.bodies
         ],
     }
-    if points:
+    if content.points:
         document |= {"points": _rounded(message.points), "labels": message.labels.tolist()}
     return document
 
 
-def _hand_document(hand: LiveHand) -> dict[str, Any]:
+def _hand_document(hand: LiveHand, *, joints: bool) -> dict[str, Any]:
+    more = {"joints": _rounded(hand.find_joints()) if hand.has_pose else None} if joints else {}
     spreads = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
     return {
         "side": hand.side,
@@ -227,6 +302,7 @@ def _hand_document(hand: LiveHand) -> dict[str, Any]:
         "angles": _rounded(hand.angles) if hand.has_pose else None,
         "positions": _rounded(hand.positions) if hand.has_pose else None,
         **{name: None if np.isnan(spread).any() else _rounded(spread) for name, spread in spreads.items()},
+        **more,
     }
 
 

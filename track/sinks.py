@@ -15,7 +15,8 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,16 +28,20 @@ from handsim._checks import check_methods, check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.space.transforms import PROGRAMS
 from track.frames import StreamedFrame, TrackedFrame
 from track.live_message import (
     FORMATS,
     SCHEMA,
+    WORLD,
+    Content,
     LiveHeader,
     LiveMessage,
     LiveSink,
     MessageEncoder,
     MessageFormat,
     document_format,
+    in_axes,
 )
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
@@ -51,11 +56,16 @@ GROUP: Final = "handsim.sinks"
 STATUSES: Final = tuple(reversed(Status))
 """Values of a status channel of LSL are indices of these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
-_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}  # valid values of each option
+_AXES_OF: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y")}  # valid values of each option
+_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes"), "joints": ("no", "openxr"), **_AXES_OF}
+_SERVED: Final = {**_DOCUMENTS, "every": ("no", "yes")}
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 _HEADER_PERIOD: Final = 1.0  # time after which the header is sent again, for receivers that came late [s]
-_WAITING: Final = 256  # largest number of frames that wait for a client
+_WAITING: Final = 256  # largest number of frames that wait for a client that wants every frame
+_UNCONFIRMED: Final = 0.05  # time without a client's answer after which it gets no further frame [s]
+_ON_REQUEST: Final = "/newest"  # path of clients that ask for each frame
+_FLUSHED: Final = 0.01  # time between two looks whether clients have read what was left [s]
 _SEND_BUFFER: Final = 1 << 17  # size of the system's buffer for each client [bytes]
 _LARGEST: Final = 1 << 10  # largest size of a client's message, which is ignored [bytes]
 _FLUSH: Final = 1.0  # time for clients to read waiting frames at the end [s]
@@ -158,12 +168,20 @@ def open_sink(address: str) -> LiveSink:
     """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
-        parts = split_address(address, options={} if scheme == "osc" else _DOCUMENTS, any_port=scheme == "ws")
+        valid: Mapping[str, tuple[str, ...]] = {"osc": _AXES_OF, "udp": _DOCUMENTS, "ws": _SERVED}[scheme]
+        host, port, options = split_address(address, options=valid, any_port=scheme == "ws")
+        content = Content(
+            points=options.get("points") == "yes",
+            joints=options.get("joints") == "openxr",
+            axes=options["axes"],
+            up="y" if options["up"] == "y" else "z",
+        )
         if scheme == "osc":
-            return DatagramSink(parts.host, parts.port, osc_format())
-        format = document_format(parts.options["format"], points=parts.options["points"] == "yes")
-        kind: Callable[..., LiveSink] = WebSocketSink if scheme == "ws" else DatagramSink
-        return kind(parts.host, parts.port, format)
+            return DatagramSink(host, port, osc_format(content))
+        format = document_format(options["format"], content)
+        if scheme == "udp":
+            return DatagramSink(host, port, format)
+        return WebSocketSink(host, port, format, every=options["every"] == "yes")
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
     name = address.partition("?")[0]
@@ -197,7 +215,8 @@ class DatagramSink:
         self._put(self._format.frame(message))
 
     def close(self) -> None:
-        """Close the socket."""
+        """Send the end, and close the socket."""
+        self._put(self._format.end())
         self._socket.close()
 
     def _put(self, datagram: bytes) -> None:
@@ -207,8 +226,9 @@ class DatagramSink:
             self.dropped += 1
 
 
-def osc_format() -> MessageFormat:
+def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
     """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists their addresses."""
+    program = content.program
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
 
@@ -223,7 +243,9 @@ def osc_format() -> MessageFormat:
         return datagram
 
     return MessageFormat(
-        lambda header: bundle(_osc_header(header)), lambda message: bundle(_osc_frame(message))
+        lambda header: bundle(_osc_header(header)),
+        lambda message: bundle(_osc_frame(message if program is None else in_axes(message, program))),
+        lambda: bundle([("/handsim/end", "", [])]),
     )
 
 
@@ -353,21 +375,24 @@ def sample_of(message: LiveMessage) -> np.ndarray:
 class WebSocketSink:
     """Serves messages to any number of clients from a thread of its own; port 0 is any free one.
 
-    A client gets the header, then every new frame; a slow client loses frames and delays nobody. A loopback
-    address serves pages of this machine and other programs; another address serves everybody.
+    A client gets the header, then the newest frame as soon as it has taken the one before. It confirms what
+    it took by the protocol's pongs, which its library sends. A client of the path /newest gets one frame for
+    each message that it sends. With `every` all frames wait for a client, and 256 at most. A slow client
+    loses frames and delays nobody. A loopback address serves pages of this machine and other programs;
+    another address serves everybody.
     """
 
-    def __init__(self, host: str, port: int, format: MessageFormat) -> None:
+    def __init__(self, host: str, port: int, format: MessageFormat, *, every: bool = False) -> None:
         self._serve: Any = import_extra("websockets.asyncio.server", "ws://", "send").serve
         self._closed_error: Any = import_extra("websockets.exceptions", "ws://", "send").ConnectionClosed
-        self._format, self._socket = format, _listen(host, port)
+        self._format, self._every, self._socket = format, every, _listen(host, port)
         address = self._socket.getsockname()
         self._origins = [None, _OWN_PAGES] if ipaddress.ip_address(address[0]).is_loopback else None
         self.port: int = address[1]
         self.dropped = 0
         """Number of frames that were dropped for slow clients."""
         self._header = b""
-        self._clients: dict[ServerConnection, asyncio.Queue[bytes]] = {}  # frames that wait for each
+        self._clients: dict[ServerConnection, _Client] = {}
         self._loop = asyncio.new_event_loop()
         self._ending, self._ready = asyncio.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="websocket server", daemon=True)
@@ -386,19 +411,17 @@ class WebSocketSink:
             self._loop.call_soon_threadsafe(self._spread, self._format.frame(message))
 
     def close(self) -> None:
-        """Give clients a second to read waiting frames, and disconnect them."""
+        """Give clients a second to read what waits for them and the end, and disconnect them."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._ending.set)
             self._thread.join()
 
-    def _spread(self, frame: bytes) -> None:
-        """Queue a frame for every client; the oldest of a full queue is dropped."""
-        for queue in self._clients.values():
-            if queue.full():
-                queue.get_nowait()
-                queue.task_done()
-                self.dropped += 1
-            queue.put_nowait(frame)
+    def _spread(self, message: bytes) -> None:
+        """Lay a message out for every client; where there is no room the oldest is dropped."""
+        for client in self._clients.values():
+            self.dropped += len(client.waiting) == client.waiting.maxlen
+            client.waiting.append(message)
+            client.woken.set()
 
     def _run(self) -> None:
         try:
@@ -421,36 +444,74 @@ class WebSocketSink:
         )
         self._ready.set()
         await self._ending.wait()
-        waiting = {asyncio.ensure_future(queue.join()): client for client, queue in self._clients.items()}
-        if waiting:
-            _, late = await asyncio.wait(waiting, timeout=_FLUSH)
-            for one in late:
-                one.cancel()
-                waiting[one].transport.abort()  # a closing handshake would wait, too
+        self._spread(self._format.end())
+        for client in self._clients.values():
+            client.ask()
+        until = self._loop.time() + _FLUSH
+        while any(client.waiting for client in self._clients.values()) and self._loop.time() < until:
+            await asyncio.sleep(_FLUSHED)
+        for connection, client in self._clients.items():
+            if client.waiting:
+                connection.transport.abort()  # a closing handshake would wait, too
         server.close()
         await server.wait_closed()
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Send messages to a client until it leaves."""
-        queue = self._clients[connection] = asyncio.Queue(_WAITING)
-        sending = asyncio.ensure_future(self._deliver(connection, queue))
+        path = connection.request.path if connection.request is not None else ""
+        client = _Client(_WAITING if self._every else 1, only_asked=path == _ON_REQUEST)
+        self._clients[connection] = client
+        sending = asyncio.ensure_future(self._deliver(connection, client))
         try:
             with suppress(self._closed_error):
                 while True:
                     await connection.recv()  # this notices pongs and the end of the connection
+                    client.ask()
         finally:
             del self._clients[connection]
             sending.cancel()
 
-    async def _deliver(self, client: ServerConnection, queue: asyncio.Queue[bytes]) -> None:
-        """Send a client the header, then frame after frame."""
+    async def _deliver(self, connection: ServerConnection, client: _Client) -> None:
+        """Send a client the header, then message after message."""
+        unconfirmed: deque[tuple[float, Awaitable[float]]] = deque()  # when frames were sent, and their pongs
         with suppress(self._closed_error):
-            frame = await queue.get()
-            await client.send(self._header, text=self._format.is_text)
+            await client.woken.wait()
+            if self._header:
+                await connection.send(self._header, text=self._format.is_text)
             while True:
-                await client.send(frame, text=self._format.is_text)
-                queue.task_done()
-                frame = await queue.get()
+                while unconfirmed and unconfirmed[0][0] < self._loop.time() - _UNCONFIRMED:
+                    await unconfirmed.popleft()[1]
+                await client.next()
+                await connection.send(client.take(), text=self._format.is_text)
+                if not self._every:
+                    unconfirmed.append((self._loop.time(), await connection.ping()))
+
+
+class _Client:
+    """What waits for a client of a WebSocket, and what it has asked for."""
+
+    def __init__(self, most: int, *, only_asked: bool) -> None:
+        self.waiting: deque[bytes] = deque(maxlen=most)
+        self.woken = asyncio.Event()
+        self._asks = not only_asked
+        self._only_asked = only_asked
+
+    def ask(self) -> None:
+        """The client asks for a message."""
+        self._asks = True
+        if self.waiting:
+            self.woken.set()
+
+    async def next(self) -> None:
+        """Wait until a message may be sent."""
+        while not (self.waiting and self._asks):
+            self.woken.clear()
+            await self.woken.wait()
+
+    def take(self) -> bytes:
+        """The oldest message that waits."""
+        self._asks = not self._only_asked
+        return self.waiting.popleft()
 
 
 def _listen(host: str, port: int) -> socket.socket:

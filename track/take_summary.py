@@ -7,7 +7,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.ndimage import minimum_filter1d
 
 from gloves.captures.capture import AT_ORIGIN, all_at_origin, runs_of, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
@@ -166,7 +165,9 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
     least = np.fmin(_least_in_frames(take, confidence), 1.0)
     found: list[tuple[float, SuspectSpan]] = []
     around, apart = round(_AROUND * take.rate), _APART * take.rate
-    for first, last in _joined(runs_of(minimum_filter1d(least, 2 * around + 1) < _CERTAIN), apart):
+    runs = [(max(first - around, 0), last + around) for first, last in runs_of(least < _CERTAIN)]
+    for first, end in _joined(runs, apart):
+        last = min(end, len(least) - 1)
         worst = first + int(least[first : last + 1].argmin())
         point = points.of(worst).start + int(np.nanargmin(confidence[points.of(worst)]))
         of, why = _words(take, worst, int(points.labels[point]), int(markers[point]))

@@ -38,7 +38,6 @@ from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
 from track.rigid_body import AnyBody, BodyTracker, load_bodies
 from track.user import AnyLabeler, User, as_user, labeler_of
-from train.labelers.protocol import Labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
@@ -92,7 +91,7 @@ class Tracker:
         self.hands = self.user.hands
         self.bodies = load_bodies(bodies)
         self.config = config
-        asked = labeler_of(self.user.layout, labeler)
+        self.labeler = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [HandState(hand, config, origin=self.user.origin(hand.side)) for hand in self.hands]
@@ -100,11 +99,29 @@ class Tracker:
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
         self._digits = digit_table(self._states, self._numbering)
-        self._initializer = HandInitializer(self._states, asked, config)
-        self._review = LabelerReview(asked, len(self.hands), config)
+        self._initializer = HandInitializer(self._states, self.labeler, config)
+        self._review = LabelerReview(self.labeler, len(self.hands), config)
         self._last_attempt, self._attempt_wait = -np.inf, 0.0  # [s] of looking for lost hands
         self._attempt_points = 0  # that it looked among
         self._last_sound = np.zeros(len(self.hands))  # [s] when each track was last beyond doubt
+
+    def warm_up(self) -> None:
+        """Load the kernels and the labeler, for which the first frames of a stream would otherwise wait.
+
+        The state of this tracker stays as it is.
+        """
+        tracker, hands = Tracker(self.user, self.labeler), self.hands
+        qpos = np.zeros((len(hands), NUM_QPOS))
+        qpos[:, 0], qpos[:, 3] = _HAND_SPACING * np.arange(len(hands)), 1.0
+        worn = [hand.markers(row[None])[0][0] for hand, row in zip(hands, qpos, strict=True)]
+        points = np.concatenate(worn)
+        for number in range(3):  # initialized, tracked, and labeled again
+            ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
+            for hand in tracker.step(points, ids, 0.01 * number).hands:
+                _ = hand.angle_spread
+        unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
+        for cloud in unsure:  # labels that a pose has to verify
+            self.labeler.label_frames([cloud])
 
     def step(
         self,
@@ -338,21 +355,3 @@ def _tracked_hand(
     markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
     return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)
-
-
-def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
-
-    Otherwise the first frames of a stream would have to wait.
-    """
-    tracker = Tracker(hands, labeler)
-    qpos = np.zeros((len(hands), NUM_QPOS))
-    qpos[:, 0], qpos[:, 3] = _HAND_SPACING * np.arange(len(hands)), 1.0
-    points = np.concatenate([hand.markers(row[None])[0][0] for hand, row in zip(hands, qpos, strict=True)])
-    for number in range(3):  # initialized, tracked, and labeled again
-        ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
-        for hand in tracker.step(points, ids, 0.01 * number).hands:
-            _ = hand.angle_spread
-    unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
-    for cloud in unsure:  # labels that a pose has to verify
-        labeler.label_frames([cloud])

@@ -21,6 +21,7 @@ EPOCHS: Final = 75
 Views = Literal["aligned", "random"]
 """`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
 for labeling the one of ten on which the cloud spreads best."""
+_KNEE: Final = 0.02
 _MAX_CLOUDS: Final = 1_000_000  # in a batch
 _MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 
@@ -104,7 +105,7 @@ class TrainSettings(Settings):
     """A corruption of your own instead of the paper's: module:name, or the name of an entry point."""
     anisotropy: Annotated[float, Limits(0.0, 1.0)] = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
-    knee: Annotated[float, Limits(0.0, above=True)] = 0.02
+    knee: Annotated[float, Limits(0.0, above=True)] = _KNEE
     """Distance at which the loss of the paper's network turns from quadratic to linear [half an image's
     width]."""
     seed: Annotated[int, Limits(0)] = 0
@@ -115,6 +116,23 @@ class TrainSettings(Settings):
     def chosen(self) -> NetworkConfig:
         """The settings of the network of this kind."""
         return self.cnn if self.labeler == "cnn" else self.network
+
+    def check(self) -> None:
+        """Refuse settings of the other kind of network, and the paper's corruption beside one's own."""
+        is_given = {
+            "network": self.network != SetLabelerConfig(self.network.num_labels),
+            "cnn": self.cnn != CNNConfig(self.cnn.num_labels),
+            "knee": self.knee != _KNEE,
+        }
+        of_others = ("network",) if self.labeler == "cnn" else ("cnn", "knee")
+        given = [name for name in of_others if is_given[name]]
+        if given:
+            kind = next(one for one in KINDS if one != self.labeler)
+            raise ArgumentError(
+                f"given {' and '.join(given)} with the labeler {self.labeler}, expected the labeler {kind}"
+            )
+        if self.corruption is not None and (self.occlude, self.ghosts) != (None, 2):
+            raise ArgumentError("given occlude or ghosts beside a corruption, expected one of them")
 
     def for_set(self, num_markers: int, num_frames: int) -> TrainSettings:
         """The same settings for a training set of this size."""

@@ -11,6 +11,7 @@ not decide, the file is refused.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
+from gloves.captures.coordinates import UNMARKED, without_outputs
 from gloves.captures.text import StatedTimes, Tell, check_same_rate, meters_per, timed_positions, warn
 from handsim.errors import CaptureError, shortened
 from handsim.files.outputs import plain_path, unwritten
@@ -333,10 +335,12 @@ def _num_frames(
 
 
 _MOST_LABEL_BYTES: Final = 255
+_OUTPUTS: Final = ("ANGLES", "MOMENTS", "FORCES", "POWERS", "SCALARS", "REACTIONS")
+"""Parameters of the group POINT that name columns which are no markers."""
 
 
 def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
-    """Read the bytes of a C3D file; points with a negative residual are missing."""
+    """Read the bytes of a C3D file; points with a negative residual are missing, unless all are."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
     parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)
@@ -349,9 +353,14 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
         tell("the file states no POINT:UNITS, read as millimeters, which most programs write")
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
+    located = np.isfinite(positions).all(axis=-1) & (positions != 0.0).any(axis=-1)
+    unmarked = 0
+    if located.any() and not (located & ~missing).any():
+        missing, unmarked = ~located, int(located.sum())
     positions[missing] = np.nan
     timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)
-    return Capture(_labels(parameters, points.shape[1]), *timed)
+    capture = Capture(_labels(parameters, points.shape[1]), *timed, findings={UNMARKED: unmarked})
+    return without_outputs(capture, [name for group in _OUTPUTS for name in _list(parameters, group)])
 
 
 def write_c3d(path: Path, capture: Capture) -> None:
@@ -414,11 +423,14 @@ def _check_written(path: Path, capture: Capture) -> None:
 
 
 def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:
-    """POINT:LABELS and its continuations LABELS2, LABELS3, ...; a point without one becomes '*n'."""
-    labels = parameters.strings("POINT", "LABELS")
-    number = 2
-    while len(labels) < num_points and (more := parameters.strings("POINT", f"LABELS{number}")):
-        labels += more
-        number += 1
-    labels = labels[:num_points] + [""] * (num_points - len(labels))
+    """The names of all points; a point without one becomes '*n'."""
+    labels = _list(parameters, "LABELS")[:num_points]
+    labels += [""] * (num_points - len(labels))
     return tuple(label or f"*{number}" for number, label in enumerate(labels, 1))
+
+
+def _list(parameters: Parameters, name: str) -> list[str]:
+    """The strings of a parameter of the group POINT and its continuations (LABELS, LABELS2, LABELS3, ...)."""
+    names = itertools.chain([name], (f"{name}{number}" for number in itertools.count(2)))
+    parts = (parameters.strings("POINT", one) for one in names)
+    return [text for part in itertools.takewhile(bool, parts) for text in part]

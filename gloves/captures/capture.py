@@ -1,15 +1,13 @@
 """Marker files: trajectories at a frame rate, their gaps, labels, and mistakes of units and places.
 
-Gaps are counted as in Table 3 of Han et al. 2018, and per marker. Positions tell of a wrong unit or place,
-and of zeros that stand for gaps.
+Gaps are counted as in Table 3 of Han et al. 2018, and per marker. Positions tell of a wrong unit or place.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -36,6 +34,8 @@ class Capture:
     """Positions [m] in the file's axes; NaN, always in all three coordinates, where a marker was not seen."""
     rate: float
     """Frames per second [Hz]."""
+    findings: Mapping[str, int] = field(default_factory=dict)
+    """How many values of a file were not read as measured points, by the reason."""
 
     def __post_init__(self) -> None:
         positions = np.array(self.positions, dtype=np.float64)  # a copy: the next lines change it
@@ -56,6 +56,7 @@ class Capture:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "rate", float(self.rate))
+        object.__setattr__(self, "findings", dict(self.findings))
 
     @property
     def num_frames(self) -> int:
@@ -247,22 +248,6 @@ def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     fault = unit_fault(clouds, only_wide=only_wide)
     if fault is not None:
         raise ArgumentError(f"{fault.found}, expected a hand in meters{fault.hint}")
-
-
-def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
-    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
-
-    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
-    in which nothing moves is left as it is.
-    """
-    positions = capture.positions
-    zero = (positions == 0.0).all(axis=-1)
-    count = int(zero.sum())
-    there = np.isfinite(positions[..., 0]) & ~zero
-    tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
-    if count < 2 or not any((track != track[:1]).any() for track in tracks):  # nothing moves
-        return capture, 0
-    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
 
 
 def check_place(capture: Capture, farthest: float) -> None:

@@ -19,7 +19,9 @@ optionally frame number and time, then three cells per marker in millimeters.
 
 from __future__ import annotations
 
+import codecs
 import csv
+import itertools
 import re
 import warnings
 from collections.abc import Sequence
@@ -28,6 +30,7 @@ from typing import Final, TextIO
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import (
@@ -37,17 +40,18 @@ from gloves.captures.capture import (
     select_hands,
     unit_fault,
     unlabeled_frames,
-    zeros_as_missing,
 )
+from gloves.captures.coordinates import OUTPUTS, PIECES, findings_sentence, settled
+from gloves.captures.pieces import Trajectories
 from gloves.captures.text import (
     MOST_CELLS,
     TAB,
     StatedTimes,
+    TableColumns,
     Tell,
     cell_number,
     check_width,
     header_cells,
-    marker_titles,
     meters_per,
     parse_table,
     plain_lines,
@@ -74,6 +78,7 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
     lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
+    lines = _tabs_for_spaces(lines)
     # a header line without a line end may be cut
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
@@ -90,19 +95,45 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
     names += _unnamed(lines[_HEADER_LINES:], len(names))
 
-    titles = marker_titles(("frame number", "time"), names)
-    table = parse_table(lines, start=_HEADER_LINES, ended=ended, titles=titles)
-    positions = table[:, _LEADING:].reshape(len(table), len(names), 3) * scale
+    columns = TableColumns.of_triples(("frame number", "time"), names, scale)
+    leading, read = parse_table(lines, columns, start=_HEADER_LINES, ended=ended)
     times = StatedTimes(
         stated.get("datarate", ""),
         "DataRate",
-        numbers=table[:, 0],
-        times=table[:, 1],
+        numbers=leading[:, 0],
+        times=leading[:, 1],
         count=stated.get("numframes", ""),
         count_name="NumFrames",
         count_is_reliable=False,
     )
-    return Capture(names, *timed_positions(positions, times, tell))
+    return _timed(read, times, tell)
+
+
+def _timed(read: Trajectories, times: StatedTimes, tell: Tell, outputs: int = 0) -> Capture:
+    """The capture of trajectories at the stated times."""
+    timed = timed_positions(read.positions, times, tell)
+    return Capture(read.names, *timed, findings={PIECES: read.pieces, OUTPUTS: outputs})
+
+
+def _tabs_for_spaces(lines: list[bytes]) -> list[bytes]:
+    """The lines with tabs where spaces part the cells, between which a blank cell cannot be told."""
+    spaced = [index for index, line in enumerate(lines) if TAB not in line and b" " in line.strip()]
+    lines = list(lines)
+    for index in spaced:
+        lines[index] = TAB.join(lines[index].split())
+    rows = [index for index in spaced if index >= _HEADER_LINES]
+    if not rows:
+        return lines
+    if not any(b"nan" in lines[index].lower() for index in rows):
+        widths = [lines[index].count(TAB) + 1 for index in rows]
+        other = next((row for row, width in enumerate(widths) if width != widths[0]), None)
+        if other is not None:
+            raise CaptureError(
+                f"line {rows[other] + 1} has {widths[other]} cells and line {rows[0] + 1} {widths[0]}, all "
+                "parted by spaces, so that blank cells do not show; write tabs, or nan in blank cells"
+            )
+    # the blank line behind the header may hold a missing number, too
+    return [b"" if line.strip().lower() == b"nan" else line for line in lines]
 
 
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
@@ -171,6 +202,11 @@ def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
 _MOST_HEADER_LINES: Final = 20
 MOTIVE_BEGIN: Final = b"Format Version"
 _COUNT: Final = "Total Exported Frames"
+_LENGTH: Final = "Length Units"
+_RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
+_MOTIVE_KEYS: Final = {
+    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _LENGTH)
+}
 _AXES: Final = ["X", "Y", "Z"]
 _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
 
@@ -183,16 +219,23 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
     lines = plain_lines(lines, separator)
     rows = [header_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
-    stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
-    rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
-    if not stated.get("Length Units"):
-        tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
-    scale = meters_per(stated.get("Length Units") or "Meters")
     end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
+    # a comma or a line break in the take's name or notes moves the keys behind them
+    keyed = [index for index, row in enumerate(rows[:end]) for cell in row if cell.lower() in _MOTIVE_KEYS]
+    stated = {
+        _MOTIVE_KEYS[key.lower()]: value
+        for row in rows[: keyed[-1] + 1]
+        for key, value in itertools.pairwise(row)
+        if key.lower() in _MOTIVE_KEYS
+    }
+    rate_key = next((key for key in _RATES if stated.get(key)), _RATES[-1])
+    if not stated.get(_LENGTH):
+        tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
+    scale = meters_per(stated.get(_LENGTH) or "Meters")
     axes = rows[end]
-    header = [row for row in rows[1:end] if any(row)]
+    header = [row for row in rows[keyed[-1] + 1 : end] if any(row)]
     # files without labels begin with the types, behind two blank cells
     if len(header) > 2 and not any(header[0][:2]) and set(header[0]) & _TYPES:
         types, names = header[:2]
@@ -201,24 +244,23 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     names = names + [""] * (len(axes) - len(names))
     columns = _marker_columns(types, header[-1], axes)
 
-    table = parse_table(
-        lines,
-        start=end + 1,
-        ended=ended,
+    table = TableColumns(
         titles=[f"{name} {axis}".strip() for name, axis in zip(names, axes, strict=False)],
-        text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
+        names=[names[column] or f"*{number}" for number, column in enumerate(columns, 1)],
+        first=np.array(columns),
+        scales=np.full(len(columns), scale),
+        texts=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
     )
-    positions = table[:, np.array(columns)[:, None] + np.arange(3)]
-    labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns, 1))
+    leading, read = parse_table(lines, table, start=end + 1, ended=ended)
     times = StatedTimes(
         stated.get(rate_key, ""),
         rate_key,
-        numbers=table[:, 0],
-        times=table[:, 1] if axes[1].lower().startswith("time (") or axes[1].lower() == "time" else None,
+        numbers=leading[:, 0],
+        times=leading[:, 1] if axes[1].lower().startswith("time (") or axes[1].lower() == "time" else None,
         count=stated.get(_COUNT, ""),
         count_name=_COUNT,
     )
-    return Capture(labels, *timed_positions(positions * scale, times, tell))
+    return _timed(read, times, tell)
 
 
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
@@ -283,6 +325,8 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
 _TITLE: Final = "Trajectories"
 _SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
 _FIRST_CELLS: Final = ("frame", "field #")
+_OUTPUT_UNITS: Final = {"deg", "rad", "n", "nmm", "n.mm", "nm", "n.m", "w", "kg", "v", "mv"}
+"""Units of angles, forces, moments, powers and signals, in lower case."""
 _BLANKS: Final = b' \t",;'
 
 
@@ -320,33 +364,36 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     columns = np.array([index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES])
     if not len(columns):
         raise CaptureError(f"no markers: line {at + 4} has no axes X, Y, Z")
-    start, scales = _scales(lines[:end], at + 4, columns, tell)
+    num_columns = len(columns)
+    start, columns, scales = _scales(lines[:end], at + 4, columns, tell)
     names += [""] * (len(axes) - len(names))
     # A name stands above the first of its three columns.
     above = [next(filter(None, names[max(0, n - 2) : n + 1][::-1]), "") for n in range(len(axes))]
-    table = parse_table(
-        lines[:end],
-        start=start,
-        ended=ended or end < len(lines),
+    table = TableColumns(
         titles=[f"{name} {axis}".strip() for name, axis in zip(above, axes, strict=False)],
+        names=[names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1)],
+        first=columns,
+        scales=scales,
     )
-    positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
-    labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
-    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=table[:, 0])
-    return Capture(labels, *timed_positions(positions, times, tell))
+    leading, read = parse_table(lines[:end], table, start=start, ended=ended or end < len(lines))
+    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=leading[:, 0])
+    return _timed(read, times, tell, outputs=num_columns - len(columns))
 
 
 def _scales(
     lines: list[bytes], row: int, columns: Int[np.ndarray, "N"], tell: Tell
-) -> tuple[int, Float[np.ndarray, "N"]]:
-    """Index of the first row of numbers, and meters per unit of each trajectory."""
+) -> tuple[int, NDArray[np.int64], NDArray[np.float64]]:
+    """Index of the first row of numbers, the trajectories in units of length, and meters per unit of each."""
     cells = header_cells(lines[row], row + 1) if row < len(lines) else []
     if cells and cells[0]:  # a frame's number
         tell("the file states no unit of length, read as millimeters, which Vicon's programs write")
-        return row, np.full(len(columns), meters_per("mm"))
-    units = [cells[column] if column < len(cells) else "" for column in columns]
-    scales = {unit: meters_per(unit) for unit in set(units)}
-    return row + 1, np.array([scales[unit] for unit in units])
+        return row, columns, np.full(len(columns), meters_per("mm"))
+    units = np.array([cells[column] if column < len(cells) else "" for column in columns])
+    lengths = np.array([unit.lower() not in _OUTPUT_UNITS for unit in units])
+    if lengths.any():
+        units, columns = units[lengths], columns[lengths]
+    scales = {unit: meters_per(str(unit)) for unit in np.unique(units)}
+    return row + 1, columns, np.array([scales[unit] for unit in units])
 
 
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
@@ -378,20 +425,19 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
     names = _names(stated)
-    start, leading = _begin_of_rows(lines, start, 3 * len(names))
+    start, num_leading = _begin_of_rows(lines, start, 3 * len(names))
 
-    titles = marker_titles(_QTM_LEADING[:leading], names)
-    table = parse_table(lines, start=start, ended=ended, titles=titles)
-    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per("mm")
+    columns = TableColumns.of_triples(_QTM_LEADING[:num_leading], names, meters_per("mm"))
+    leading, read = parse_table(lines, columns, start=start, ended=ended)
     times = StatedTimes(
         _first(stated, "FREQUENCY"),
         "FREQUENCY",
-        numbers=table[:, 0] if leading > 0 else None,
-        times=table[:, 1] if leading > 1 else None,
+        numbers=leading[:, 0] if num_leading > 0 else None,
+        times=leading[:, 1] if num_leading > 1 else None,
         count=_first(stated, "NO_OF_FRAMES"),
         count_name="NO_OF_FRAMES",
     )
-    return Capture(names, *timed_positions(positions, times, tell))
+    return _timed(read, times, tell)
 
 
 def _first(stated: dict[str, list[str]], key: str) -> str:
@@ -453,6 +499,32 @@ _FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": read_qtm_tsv}
 _TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)
+_SKELETON: Final = "the motion of a skeleton without its markers; export the markers where it was made"
+_VICON: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
+_CORTEX: Final = "a binary file of Cortex; export TRC or C3D from there"
+_OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that they were made of"
+_UNREAD: Final = {
+    ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
+    ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
+    ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
+    ".npz": "an archive of NumPy; if it is a take, load_take reads it and handsim export writes its points",
+    **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
+    **dict.fromkeys((".trb", ".cap"), _CORTEX),
+    **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),
+    **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON),
+}
+"""What files of other programs are, and what would help, by their endings."""
+_FOREIGN: Final = {
+    _BEGIN.lower(): "the content of a TRC; name it .trc",
+    MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
+    **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _BEGINS},
+    b"comment,this file was exported from": "a CSV of Tracking Tools; export its take from Motive",
+    b"scorer,": "a CSV of DeepLabCut with points of pictures; triangulate them and write a TRC",
+    b"pk\3\4": "a workbook of Excel or another archive; save it as text",
+    b"<": "XML or a page of the web",
+    b"{": "JSON",
+}
+"""What files are that begin so."""
 WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
@@ -479,6 +551,8 @@ def read_capture(capture: Capture | str | Path) -> Capture:
         return capture
     check_type("capture", capture, (str, Path), "a Capture or the path of a file", READABLE)
     path = Path(capture)
+    if path.suffix.lower() in _UNREAD:
+        raise CaptureError(f"{path}: {_UNREAD[path.suffix.lower()]}; expected {', '.join(READABLE)}")
     check_suffix(path, READABLE)
     data = read_bytes(path, error=CaptureError)
     if not data:
@@ -488,29 +562,35 @@ def read_capture(capture: Capture | str | Path) -> Capture:
         warnings.warn(f"{path}: {text}", HandSimWarning, stacklevel=3)
 
     try:
-        read = _READERS[path.suffix.lower()](data, tell)
+        return _checked(path, _READERS[path.suffix.lower()](data, tell))
     except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
-    return _checked(path, read)
+        raise CaptureError(f"{path}: {error}{_content_hint(data, str(error))}") from error
+    except MemoryError as error:
+        raise CaptureError(
+            f"{path}: the {len(data) / 1e6:.0f} MB of the file do not fit in memory; export a part of the "
+            "take, or fewer columns"
+        ) from error
+
+
+def _content_hint(data: bytes, error: str) -> str:
+    """What a file is that is not what its ending says, behind an error that says so."""
+    begin = data[:_FIRST_BYTES].removeprefix(codecs.BOM_UTF8).lstrip(_BLANKS).lower()
+    found = next((text for word, text in _FOREIGN.items() if begin.startswith(word)), None)
+    return f"; this is {found}" if found and error.startswith("not a ") else ""
 
 
 def _checked(path: Path, capture: Capture) -> Capture:
-    """The capture with NaN in place of zeros; refuse positions that cannot be in the unit of the file."""
-    capture, zeros = zeros_as_missing(capture)
-    if zeros:
-        warnings.warn(
-            f"{path}: {zeros} points at exactly (0, 0, 0) are read as missing; if they are points, move the "
-            "origin",
-            HandSimWarning,
-            stacklevel=3,
-        )
+    """The measured points of the capture; refuse positions that cannot be in the unit of the file."""
+    capture = settled(capture)
+    if capture.findings:
+        warnings.warn(f"{path}: {findings_sentence(capture.findings)}", HandSimWarning, stacklevel=3)
     clouds = unlabeled_frames(capture)
     if all_at_origin(clouds):
-        raise CaptureError(f"{path}: {AT_ORIGIN}, expected positions of markers")
+        raise CaptureError(f"{AT_ORIGIN}, expected positions of markers")
     fault = unit_fault(clouds)
     if fault is not None:
         raise CaptureError(
-            f"{path}: by the unit of length that the file states, {fault.found}; correct that unit, probably "
+            f"by the unit of length that the file states, {fault.found}; correct that unit, probably "
             f"to {fault.guess}"
         )
     return capture

@@ -16,12 +16,13 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures.pieces import Trajectories, packed_trajectories
 from handsim.errors import CaptureError, HandSimWarning, shortened
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -43,6 +44,7 @@ _SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
 _MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
 _LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
 _MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
+_MOST_DENSE: Final = 8_000_000  # cells of a table that is held whole
 
 Tell = Callable[[str], None]
 """Called with a sentence about something suspicious in a file that is read nevertheless."""
@@ -103,7 +105,7 @@ def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
 
 
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
-    """The lines with tabs between their cells and without quotes.
+    """The same list of lines, now with tabs between their cells and without quotes.
 
     In a file with tabs, quotes are quotes only if its first cell is quoted. `first` is the number of the
     first line in the file. With `wider`, rows may have more cells than the line above them.
@@ -112,18 +114,18 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         return lines
     if separator == b",":
         _check_decimals(lines, first, wider)
-    plain = []
-    for number, line in enumerate(lines, first):
+    for index, line in enumerate(lines):  # in place: large files would be held twice
+        number = first + index
         if b'"' not in line:
-            plain.append(line.replace(TAB, b" ").replace(separator, TAB))
+            lines[index] = line.replace(TAB, b" ").replace(separator, TAB)
             continue
         check_width(line.count(separator) + 1, number)
         try:
             row = next(csv.reader([line.decode("latin-1")], delimiter=separator.decode()), [])
         except csv.Error as error:
             raise CaptureError(f"line {number} cannot be read: {error}") from error
-        plain.append(TAB.join(cell.replace("\t", " ").encode("latin-1") for cell in row))
-    return plain
+        lines[index] = TAB.join(cell.replace("\t", " ").encode("latin-1") for cell in row)
+    return lines
 
 
 def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
@@ -153,24 +155,38 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
             )
 
 
-def marker_titles(leading: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Names in messages for the columns of a table with three cells per marker."""
-    return [*leading, *(f"{name} {axis}" for name in names for axis in "XYZ")]
+class TableColumns(NamedTuple):
+    """What the columns of a table are."""
+
+    titles: Sequence[str]
+    """Of all columns, in messages."""
+    names: Sequence[str]
+    """Of the N trajectories."""
+    first: Int[np.ndarray, "N"]
+    """The first of the three columns of each trajectory."""
+    scales: Float[np.ndarray, "N"]
+    """Meters per unit of each trajectory."""
+    texts: frozenset[int] = frozenset()
+    """Columns without numbers."""
+
+    @classmethod
+    def of_triples(cls, leading: Sequence[str], names: Sequence[str], scale: float) -> TableColumns:
+        """The columns of a table with three cells per marker behind those that lead."""
+        titles = [*leading, *(f"{name} {axis}" for name in names for axis in "XYZ")]
+        first = len(leading) + 3 * np.arange(len(names))
+        return cls(titles, names, first, np.full(len(names), scale))
 
 
 def parse_table(
-    lines: list[bytes],
-    *,
-    start: int,
-    ended: bool,
-    titles: Sequence[str],
-    text_columns: frozenset[int] = frozenset(),
-) -> Float[np.ndarray, "T columns"]:
-    """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
+    lines: list[bytes], columns: TableColumns, *, start: int, ended: bool
+) -> tuple[Float[np.ndarray, "T 2"], Trajectories]:
+    """The first two numbers of each row, and the trajectories.
 
-    Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its
-    end, because some writers omit missing markers, or have blank cells too many.
+    A blank or absent cell is NaN, a blank line is not a row. Numbers have decimal points, or commas if no
+    number of the table has a point. A row may lack cells at its end, because some writers omit missing
+    markers, or have blank cells too many.
     """
+    titles, text_columns = columns.titles, columns.texts
     num_columns = len(titles)
     rows = [index for index in range(start, len(lines)) if lines[index].strip()]
     if not rows:
@@ -184,29 +200,64 @@ def parse_table(
         raise CaptureError(
             f"damaged: {len(rows)} rows of {num_columns} columns are more than {written} bytes can hold"
         )
+    if len(rows) * num_columns > _MOST_DENSE:
+        return _parse_wide([lines[index] for index in rows], columns, [index + 1 for index in rows])
     table = np.full((len(rows), num_columns), np.nan)
     for row, index in enumerate(rows):
-        number, line = index + 1, lines[index]
-        cells = line.split(TAB)
+        cells = lines[index].split(TAB)
         if len(cells) > num_columns:
-            if any(cell.strip() for cell in cells[num_columns:]):
-                raise CaptureError(f"line {number} has {len(cells)} cells, expected {num_columns}")
+            _check_blank(cells[num_columns:], len(cells), num_columns, index + 1)
             del cells[num_columns:]
         for column in text_columns:
             if column < len(cells):
                 cells[column] = b""
-        try:
-            table[row, : len(cells)] = [float(cell) if cell else _BLANK for cell in cells]
-        except ValueError:
-            table[row, : len(cells)] = _parse_cells(cells, number, titles)
-    infinite = np.argwhere(np.isinf(table))
-    if len(infinite):
-        row, column = infinite[0].tolist()
-        raise CaptureError(
-            f"line {rows[row] + 1}, column {column + 1} ({titles[column]}): infinite, expected a "
-            "finite number or a blank cell"
-        )
-    return table
+        table[row, : len(cells)] = _parse_cells(cells, index + 1, titles, range(len(cells)))
+    triples = table[:, columns.first[:, None] + np.arange(3)] * columns.scales[:, None]
+    return table[:, :_LEADING], Trajectories(tuple(columns.names), triples)
+
+
+def _parse_wide(
+    rows: list[bytes], columns: TableColumns, numbers: Sequence[int]
+) -> tuple[Float[np.ndarray, "T 2"], Trajectories]:
+    """`parse_table` of a table that is too large for an array, most of whose cells are blank."""
+    num_columns, texts = len(columns.titles), np.array(sorted(columns.texts), dtype=np.int64)
+    found = []
+    for row, number in zip(rows, numbers, strict=True):
+        ends = np.append(np.flatnonzero(np.frombuffer(row, dtype=np.uint8) == TAB[0]), len(row))
+        begins = np.append(0, ends[:-1] + 1)
+        filled = np.flatnonzero(ends > begins)
+        filled = filled[~np.isin(filled, texts)]
+        spans = zip(begins[filled].tolist(), ends[filled].tolist(), strict=True)
+        cells = [row[begin:end] for begin, end in spans]
+        inside = int(np.searchsorted(filled, num_columns))
+        _check_blank(cells[inside:], len(ends), num_columns, number)
+        filled = filled[:inside]
+        found.append((filled, _parse_cells(cells[:inside], number, columns.titles, filled.tolist())))
+    frames = np.repeat(np.arange(len(rows)), [len(filled) for filled, _ in found])
+    cells_at = np.concatenate([filled for filled, _ in found])
+    values = np.concatenate([values for _, values in found])
+    leading = np.full((len(rows), _LEADING), np.nan)
+    leads = cells_at < _LEADING
+    leading[frames[leads], cells_at[leads]] = values[leads]
+
+    num_names = len(columns.names)
+    places = np.full((num_columns, 2), -1)  # trajectory and axis of each column
+    for axis in range(3):
+        places[columns.first + axis] = np.stack([np.arange(num_names), np.full(num_names, axis)], axis=1)
+    there = (places[cells_at, 0] >= 0) & np.isfinite(values)
+    frames, values, places = frames[there], values[there], places[cells_at[there]]
+    keys, inverse = np.unique(frames * num_names + places[:, 0], return_inverse=True)
+    points = np.full((len(keys), 3), np.nan)
+    points[inverse, places[:, 1]] = values
+    frames, tracks = np.divmod(keys, num_names)
+    points *= columns.scales[tracks, None]
+    return leading, packed_trajectories(columns.names, len(rows), frames, tracks, points)
+
+
+def _check_blank(cells: Sequence[bytes], width: int, expected: int, number: int) -> None:
+    """Refuse cells behind the end of a table."""
+    if any(cell.strip() for cell in cells):
+        raise CaptureError(f"line {number} has {width} cells, expected {expected}")
 
 
 def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool:
@@ -248,20 +299,34 @@ def _check_last_line(rows: list[bytes], number: int, num_columns: int) -> None:
         )
 
 
-def _parse_cells(cells: list[bytes], number: int, titles: Sequence[str]) -> list[float]:
-    """Parse a row whose cells may hold blanks; an error names the cell that is not a number."""
-    values = []
-    for column, cell in enumerate(cells):
-        text = cell.decode("utf-8", "replace").strip()
-        try:
-            values.append(_BLANK if text in _BLANKS else float(text))
-        except ValueError:
-            mixed = "," in text and "." not in text and text.count(",") == 1
-            raise CaptureError(
-                f"line {number}, column {column + 1} ({titles[column]}): '{shortened(text)}' is not a "
-                f"number{', since others have decimal points' if mixed else ''}"
-            ) from None
+def _parse_cells(
+    cells: list[bytes], number: int, titles: Sequence[str], columns: Sequence[int]
+) -> NDArray[np.float64]:
+    """The numbers of a row, NaN for a blank; an error names the cell that is not a finite number."""
+    try:
+        values = np.array([float(cell) if cell else _BLANK for cell in cells])
+    except ValueError:
+        values = np.array([_cell_value(cell, number, titles, columns[n]) for n, cell in enumerate(cells)])
+    if np.isinf(values).any():
+        column = columns[int(np.isinf(values).argmax())]
+        raise CaptureError(
+            f"line {number}, column {column + 1} ({titles[column]}): infinite, expected a "
+            "finite number or a blank cell"
+        )
     return values
+
+
+def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) -> float:
+    """The number of a cell that may hold blanks."""
+    text = cell.decode("utf-8", "replace").strip()
+    try:
+        return _BLANK if text in _BLANKS else float(text)
+    except ValueError:
+        mixed = "," in text and "." not in text and text.count(",") == 1
+        raise CaptureError(
+            f"line {number}, column {column + 1} ({titles[column]}): '{shortened(text)}' is not a "
+            f"number{', since others have decimal points' if mixed else ''}"
+        ) from None
 
 
 LOWEST_RATE: Final = 1.0

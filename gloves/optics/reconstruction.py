@@ -88,25 +88,45 @@ def cast_rays(
     """
     roundness = optics[2]
     count = seen.shape[0]
+    blobs, touches = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
     for c in range(len(cameras.lenses)):
         pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
+        number = 0
         for s in range(count):
             usable[s, c] = radii[c, s] > 0.0
-            if not usable[s, c]:
-                continue
+            if usable[s, c]:
+                blobs[number] = s
+                number += 1
+        touches[:number] = False
+        for n in range(number):
+            x, y, size = centers[c, blobs[n], 0], centers[c, blobs[n], 1], radii[c, blobs[n]]
+            for m in range(n):
+                du, dv, reach = (
+                    centers[c, blobs[m], 0] - x,
+                    centers[c, blobs[m], 1] - y,
+                    radii[c, blobs[m]] + size,
+                )
+                if du * du + dv * dv < reach * reach:
+                    touches[n] = touches[m] = True
+        for n in range(number):
+            s = blobs[n]
             u, v, members = centers[c, s, 0], centers[c, s, 1], 1
-            for o in range(count):
-                if o == s or radii[c, o] == 0.0:
-                    continue
-                du, dv = centers[c, o, 0] - centers[c, s, 0], centers[c, o, 1] - centers[c, s, 1]
-                reach = radii[c, o] + radii[c, s]
+            for m in range(number if touches[n] else 0):
+                o = blobs[m]
+                du, dv, reach = (
+                    centers[c, o, 0] - centers[c, s, 0],
+                    centers[c, o, 1] - centers[c, s, 1],
+                    radii[c, o] + radii[c, s],
+                )
                 squared = du * du + dv * dv
-                if squared >= reach * reach:
+                if o == s or squared >= reach * reach:
                     continue
                 if squared > (roundness * reach) ** 2:
                     usable[s, c] = False
                     break
                 u, v, members = u + centers[c, o, 0], v + centers[c, o, 1], members + 1
+            if not usable[s, c]:
+                continue
             u, v = u / (members * inner[0]), v / (members * inner[1])
             length = np.sqrt(u * u + v * v + 1.0)
             for i in range(3):
@@ -163,10 +183,10 @@ def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough:
     while count >= enough:
         if not _nearest_point(directions, used, T_world_camera, point):
             break
-        worst, far = -1, gates[0]
+        worst, far = -1, gates[0] * gates[0]
         for c in range(len(used)):
             if used[c]:
-                off = _off(point, directions[c], T_world_camera[c])
+                off = _off_squared(point, directions[c], T_world_camera[c])
                 if off > far:
                     worst, far = c, off
         if worst < 0:
@@ -203,14 +223,14 @@ def _nearest_point(directions: Any, used: Any, T_world_camera: Any, point: Any) 
     return True
 
 
-@kernel
-def _off(point: Any, direction: Any, pose: Any) -> float:
-    """Distance [m] of a point from a camera's ray; infinite behind the camera."""
+@kernel(inline=True)
+def _off_squared(point: Any, direction: Any, pose: Any) -> float:
+    """Squared distance [m^2] of a point from a camera's ray; infinite behind the camera."""
     x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
     along = x * direction[0] + y * direction[1] + z * direction[2]
     if along <= 0.0:
         return np.inf
-    return float(np.sqrt(max(0.0, x * x + y * y + z * z - along * along)))
+    return float(x * x + y * y + z * z - along * along)
 
 
 @kernel
@@ -222,9 +242,15 @@ def _wide(directions: Any, used: Any, min_sine: float) -> bool:
             if first < 0:
                 first = c
             else:
-                cosine = np.dot(directions[first], directions[c])
-                return bool(1.0 - cosine * cosine >= min_sine * min_sine)
+                return bool(_sine_squared(directions[first], directions[c]) >= min_sine * min_sine)
     return False
+
+
+@kernel(inline=True)
+def _sine_squared(one: Any, other: Any) -> float:
+    """Squared sine of the angle between two unit directions (3,)."""
+    cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return float(1.0 - cosine * cosine)
 
 
 @kernel
@@ -243,14 +269,14 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
 def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
     """Mark the rays of a point as used; a camera without a ray of its source gives its nearest ray."""
     for c in range(len(T_world_camera)):
-        taken, near = -1, gate
+        taken, near = -1, gate * gate
         if usable[source, c]:
-            if _off(point, directions[source, c], T_world_camera[c]) <= gate:
+            if _off_squared(point, directions[source, c], T_world_camera[c]) <= near:
                 usable[source, c] = False
             continue
         for s in range(len(usable)):
             if usable[s, c]:
-                off = _off(point, directions[s, c], T_world_camera[c])
+                off = _off_squared(point, directions[s, c], T_world_camera[c])
                 if off <= near:
                     taken, near = s, off
         if taken >= 0:
@@ -277,9 +303,10 @@ def _meet_by_chance(
             two[c], two[k] = True, True
             found = _wide(pair, two, gates[1]) and _nearest_point(pair, two, T_world_camera, point)
             two[c], two[k] = False, False
-            if not found or max(
-                _off(point, pair[c], T_world_camera[c]), _off(point, pair[k], T_world_camera[k])
-            ) > gates[0]:  # fmt: skip
+            if not found or gates[0] * gates[0] < max(
+                _off_squared(point, pair[c], T_world_camera[c]),
+                _off_squared(point, pair[k], T_world_camera[k]),
+            ):
                 continue
             column, is_old = _false_column(point, before, now)
             fewest = min_rays[0] if is_old else min_rays[1]
@@ -297,7 +324,7 @@ def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera
     through = np.zeros(len(T_world_camera), dtype=np.bool_)
     for s, c in left:
         if usable[s, c] and not through[c]:
-            through[c] = _off(point, directions[s, c], T_world_camera[c]) <= gate
+            through[c] = _off_squared(point, directions[s, c], T_world_camera[c]) <= gate * gate
     return int(through.sum())
 
 

@@ -341,7 +341,7 @@ def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
                 x, y, z = marker[0] - pose[0, 3], marker[1] - pose[1, 3], marker[2] - pose[2, 3]
                 distance = np.sqrt(x * x + y * y + z * z)
                 ahead = -(x * normal[0] + y * normal[1] + z * normal[2])
-                seen[t, m, c] = (ahead > facing * distance) & in_picture(
+                seen[t, m, c] = ahead > facing * distance and in_picture(
                     inner, size, lens,
                     x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0],
                     x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1],

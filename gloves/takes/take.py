@@ -84,6 +84,8 @@ class MotionFormat(NamedTuple):
     """How a hand without a pose is written, in words."""
     steady: bool = False
     """Whether frames are written without times, so that they must come at a steady rate."""
+    keeps_axes: bool = False
+    """Whether positions stay in the take's axes, whatever points up."""
 
     def take_of(self, take: Take, rate: float | None) -> Take:
         """The poses of a take that are written, at a rate if given."""
@@ -116,8 +118,8 @@ MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".bvh": MotionFormat(write_bvh, HELD, steady=True),
     ".usda": MotionFormat(write_usd, "invisible"),
     ".usdc": MotionFormat(write_usd, "invisible"),
-    ".csv": MotionFormat(write_joint_csv, "blank"),
-    ".parquet": MotionFormat(write_joint_parquet, "null"),
+    ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
+    ".parquet": MotionFormat(write_joint_parquet, "null", keeps_axes=True),
     ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
     ".mot": MotionFormat(write_mot, HELD),
     OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
@@ -619,6 +621,8 @@ class Take:
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
+        A hand without any label has no columns if the other hand has one.
+
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
                 `ThumbTip`, and no frame may hold two hands.
@@ -627,9 +631,16 @@ class Take:
             CaptureError: There are no points.
         """
         names, labels = self.label_names, self.point_list.labels.astype(np.int64)
+        num_markers = len(self.hands[0].layout.names)
         if not sides:
             names = self.hands[0].layout.names
-            labels = np.where(labels >= 0, labels % len(names), -1)
+            labels = np.where(labels >= 0, labels % num_markers, -1)
+        else:
+            seen = np.isin(np.arange(len(self.hands)), labels[labels >= 0] // num_markers)
+            kept = np.ones(len(names), dtype=np.bool_)
+            kept[: num_markers * len(seen)] = np.repeat(seen | ~seen.any(), num_markers)
+            names = tuple(name for name, keeps in zip(names, kept, strict=True) if keeps)
+            labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
         return labeled_columns(frames, rows, names, self.rate)
@@ -674,6 +685,11 @@ class Take:
         check_choice(up, get_args(UpAxis), noun="axis that points up")
         path = Path(path)
         form = motion_format(path)
+        if up != "z" and form.keeps_axes:
+            raise ArgumentError(
+                f"up is {up} and the file {path}, expected a format with a direction that is up: "
+                f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
+            )
         form.write(path, posed_motion(form.take_of(self, None if rate is None else float(rate))), up)
 
     def save(self, path: str | Path) -> None:

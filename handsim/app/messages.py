@@ -152,6 +152,21 @@ def tell_state(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
+def told_share(what: str) -> Callable[[int, int], None]:
+    """A `Progress` that shows the share done and the time left where a running command shows its state."""
+    began = told = time.monotonic()
+
+    def show(done: int, total: int) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if _tellers and done and now >= told + (_RENEWED if sys.stderr.isatty() else EVERY):
+            told = now
+            left = (now - began) * (total - done) / done
+            tell_state(f"{what}: {100.0 * done / total:.0f} %, about {left:.0f} s left")
+
+    return show
+
+
 @contextmanager
 def _telling(tell: Callable[[str], None]) -> Iterator[None]:
     """Let `tell_state` tell this within the block."""
@@ -236,7 +251,10 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
 
 @contextmanager
 def named_steps(first: str) -> Iterator[Callable[[str], None]]:
-    """Names steps whose length is not known, on standard error: on a terminal the running one, else all."""
+    """Names steps whose length is not known, on standard error: on a terminal the running one, else all.
+
+    Without a `first` one, only what `tell_state` tells is shown.
+    """
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -260,7 +278,8 @@ def named_steps(first: str) -> Iterator[Callable[[str], None]]:
             last, due = name, now + EVERY
             console.print(step, soft_wrap=True, markup=False, highlight=False)
 
-    tell(first)
+    if first:
+        tell(first)
     with _telling(lambda line: tell(line, always=True)):
         yield tell
 

@@ -35,7 +35,11 @@ def export(
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
         _export_take(Path(source), out, fps, up)
-    elif source.lower().endswith(".json"):
+        return
+    if fps is not None or up != "z":
+        given = f"--fps {fps:g}" if fps is not None else f"--up {up}"
+        raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
+    if source.lower().endswith(".json"):
         check_outputs([source], [out])
         user = load_user(source)
         user.export(out)

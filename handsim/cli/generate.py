@@ -13,7 +13,7 @@ from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.app.output import place_of
 from handsim.app.workers import chosen_workers
 from handsim.hand.shape import SIDES
-from handsim.space.rig import HAND_REACH, ROOM_CENTER, distances_to_volume, load_rig
+from handsim.space.rig import HAND_REACH, distances_to_volume, load_rig
 from train.data.shards import Dataset
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation.generation import make_dataset
@@ -55,8 +55,10 @@ def _report(settings: GenerateSettings, out: Path) -> Path:
             "hand-hand" if len(load_layout(settings.glove).sides) == len(SIDES) else "single-hand"
         )
         rig = load_rig(settings.rig)
-        if distances_to_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME).min() < HAND_REACH:
+        if distances_to_volume(rig, np.array(settings.center), WRIST_VOLUME).min() < HAND_REACH:
             # A small rig stands where the hands of a simulated capture would move.
             return write_dataset_page(out / REPORT, Dataset(out))
-        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=settings.glove, rig=rig)
+        take = simulate_take(
+            kind, num_frames=_TAKE_FRAMES, glove=settings.glove, rig=rig, center=settings.center
+        )
         return write_dataset_page(out / REPORT, Dataset(out), present=take.markers_present(), rate=take.rate)

@@ -9,11 +9,14 @@ import numpy as np
 import tyro
 from jaxtyping import Bool
 
+from handsim.hand.shape import Side
+
 
 def label(
     capture: Annotated[Path, tyro.conf.Positional],
     out: Path,
     glove: str = "dense19",
+    hands: tuple[Side, ...] | None = None,
     labeler: str | None = None,
     threads: int = 1,
 ) -> None:
@@ -26,6 +29,7 @@ def label(
         out: Labeled .trc, .c3d or Motive .csv file; points that are not markers become columns Unlabeled1,
             Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
+        hands: Which hands are in the capture; both when not given.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
@@ -40,7 +44,7 @@ def label(
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
     with progress_bar("frames") as bar:
-        take = label_capture(capture, glove=glove, labeler=labeler, progress=bar)
+        take = label_capture(capture, glove=glove, hands=hands, labeler=labeler, progress=bar)
     points = take.point_list
     labeled = points.labels >= 0
     side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # -1 is the last one

@@ -114,7 +114,8 @@ def render(
     if merge:
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
-        if options != RenderOptions() or format != ("webdataset",):
+        own = (hands, people, glove, workers, cluster) == (None, None, "dense19", None, None)
+        if options != RenderOptions() or format != ("webdataset",) or not own:
             raise HandSimError("--merge copies pictures as they are; leave out the options of drawing")
         print_line(f"{out}: {merge_renderings(merge, place)} shards of {len(merge)} renderings")
         return

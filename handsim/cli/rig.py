@@ -89,7 +89,7 @@ def import_rig(
 
     Args:
         file: Vicon's .xcp, Qualisys' calibration (.xml or .txt), Motive's .mcal, OpenCV's .yml or .json with
-            intrinsics and extrinsics, or COLMAP's cameras.txt and images.txt.
+            intrinsics and extrinsics, Pose2Sim's .toml, or the folder of COLMAP's cameras and images.
         out: The rig, a .toml file.
         up: The axis that points up in the calibration; y for Motive and z for the others when not given.
             The rig's is z.

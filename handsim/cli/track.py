@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 
-from handsim.app.messages import print_line, progress_bar
+from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
@@ -79,7 +79,8 @@ def track(
         if capture is not None:
             tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
-            setup = TrackerSetup.of(settings)
+            with named_steps(""):  # a glove may have to be learned
+                setup = TrackerSetup.of(settings)
             tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
             if labeled is not None:  # last, because a failure must not cost the recording
                 write_capture(labeled, tracked.whole_take(out).labeled_capture())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable, Sequence
@@ -53,7 +54,12 @@ def _with_usual_settings(args: Sequence[str], prog: str) -> Callable[..., None]:
     """The command with the settings of the given labeler or preset as its defaults."""
     labeler, preset = given_option(args, "--labeler"), given_option(args, "--preset")
     kinds, presets = (one for one in KINDS if one == labeler), (one for one in PRESETS if one == preset)
-    return functools.partial(_train, settings=usual_settings(next(kinds, "set"), next(presets, None)))
+    kind = next(kinds, None)
+    settings = usual_settings(kind or "set", next(presets, None))
+    if kind == "set":  # of a preset for the paper's network the rest is kept
+        usual = usual_settings(kind)
+        settings = dataclasses.replace(settings, labeler=kind, knee=usual.knee, cnn=usual.cnn)
+    return functools.partial(_train, settings=settings)
 
 
 train: Final = PresetCommand(_with_usual_settings)

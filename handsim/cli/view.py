@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from handsim.app.messages import print_line, progress_bar
+from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
@@ -50,7 +51,7 @@ def view(
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
         time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
     """
-    from track.settings import USUAL_SIZE, TrackerSetup
+    from track.settings import TrackerSetup
     from track.viewer.contents import open_content
 
     check_source("file", file, live)
@@ -62,10 +63,12 @@ def view(
         if out is not None:
             check_take_file(out, live=True)
             check_outputs((rig, *options.files()), (out,))
-        _view_live(live, TrackerSetup.of(options.settings()), host, port, rig, out)
+        with named_steps(""):  # a glove may have to be learned
+            setup = TrackerSetup.of(options.settings())
+        _view_live(live, setup, host, port, rig, out)
         return
-    size = USUAL_SIZE if options.size in (None, "auto") else options.size
-    content = open_content(str(file), out=out, size=size, rig=rig, time=time)
+    _check_still(str(file), options, video, time)
+    content = open_content(str(file), out=out, size=options.size, rig=rig, time=time)
     if video is not None:
         _draw(str(file), content, video)
         return
@@ -74,6 +77,16 @@ def view(
         with interrupt_flag() as ended:
             print_line(f"{file} ({content.kind}): {address_of(server)} ; Ctrl-C ends it")
             run(ended)
+
+
+def _check_still(file: str, options: TrackerOptions, video: Path | None, time: float | None) -> None:
+    """Refuse options of a live tracker beside a file, and a time to open a video at."""
+    given = [one.name for one in fields(options) if one.name != "size" and getattr(options, one.name)]
+    if given:
+        names = ", ".join(f"--{name}" for name in given)
+        raise ArgumentError(f"given {names} and the file {file}, expected --live with it")
+    if video is not None and time is not None:
+        raise ArgumentError(f"given --time {time:g} and --video {video}, expected one of them")
 
 
 def _draw(name: str, content: Content, video: Path) -> None:

@@ -36,7 +36,7 @@ from handsim.hand.shape import (
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
 from handsim.kernels import pose_bones
-from handsim.space.transforms import MIRROR, euler_matrix, rigid
+from handsim.space.transforms import MIRROR, euler_matrix
 
 if TYPE_CHECKING:
     import mujoco
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 _MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
 _CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
 """Parent of each bone, and the number of its joints."""
+_AXES: Final = np.array([joint.axis for joint in JOINTS])
+_RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,35 +67,25 @@ class Skeleton:
     def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
         """`T_wrist_bone` of every bone at zero angles."""
         transforms = np.tile(np.eye(4), (NUM_BONES, 1, 1))
-        for number, bone in enumerate(BONES):
-            if bone.parent >= 0:
-                local = rigid(self.rotations[number], self.offsets[number])
-                transforms[number] = transforms[bone.parent] @ local
+        transforms[:, :3, :3], transforms[:, :3, 3] = self.rotations, self.offsets
+        for first in range(1, 4):  # the bones of all digits that are as far from the palm
+            bones = slice(first, None, 3)
+            transforms[bones] = transforms[_CHAIN[bones, 0]] @ transforms[bones]
         return transforms
 
 
 def build_skeleton(shape: HandShape) -> Skeleton:
     """Skeleton of a hand; a left hand is the mirror image, so equal angles give mirrored poses."""
     offsets, rotations = np.zeros((NUM_BONES, 3)), np.tile(np.eye(3), (NUM_BONES, 1, 1))
-    lengths = np.zeros(NUM_BONES)
-    lengths[0] = shape.knuckles[2, 0]
-    digits = euler_matrix(shape.base_angles)
-    for number, bone in enumerate(BONES):
-        if bone.digit < 0:
-            continue
-        index = (number - 1) % 3
-        lengths[number] = shape.bone_lengths[bone.digit, index]
-        if index == 0:
-            offsets[number] = shape.knuckles[bone.digit]
-            rotations[number] = digits[bone.digit]
-        else:
-            offsets[number, 0] = shape.bone_lengths[bone.digit, index - 1]
-    axes = np.array([joint.axis for joint in JOINTS])
+    # After the palm come the three bones of each digit.
+    offsets[1::3], rotations[1::3] = shape.knuckles, euler_matrix(shape.base_angles)
+    offsets[2::3, 0], offsets[3::3, 0] = shape.bone_lengths[:, 0], shape.bone_lengths[:, 1]
+    lengths = np.concatenate([shape.knuckles[2, :1], shape.bone_lengths.ravel()])
+    axes = _AXES.copy()
     if shape.side == "left":
         offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
         axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
-    ranges = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
-    return Skeleton(offsets, rotations, axes, ranges, lengths)
+    return Skeleton(offsets, rotations, axes, _RANGES.copy(), lengths)
 
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:

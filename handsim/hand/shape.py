@@ -222,7 +222,8 @@ class HandShape:
 
 def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
     """Refuse measures [m] beyond those of any hand, from which no model can be built."""
-    wrong = np.extract((np.asarray(values) < low) | (np.asarray(values) > high), values)
+    measures = np.asarray(values)
+    wrong = measures[(measures < low) | (measures > high)]
     if len(wrong):
         raise ArgumentError(f"{name} of a hand: {wrong[0]:g} m, expected {low:g} to {high:g} m")
 

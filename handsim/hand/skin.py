@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.hand.shape import DIGITS, NUM_BONES, PALM
+from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix
 
@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 def edge_table(quads: Int[np.ndarray, "Q 4"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "Q 4"]]:
     """Edges of a quad mesh (lower vertex first) and the edge from each corner of a quad to the next one."""
     ends = np.stack([quads, np.roll(quads, -1, axis=1)], axis=-1).reshape(-1, 2)
-    edges, inverse = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
-    return edges, inverse.reshape(quads.shape)
+    count = int(quads.max()) + 1
+    numbers, inverse = np.unique(ends.min(axis=1) * count + ends.max(axis=1), return_inverse=True)
+    return np.stack(np.divmod(numbers, count), axis=1), inverse.reshape(quads.shape)
 
 
 def catmull_clark(
@@ -483,11 +484,19 @@ def build_surface(shape: HandShape) -> HandSurface:
     Subdivision shrinks, so the cage is enlarged until the skin has the shape's girths, lengths, breadth and
     palm thickness. A left hand is the exact mirror image of the right one.
     """
-    template, vertices = _template(), rest_vertices([shape])[0]
+    template, vertices = _template(), _right_vertices(np.array(pack_hand(shape), HAND_DTYPE).tobytes()[1:])
     faces = template.faces
     if shape.side == "left":
         vertices, faces = vertices @ MIRROR, faces[:, ::-1]
     return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
+
+
+@functools.lru_cache(maxsize=4)
+def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
+    """`rest_vertices` of the bytes of a `HAND_DTYPE` after the side, which a pair of hands shares."""
+    shape: Any = np.frombuffer(b"\0" + measures, HAND_DTYPE).view(np.recarray)[0]
+    vertices: NDArray[np.float64] = rest_vertices([shape])[0]
+    return vertices
 
 
 def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:

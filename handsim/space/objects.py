@@ -5,6 +5,7 @@ Five objects come with handsim, in `data/objects.json`, made of simple solids; a
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -220,9 +221,8 @@ def object_names() -> tuple[str, ...]:
 
 def named_object(name: str) -> RigidObject:
     """One of the objects that come with handsim."""
-    library = _library()
-    check_choice(name, library, noun="object")
-    return _build(name, library[name])
+    check_choice(name, _library(), noun="object")
+    return _build(name)
 
 
 def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
@@ -302,9 +302,11 @@ def _library() -> dict[str, Any]:
     return library
 
 
-def _build(name: str, entry: dict[str, Any]) -> RigidObject:
+@functools.cache
+def _build(name: str) -> RigidObject:
     import trimesh
 
+    entry = _library()[name]
     parts: list[Part] = []
     surfaces: list[Any] = []
     for kind, numbers in entry["solids"]:

@@ -1,7 +1,8 @@
 """Cameras as OpenCV calibrates them: a YAML or JSON file of one camera, a stereo pair, or many.
 
-They are flat tables of numbers, which are parsed here: OpenCV's parser may never return from a damaged file,
-and the fast one of PyYAML ends the process where lists are nested deeply.
+ROS' CameraInfo is such a file, and so is the TOML of Pose2Sim and anipose with a table for each camera.
+YAML and JSON are flat tables of numbers, which are parsed here: OpenCV's parser may never return from a
+damaged file, and the fast one of PyYAML ends the process where lists are nested deeply.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import itertools
 import json
 import re
 import textwrap
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -17,10 +19,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, RigError, shortened
-from handsim.files.inputs import read_bytes, words_numbers
-from handsim.space.camera import Camera, Lens, brown_lens
-from handsim.space.rig import camera_names, checked_cameras, nearest_rotation
+from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
+from handsim.files.inputs import read_bytes, read_toml, words_numbers
+from handsim.space.camera import Camera, Lens, LensKind, brown_lens
+from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, nearest_rotation
 from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternions
 
 _MAX_OPENCV_BYTES: Final = 1 << 24
@@ -29,19 +31,46 @@ _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one,
 _MAX_BASELINE: Final = 5.0  # [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
+_DASH: Final = re.compile(r"^[ \t]*-[ \t](?=[ \t]*[-+.\d\[])", re.M)
 _LIST: Final = re.compile(r"[\[\],\s]+")
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
-_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist")
+_D: Final = (
+    "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist",
+    "distortions",
+)  # fmt: skip
 _WIDTH: Final = ("image_width", "imageWidth", "img_width", "width")
 _HEIGHT: Final = ("image_height", "imageHeight", "img_height", "height")
 _SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
 _FISHEYE: Final = ("fisheye_model", "fisheye")
+_MODEL: Final = (
+    "distortion_model", "distortionModel", "distortion_type", "distortion", "lens_model", "lensModel",
+    "lens_type", "camera_model", "cameraModel", "projection_model", "projection", "model_type",
+)  # fmt: skip
+"""Keys of the name of a lens."""
+_LOOSE_MODEL: Final = ("model", "camera_type", "lens", "type")
+"""Keys of the name of a lens, or of the camera's maker."""
+_LENSES: Final[dict[str, LensKind]] = {
+    **dict.fromkeys(("none", "pinhole", "perspective"), "pinhole"),
+    **dict.fromkeys(("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady"), "brown"),
+    **dict.fromkeys(("opencv", "standard", "rational_polynomial"), "brown"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencv_fisheye", "cv2_fisheye"), "fisheye"),
+    **dict.fromkeys(("kannala_brandt", "kannala_brandt8", "kb", "kb4", "kb8", "pinhole_equi"), "fisheye"),
+}
+"""Names of lenses. A pinhole camera may have coefficients of Brown's lens."""
+_SHOWN_LENSES: Final = (
+    "pinhole", "plumb_bob", "radtan", "rational_polynomial", "equidistant", "fisheye", "kannala_brandt",
+)  # fmt: skip
+_OTHER_LENSES: Final = {
+    "mei", "omni", "omnidirectional", "ucm", "eucm", "ds", "doublesphere", "fov", "ftheta", "unified", "ocam",
+    "scaramuzza", "equisolid", "stereographic", "orthographic",
+}  # fmt: skip
 _R: Final = ("R", "Rot", "rvec", "rotation")
 _T: Final = ("T", "t", "tvec", "translation")
 _PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
 _OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
-_OF_ONE: Final = (*_K, *_D, *_WIDTH, "W", *_HEIGHT, "H", *_SIZE, *_FISHEYE, *_R, *_T)
+_OF_ALL: Final = (*_WIDTH, *_HEIGHT, *_SIZE, *_FISHEYE, *_MODEL)
+_OF_ONE: Final = (*_K, *_D, "W", "H", *_OF_ALL, *_R, *_T)
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
 _MAX_CAMERAS: Final = 256
 
@@ -51,8 +80,9 @@ Sections = dict[str, Values]
 
 
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
-    """All cameras of a `.yml`, `.yaml` or `.json` (names: docs/rendering.md), or of such a pair of files."""
+    """All cameras of a `.yml`, `.yaml`, `.json` or `.toml`, or of a pair of files (docs/rendering.md)."""
     values, sections = _read(path)
+    values = _without_rectification(path, values)
     other = path.with_stem(_OTHERS.get(path.stem, path.stem))
     if other != path and other.is_file():
         more, others = _read(other)
@@ -73,11 +103,11 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
 
 
 def _many(values: Values, sections: Sections) -> list[Camera]:
-    """Cameras in one world; a size of the pictures outside their sections holds for all."""
+    """Cameras in one world; a size or a lens's name outside their sections holds for all."""
     if len(sections) > _MAX_CAMERAS:
         raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
-    common = {key: value for key, value in values.items() if key in (*_WIDTH, *_HEIGHT, *_SIZE)}
+    common = {key: value for key, value in values.items() if key in _OF_ALL}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
         try:
             if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
@@ -86,6 +116,17 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
         except HandSimError as error:
             raise RigError(f"camera '{shortened(given)}': {error}") from error
     return cameras
+
+
+def _without_rectification(path: Path, values: Values) -> Values:
+    """Values of ROS' CameraInfo as OpenCV's; in ROS 2 the keys K, D, R and P are in lower case."""
+    if {"k", "p", "distortion_model"} <= values.keys():
+        values = {key.upper() if key in ("k", "d", "r", "p") else key: value for key, value in values.items()}
+    if not {"K", "P", "R"} <= values.keys() or _find(values, (*_T, "T_world_camera")) is not None:
+        return values
+    told = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
+    warnings.warn(told, HandSimWarning, stacklevel=3)
+    return {key: value for key, value in values.items() if key != "R"}
 
 
 def _numbered_sections(values: Values) -> Sections:
@@ -144,22 +185,46 @@ def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _lens(values: Values, names: tuple[str, ...]) -> Lens:
-    found = _find(values, names)
+    found = _find(values, names) or ("distortion" if isinstance(values.get("distortion"), tuple) else None)
     given = () if found is None else _value_numbers(values, found, None)
-    model = str(values.get("distortion_model", ""))
-    flag = _find(values, _FISHEYE)
-    if model in ("equidistant", "fisheye") or (flag is not None and any(_value_numbers(values, flag, (1,)))):
-        if len(given) != 4:
+    if "fisheye" in _lens_kinds(values, any(given)):
+        if len(given) < 4 or any(given[4:]):
             raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
-        return Lens("fisheye", given)
+        return Lens("fisheye", given[:4])
     if any(given[5:]):
         raise RigError(
             f"{found} has {len(given)} coefficients, of which those after the fifth are not 0, expected the "
-            "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like"
+            "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like, or undistort the "
+            "pictures (cv2.undistort) and set the coefficients to 0"
         )
     if any(given) and len(given) < 4:
         raise RigError(f"{found} has {len(given)} coefficients, expected 4 or 5: k1, k2, p1, p2, k3")
     return brown_lens(*(*given, *[0.0] * 5)[:5])
+
+
+def _lens_kinds(values: Values, bent: bool) -> set[LensKind]:
+    """The kinds of lens that the values name; names that are not known are refused."""
+    kinds: set[LensKind] = set()
+    known = {name.replace("_", ""): kind for name, kind in _LENSES.items()}
+    for key in (*_MODEL, *_LOOSE_MODEL):
+        if not isinstance(values.get(key), str):
+            continue
+        text = str(values[key]).partition("\n")[0].partition("#")[0].strip("\"' \t")
+        name = re.sub(r"[^a-z0-9]", "", text.lower())
+        if name in known:
+            kinds.add(known[name])
+        elif name.endswith("brownconrady") and not bent:  # RealSense's variants
+            kinds.add("pinhole")
+        elif name and (key in _MODEL or name in _OTHER_LENSES):
+            raise RigError(f"{key}: {choices(text, _SHOWN_LENSES, noun='lens')}")
+    flag = _find(values, _FISHEYE)
+    if flag is not None:
+        words = {"true": (1.0,), "yes": (1.0,), "false": (0.0,), "no": (0.0,)}
+        on = words.get(str(values[flag]).lower()) or _value_numbers(values, flag, (1,))
+        return {"fisheye"} if any(on) else kinds
+    if len(kinds - {"pinhole"}) > 1:
+        raise RigError("the lens is named both as Brown's and as a fisheye, expected one of them")
+    return kinds
 
 
 def _size(values: Values) -> tuple[int, int]:
@@ -237,6 +302,11 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
 
 
 def _read(path: Path) -> tuple[Values, Sections]:
+    if path.suffix.lower() == ".toml":
+        tables = {name: one for name, one in read_toml(path, error=RigError).items() if isinstance(one, dict)}
+        for one in tables.values():
+            one["K"] = one.pop(TOML_MATRIX, None)
+        return {}, dict(_json_sections({name: one for name, one in tables.items() if one["K"]}))
     data = read_bytes(path, error=RigError, most=_MAX_OPENCV_BYTES)
     try:
         text = data.decode("utf-8-sig")
@@ -279,7 +349,7 @@ def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
 
 def _yaml_value(body: str) -> tuple[float, ...] | str:
     """The numbers of a number, list or matrix; anything else as text."""
-    body = body.strip()
+    body = _DASH.sub(" ", body).strip()
     data = _DATA.search(body)
     words = [word for word in _LIST.split(data[1] if data else body, _MAX_NUMBERS + 2) if word]
     return _few_numbers(words) or body.strip("\"' ")

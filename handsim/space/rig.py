@@ -13,14 +13,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Annotated, Any, Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from handsim._checks import check_type
-from handsim.errors import ArgumentError, HandSimError, RigError, choices
+from handsim.errors import ArgumentError, HandSimError, RigError, choices, shortened
 from handsim.files.inputs import (
     check_keys,
     number_list,
@@ -33,6 +33,7 @@ from handsim.files.inputs import (
     text_of,
 )
 from handsim.files.outputs import as_text, atomic_write
+from handsim.settings import Limits
 from handsim.space.camera import (
     Camera,
     CameraArrays,
@@ -164,7 +165,22 @@ def _written(values: Sequence[float]) -> str:
     return f"[{', '.join(repr(float(value) + 0.0) for value in values)}]"
 
 
+TOML_MATRIX: Final = "matrix"
+"""The key of a camera's K in the TOML files of Pose2Sim and anipose."""
+
+
+def foreign_camera(table: Mapping[str, Any]) -> str | None:
+    """The name of a camera's table in a TOML file of Pose2Sim or anipose, None in any other file."""
+    return next((key for key, one in table.items() if isinstance(one, dict) and TOML_MATRIX in one), None)
+
+
 def _parse(table: Mapping[str, Any], stem: str) -> RigFile:
+    foreign = foreign_camera(table)
+    if foreign is not None:
+        raise RigError(
+            f"[{shortened(foreign)}] with a {TOML_MATRIX} is a camera of Pose2Sim or anipose, expected "
+            "[[camera]]; handsim rig import makes a rig of such a file"
+        )
     check_keys(table, "the file", _TOP, optional=_TOP)
     name = table.get("name", stem)
     if not isinstance(name, str) or not name or not name.isprintable():
@@ -262,6 +278,10 @@ MAX_CAMERAS: Final = 32
 """A marker's visibility is one bit per camera in 32 bits."""
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
+LONGEST_SIDE: Final = 50.0
+"""No volume or room is longer, and no middle of one farther from the origin [m]."""
+Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
+"""The middle of such a space [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"

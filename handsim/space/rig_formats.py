@@ -13,7 +13,7 @@ OptiTrack Motive's `.mcal`, of Motive 3.2 and newer, is in UTF-16. `Extrinsic` h
 by row, the matrix whose columns are the camera's axes in the world: x right, y up, z backward. Motive's world
 has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; the one of `Intrinsic` is Motive's own.
 
-COLMAP's reconstructions are read as text: `cameras.txt` with the lenses, `images.txt` with the poses.
+COLMAP's reconstructions are `cameras` with the lenses and `images` with the poses, as `.txt` or `.bin`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from __future__ import annotations
 import codecs
 import dataclasses
 import re
+import struct
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
@@ -33,10 +34,17 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
-from handsim.files.inputs import read_bytes, shown, words_numbers
+from handsim.files.inputs import read_bytes, read_toml, shown, words_numbers
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.opencv_cameras import read_opencv_cameras
-from handsim.space.rig import NAMELESS, camera_names, checked_cameras, nearest_rotation, read_rig_file
+from handsim.space.rig import (
+    NAMELESS,
+    camera_names,
+    checked_cameras,
+    foreign_camera,
+    nearest_rotation,
+    read_rig_file,
+)
 from handsim.space.transforms import quaternion_matrix, rigid
 
 _MAX_VALUE: Final = 1e9  # of a number in any unit
@@ -319,16 +327,59 @@ _MODELS: Final = {
     "OPENCV_FISHEYE": 8,
 }
 """Known camera models, and their numbers of parameters."""
+_BINARY_MODELS: Final = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+)  # fmt: skip
 _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
     """A camera for each image of a reconstruction in meters, with the name of the image."""
     folder = path if path.is_dir() else path.parent
-    lenses = dict(_colmap_lens(folder / CAMERAS, line) for line in _colmap_lines(folder / CAMERAS))
-    lines = _colmap_lines(folder / IMAGES, keep_empty=True)
-    images = lines[::2]  # lines of points lie between
-    return checked_cameras(folder / IMAGES, [_colmap_image(folder / IMAGES, line, lenses) for line in images])
+    cameras, images = folder / CAMERAS, folder / IMAGES
+    if cameras.with_suffix(".bin").is_file() and not cameras.is_file():
+        cameras, images = cameras.with_suffix(".bin"), images.with_suffix(".bin")
+        lines = [_binary_lines(cameras, _binary_lens), _binary_lines(images, _binary_image)]
+    else:
+        # lines of points lie between those of images
+        lines = [_colmap_lines(cameras), _colmap_lines(images, keep_empty=True)[::2]]
+    lenses = dict(_colmap_lens(cameras, line) for line in lines[0])
+    return checked_cameras(images, [_colmap_image(images, line, lenses) for line in lines[1]])
+
+
+def _binary_lines(path: Path, read: Callable[[bytes, int], tuple[int, str]]) -> list[str]:
+    """The records of a binary file of COLMAP, as lines of its text."""
+    data, at, lines = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES), 8, []
+    try:
+        for _ in range(*struct.unpack_from("<Q", data)):
+            at, line = read(data, at)
+            lines.append(line)
+        if at > len(data):
+            raise ValueError("points are cut")
+    except (struct.error, ValueError, LookupError, OverflowError) as error:
+        raise RigError(
+            f"{path}: cut or damaged, or of an unknown version of COLMAP; colmap model_converter writes text"
+        ) from error
+    return lines
+
+
+def _binary_lens(data: bytes, at: int) -> tuple[int, str]:
+    """The end of a record of a camera, and its line."""
+    number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+    name = _BINARY_MODELS[model] if model >= 0 else ""
+    count = {**_MODELS, "FOV": 5, "THIN_PRISM_FISHEYE": 12}[name]
+    parameters = struct.unpack_from(f"<{count}d", data, at + 24)
+    return at + 24 + 8 * count, " ".join(map(str, (number, name, width, height, *parameters)))
+
+
+def _binary_image(data: bytes, at: int) -> tuple[int, str]:
+    """The end of a record of an image, with its points, and its line."""
+    values = struct.unpack_from("<i7di", data, at)
+    end = data.index(b"\0", at + 64)
+    name = data[at + 64 : end].decode("utf-8", "replace")
+    (points,) = struct.unpack_from("<Q", data, end + 1)
+    return end + 9 + 24 * points, " ".join(map(str, (*values, name)))
 
 
 def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
@@ -459,11 +510,11 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     """The cameras of a file, by its ending, with their kinds."""
     path, ending = Path(path), Path(path).suffix.lower()
-    if ending == ".toml":
+    if ending == ".toml" and foreign_camera(read_toml(path, error=RigError)) is None:
         return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))
-    if ending in _OPENCV:
+    if ending in (*_OPENCV, ".toml"):
         return tuple(map(LabCamera, read_opencv_cameras(path)))
-    if path.is_dir() or path.name in (CAMERAS, IMAGES):
+    if path.is_dir() or (path.stem in ("cameras", "images") and ending in (".txt", ".bin")):
         return tuple(map(LabCamera, read_colmap_cameras(path)))
     if ending in _CLOSED:
         raise RigError(f"{path}: {_CLOSED[ending]}")

@@ -5,8 +5,9 @@ Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of fram
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,9 +21,67 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of the world to axes with y up (glTF, BVH, OpenXR, OpenSim), about x."""
-    if up == "y":
-        return np.eye(3)
-    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return np.asarray(np.array(_PROGRAMS["openxr"][0]) @ _Z_UP[up])
+
+
+class ProgramAxes(NamedTuple):
+    """How a program writes positions and orientations."""
+
+    turn: Float[np.ndarray, "3 3"]
+    """Its axes in those of the world; a program with a left-handed world mirrors."""
+    quaternion: Float[np.ndarray, "4 4"]
+    """Takes a wxyz quaternion of a thing in the world to that in the program."""
+    unit: str
+    """Its unit of length, m or cm."""
+
+    @property
+    def scale(self) -> float:
+        """Its units in a meter."""
+        return 100.0 if self.unit == "cm" else 1.0
+
+    def positions(self, positions: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
+        """Positions (..., 3) [m] of the world in the program's axes and unit."""
+        return np.asarray(self.scale * positions @ self.turn.T)
+
+    def quaternions(self, quaternions: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
+        """Wxyz quaternions (..., 4) of the world in the program's axes."""
+        return np.asarray(quaternions @ self.quaternion.T)
+
+
+_Z_UP: Final = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+_PROGRAMS: Final = {  # axes in a world with z up, what is mirrored in a thing's own axes, and the unit
+    "ros": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), (1, 1, 1), "m"),  # REP 103: x forward, y left, z up
+    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward, as OpenGL
+    "unity": (((1, 0, 0), (0, 0, 1), (0, 1, 0)), (1, 1, -1), "m"),  # x right, y up, z forward
+    "unreal": (((1, 0, 0), (0, -1, 0), (0, 0, 1)), (1, -1, 1), "cm"),  # x forward, y right, z up
+}
+PROGRAMS: Final = tuple(_PROGRAMS)
+"""Names of the programs whose axes are known."""
+
+
+@functools.cache
+def program_axes(name: str, up: UpAxis) -> ProgramAxes:
+    """The axes of one of `PROGRAMS`, from a world whose axis `up` points up."""
+    axes, mirror, unit = _PROGRAMS[name]
+    turn = np.array(axes, dtype=float) @ _Z_UP[up]
+    # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
+    w, x, y, z = rotation_quaternions((turn @ np.diag(mirror))[None])[0]
+    after = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return ProgramAxes(turn, after @ np.diag([1.0, *np.prod(mirror) * np.array(mirror)]), unit)
+
+
+def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a world in which an axis points up to ours, with z up."""
+    return np.asarray(file_axes("z").T @ file_axes(up))
+
+
+def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """Poses in a rotated world: positions and orientations (wxyz), and what follows them; NaN stays."""
+    turned = np.array(poses, dtype=np.float64)
+    w, x, y, z = rotation_quaternions(turn[None])[0]
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ product.T
+    return turned
 
 
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -34,16 +93,23 @@ def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) 
     return rotation
 
 
+def cross(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """The vector product (3,) of two vectors; numpy's function for arrays takes twenty times as long."""
+    (x, y, z), (u, v, w) = first.tolist(), second.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
     unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(unit, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = unit if unit.ndim == 1 else np.moveaxis(unit, -1, 0)  # numbers are quicker than arrays
+    matrix = np.empty((*unit.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
+    matrix[..., 0, 2], matrix[..., 1, 0] = 2 * (x * z + w * y), 2 * (x * y + w * z)
+    matrix[..., 1, 1], matrix[..., 1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    matrix[..., 2, 0], matrix[..., 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return matrix
 
 
 def rigid(
@@ -57,9 +123,14 @@ def rigid(
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation matrices."""
-    from scipy.spatial.transform import Rotation
+    from handsim.kernels import write_matrix_quaternions
 
-    quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    quaternions: NDArray[np.float64] = np.empty((len(rotations), 4))
+    matrices = np.ascontiguousarray(rotations, dtype=np.float64)
+    if not write_matrix_quaternions(matrices, quaternions):  # to the nearest rotations
+        from scipy.spatial.transform import Rotation
+
+        quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
     return quaternions
 
 

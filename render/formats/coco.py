@@ -19,7 +19,8 @@ numeral.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -168,7 +169,7 @@ class CocoWriter(FolderWriter):
         """Write `annotations.json`."""
         path = self.folder / "annotations.json"
         with one_sentence(self.folder, "writing the annotations"):
-            save_text(path, _coco_file(self._records, CATEGORY))
+            save_text(path, _coco_file(self._records(), CATEGORY, self.folder))
         return [path]
 
 
@@ -188,13 +189,24 @@ class YoloWriter(CocoWriter):
         return [*super().finish(), path]
 
 
-def _coco_file(records: Callable[[], Iterable[dict[str, Any]]], category: dict[str, Any]) -> Iterator[str]:
-    """Pieces of a COCO file; `records` reads the shards twice, so that they need not fit into memory."""
+def _coco_file(records: Iterable[dict[str, Any]], category: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Pieces of a COCO file; annotations wait in a file of the folder, so that memory need not hold them."""
     yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json([category])},\n"images":'
-    yield from json_list(image for image, _ in numbered(records()))
-    yield ',\n"annotations":'
-    yield from json_list(hand for _, hands in numbered(records()) for hand in hands)
-    yield "}\n"
+    with tempfile.TemporaryFile("w+", dir=folder, encoding="utf-8") as waiting:
+
+        def images() -> Iterator[dict[str, Any]]:
+            separator = "\n"
+            for image, hands in numbered(records):
+                for hand in hands:
+                    waiting.write(separator + to_json(hand))
+                    separator = ",\n"
+                yield image
+
+        yield from json_list(images())
+        yield ',\n"annotations":['
+        waiting.seek(0)
+        yield from waiting
+    yield "\n]}\n"
 
 
 SPLIT: Final = "train"
@@ -310,9 +322,6 @@ class InterhandWriter(CocoWriter):
         start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
         cameras: dict[str, tuple[str, dict[str, Any]]] = {}
 
-        def pictures() -> Iterator[dict[str, Any]]:
-            return _with_numerals(self._records(), cameras)
-
         def joints() -> Iterator[str]:
             yield f'{{"{CAPTURE}":{{'
             for index, (number, record) in enumerate(frames_once(self._records())):
@@ -322,7 +331,8 @@ class InterhandWriter(CocoWriter):
         category = {"id": 1, "name": "hand", "supercategory": "hand"}
         with one_sentence(self.folder, "writing the annotations"):
             save_text(Path(f"{start}_joint_3d.json"), joints())
-            save_text(Path(f"{start}_data.json"), _coco_file(pictures, category))
+            pictures = _with_numerals(self._records(), cameras)
+            save_text(Path(f"{start}_data.json"), _coco_file(pictures, category, self.folder))
             fields = ("campos", "camrot", "focal", "princpt")
             table = {name: {number: one[name] for number, one in cameras.values()} for name in fields}
             save_text(Path(f"{start}_camera.json"), [to_json({str(CAPTURE): table}) + "\n"])

@@ -25,6 +25,7 @@ _UP: Final = 2  # PNG's filter that subtracts the row above
 # DEFLATE's alphabet: bytes, the end of a block, and lengths of runs, whose last one is a code of its own.
 _END, _LONGEST_SYMBOL, _SYMBOLS = 256, 285, 286
 _SHORTEST, _LONGEST = 3, 258  # of runs
+_ADLER: Final = 65521  # largest prime below 2^16
 _MOST_BITS: Final = 15  # of a code
 _TOKENS: Final = _END + _LONGEST + 1  # bytes, the end, and 256 + length for runs
 _HEADER_WORDS: Final = 48  # room for the code's lengths and the last word
@@ -44,15 +45,14 @@ def encode_png(
     data = words.view(np.uint8)[:size]
     _subtract_above(rows, data.reshape(height, -1))
     tokens = np.empty(len(data) + 1, np.uint16)
-    tokens = tokens[: _tokenize(data, words, tokens)]
-    counts = _counts(tokens)
+    counts = np.zeros(_TOKENS, np.int64)
+    length, checksum = _tokenize(data, words, tokens, counts)
+    tokens = tokens[:length]
     lengths = _code_lengths(_symbol_counts(counts))
     codes, sizes = _codes(lengths)
     block = np.empty(_HEADER_WORDS + int(counts @ sizes.astype(np.int64)) // 32, np.uint32)
     length = _write_block(tokens, lengths, codes | sizes << np.uint64(32), block)
-    packed = (
-        _ZLIB + block.astype("<u4", copy=False).tobytes()[:length] + struct.pack(">I", zlib.adler32(data))
-    )
+    packed = _ZLIB + block.astype("<u4", copy=False).tobytes()[:length] + struct.pack(">I", checksum)
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))]
     chunks += [(b"tEXt", f"{word}\0{line}".encode("latin-1")) for word, line in (text or {}).items()]
     return _SIGNATURE + b"".join(_chunk(*chunk) for chunk in (*chunks, (b"IDAT", packed), (b"IEND", b"")))
@@ -75,17 +75,21 @@ def _subtract_above(rows: Bytes, filtered: Bytes) -> None:
 
 
 @kernel
-def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16]) -> int:
-    """Write the tokens of some bytes and the end's, and return their number.
+def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16], counts: Integers) -> Any:
+    """Write the tokens of some bytes and the end's, and count them; return their number and Adler's checksum.
 
     `words` are the same bytes, eight in each, behind which zeros follow.
     """
     count = place = 0
+    total, weighted = np.int64(1), np.int64(0)  # Adler's sums; 63 bits hold those of 250 million bytes
     while place < len(data):
-        value = data[place]
+        value = np.int64(data[place])
         tokens[count] = value
+        counts[value] += 1
         count += 1
         place += 1
+        total += value
+        weighted += total
         if place == len(data) or data[place] != value:
             continue
         start = place
@@ -95,25 +99,21 @@ def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16]
                 while place + 8 <= len(data) and words[place >> 3] == 0:
                     place += 8
         run = place - start
+        weighted += run * total + value * (run * (run + 1) // 2)
+        total += run * value
         while run >= _SHORTEST:
             length = min(run, _LONGEST)
             tokens[count] = _END + length
+            counts[_END + length] += 1
             count += 1
             run -= length
         for _ in range(run):
             tokens[count] = value
+            counts[value] += 1
             count += 1
     tokens[count] = _END
-    return count + 1
-
-
-@kernel
-def _counts(tokens: NDArray[np.uint16]) -> Any:
-    """How often each token (515,) comes; in two tables, because equal tokens often follow one another."""
-    counts = np.zeros((2, _TOKENS), np.int64)
-    for n in range(len(tokens)):
-        counts[n & 1, tokens[n]] += 1
-    return counts[0] + counts[1]
+    counts[_END] += 1
+    return count + 1, (weighted % _ADLER) << 16 | total % _ADLER
 
 
 @kernel

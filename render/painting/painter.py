@@ -6,6 +6,7 @@ painter shades each pixel once, after its nearest face is known, and four times 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple
 
@@ -59,12 +60,12 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     width, height = camera.size
     meshes = _meshes(camera, drawn)
     counts = np.cumsum([0, *(len(mesh.corners) for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)])
-    corners = np.concatenate([mesh.corners for mesh in meshes])
-    nearness, first = nearest_faces(corners, faces, (2 * width, 2 * height), farthest=0.0)
+    surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
+    nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
     lamps, around = _lamp_table(lighting), np.zeros((9, 3))
     around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
     casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
+    corners = np.concatenate([mesh.corners for mesh in meshes])
     sides = 2.0 * np.array([width, height])
     with np.errstate(invalid="ignore"):  # NaN behind the camera
         inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
@@ -108,8 +109,9 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
     return meshes
 
 
+@functools.lru_cache(maxsize=4)
 def _lamp_table(lighting: Lighting) -> Doubles:
-    """Rows (L, 9) for `shading.shade`; lamps in one direction share a row."""
+    """Rows (L, 9) for `shading.shade`; lamps in one direction share a row. They are not to be written to."""
     rows: dict[tuple[float, float, float], Doubles] = {}
     for number, lamp in enumerate(lighting.lamps):
         towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
@@ -162,12 +164,13 @@ def _add_surface(
     the `ShadowMap` [m]; `texels` is empty without a texture.
     """
     width, end = first.shape[1] // 2, begin + len(faces)
-    block = np.empty((SPOT, _BLOCK), np.float32)
+    block = np.zeros((SPOT, _BLOCK), np.float32)
     places, shares = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.float32)
     spot = row = start = 0
     for place in range(len(covered) + 1):
         if spot > _BLOCK - 4 or place == len(covered):
-            spots = np.ascontiguousarray(block[:, :spot])
+            # A copy takes time; a full block has a few points of before, or zeros, behind the last one.
+            spots = block if spot > _BLOCK - 4 else np.ascontiguousarray(block[:, :spot])
             light = shade(spots, texels, finish, to_linear, lamps, ambient, to_map, nearest, bias)
             for k in range(3):
                 display(light[k], spots[TINT + k], to_display)
@@ -202,14 +205,14 @@ def _add_surface(
 @kernel(inline=True)
 def _samples(nearness: Floats, first: NDArray[np.int32], begin: int, end: int, row: int, column: int) -> Any:
     """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths."""
-    count, most, least = 0, 0.0, np.inf
-    for i in range(2):
-        for j in range(2):
-            if begin <= first[2 * row + i, 2 * column + j] < end:
-                count += 1
-                most = max(most, nearness[2 * row + i, 2 * column + j])
-                least = min(least, nearness[2 * row + i, 2 * column + j])
-    return count, count == 4 and most - least < _SMOOTH * most
+    i, j = 2 * row, 2 * column
+    count = (begin <= first[i, j] < end) + (begin <= first[i, j + 1] < end)
+    count += (begin <= first[i + 1, j] < end) + (begin <= first[i + 1, j + 1] < end)
+    if count < 4:
+        return count, False
+    a, b, c, d = nearness[i, j], nearness[i, j + 1], nearness[i + 1, j], nearness[i + 1, j + 1]
+    most, least = np.float64(max(a, b, c, d)), np.float64(min(a, b, c, d))
+    return count, most - least < _SMOOTH * most
 
 
 @kernel(inline=True)

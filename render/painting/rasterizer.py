@@ -26,7 +26,6 @@ from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
 _ROUNDING: Final = 1e-12  # of barycentric coordinates, so that no pixel on a common side falls between faces
-_NARROW: Final = 6  # [px] width of a triangle's box up to which each of its pixels is tested
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +76,7 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     local = camera.local(surface.vertices)
     faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
     corners = project(local, camera.K)
-    inverse, first = nearest_faces(corners, faces, camera.size, farthest=0.0)
+    inverse, first = nearest_faces([(corners, faces)], camera.size, farthest=0.0)
     depth = np.zeros((height, width), dtype=np.float32)
     normals = np.zeros((height, width, 3), dtype=np.float32) if with_normals else None
     parts, instances, markers = (np.zeros((height, width), dtype=np.uint8) for _ in range(3))
@@ -90,19 +89,22 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
 
 
 def nearest_faces(
-    corners: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
+    surfaces: Sequence[tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]],
     size: tuple[int, int],
     *,
     farthest: float,
 ) -> tuple[Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
     """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
 
-    Faces that run counter-clockwise in the picture, where y is down, are drawn.
+    Surfaces are corners and faces, whose numbers go on from one surface to the next. Faces that run
+    counter-clockwise in the picture, where y is down, are drawn.
     """
     nearness = np.full(size[::-1], farthest, dtype=np.float32)
     first = np.full(size[::-1], -1, dtype=np.int32)
-    _draw(corners, faces, nearness, first)
+    begin = 0
+    for corners, faces in surfaces:
+        _draw(corners, faces, begin, nearness, first)
+        begin += len(faces)
     return nearness, first
 
 
@@ -124,20 +126,25 @@ def project(local: Doubles, K: Doubles) -> Any:
     return corners
 
 
-@kernel
-def _where_positive(value: float, step: float, low: float, high: float) -> Any:
-    """The part of low..high where `value + step * place` is positive, and one place more on either side."""
+@kernel(inline=True)
+def _narrowed(value: float, step: float, inverse: float, low: float, high: float) -> Any:
+    """The part of low..high where `value + step * place` is not negative; `inverse` is one over the step."""
+    bound = -value * inverse
     if step > 0.0:
-        return max(low, -value / step - 1.0), high
+        return bound if bound > low else low, high
     if step < 0.0:
-        return low, min(high, -value / step + 1.0)
-    return low, high
+        return low, bound if bound < high else high
+    return low, high if value >= 0.0 else -1.0
 
 
 @kernel
-def _draw(corners: Doubles, faces: Integers, nearness: Floats, first: NDArray[np.int32]) -> None:
-    """Draw faces into a z-buffer `nearness` with their numbers `first`, both (H, W); see `nearest_faces`."""
+def _draw(corners: Doubles, faces: Integers, begin: int, nearness: Floats, first: NDArray[np.int32]) -> None:
+    """Draw faces into a z-buffer `nearness` with their numbers `first`, both (H, W); see `nearest_faces`.
+
+    The first face has the number `begin`.
+    """
     height, width = nearness.shape
+    nearest, numbers = nearness.reshape(-1), first.reshape(-1)
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         ax, ay, az = corners[a, 0], corners[a, 1], corners[a, 2]
@@ -154,28 +161,26 @@ def _draw(corners: Doubles, faces: Integers, nearness: Floats, first: NDArray[np
         top, bottom = max(0, int(np.ceil(low_y - 0.5))), min(height - 1, int(np.floor(high_y - 0.5)))
         scale = 1.0 / area
         step_v, step_w = cy * scale, -by * scale
-        begin, end = left, right
+        step_u = -step_v - step_w
+        # One division for each side of a face is quicker than one for each of its rows.
+        inverse_v, inverse_w, inverse_u = 1.0 / step_v, 1.0 / step_w, 1.0 / step_u
+        x = left + 0.5 - ax
         for row in range(top, bottom + 1):
             y = row + 0.5 - ay
-            if right - left > _NARROW:  # most of a slanted triangle's box is outside of it
-                x = left + 0.5 - ax
-                v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
-                low, high = _where_positive(v, step_v, 0.0, float(right - left))
-                low, high = _where_positive(w, step_w, low, high)
-                low, high = _where_positive(1.0 - v - w, -step_v - step_w, low, high)
-                if low > high:
-                    continue
-                begin, end = left + int(low), left + int(high)
-            x = begin + 0.5 - ax
             v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
-            for column in range(begin, end + 1):
-                if v >= -_ROUNDING and w >= -_ROUNDING and v + w <= 1.0 + _ROUNDING:
-                    near = az + v * bz + w * cz
-                    if near > nearness[row, column]:
-                        nearness[row, column] = near
-                        first[row, column] = face
-                v += step_v
-                w += step_w
+            low, high = 0.0, float(right - left)
+            low, high = _narrowed(v + _ROUNDING, step_v, inverse_v, low, high)
+            low, high = _narrowed(w + _ROUNDING, step_w, inverse_w, low, high)
+            low, high = _narrowed(1.0 - v - w + _ROUNDING, step_u, inverse_u, low, high)
+            if low > high:
+                continue
+            start = row * width + left
+            for column in range(int(np.ceil(low)), int(np.floor(high)) + 1):
+                near = az + (v + column * step_v) * bz + (w + column * step_w) * cz
+                place = np.uint64(start + column)  # saves a test for negative indices
+                if near > nearest[place]:
+                    nearest[place] = near
+                    numbers[place] = begin + face
 
 
 @kernel

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
+from handsim.space.transforms import cross
 from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, nearest_faces, project
@@ -26,6 +27,7 @@ from render.scenery.backgrounds import Backdrop
 from render.scenery.lights import Lighting
 
 _TEXELS: Final = 256  # side of a shadow map; edges are a few millimeters soft on half a meter, as in rooms
+_LOOKED_UP: Final = 4  # texels each way that one look-up reads
 _FREE: Final = 3.0  # free border of a shadow map, for reads of neighbors [texels]
 _COARSE: Final = 4  # size of a pixel of the shadow's mask, whose edges are soft, in pixels of the picture
 _MARGIN: Final = 0.15  # border around a picture where a hand still counts as in it, as a share of its size
@@ -38,7 +40,9 @@ class ShadowMap(NamedTuple):
 
     to_map: Float[np.ndarray, "3 4"]
     """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
-    nearest: Float32[np.ndarray, "N N"]  # nearness [m], minus infinity where nothing is
+    nearest: Float32[np.ndarray, "3 N N"]
+    """Nearness [m], minus infinity where nothing is; then the largest and the least of the 4 x 4 texels that
+    begin at each."""
     bias: float  # how much nearer a surface must be to cast a shadow [m]: about a texel
 
 
@@ -49,11 +53,15 @@ def shadow_map(
     seen: Bool[np.ndarray, "V"],
 ) -> ShadowMap:
     """The shadow map of a surface for a lamp in this unit direction, with room for its seen vertices."""
-    aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
+    aside = cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
-    rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
+    rotation = np.stack([aside, cross(aside, towards), towards])  # rows run down, as in pictures
     corners, to_map, scale = _onto_map(points, rotation, seen if seen.any() else ~seen)
-    nearest, _ = nearest_faces(corners, faces, (_TEXELS, _TEXELS), farthest=-np.inf)
+    nearest = np.empty((3, _TEXELS, _TEXELS), np.float32)
+    nearest[0], _ = nearest_faces([(corners, faces)], (_TEXELS, _TEXELS), farthest=-np.inf)
+    around = np.ones((_LOOKED_UP, _LOOKED_UP), np.uint8)
+    cv2.dilate(nearest[0], around, nearest[1], anchor=(0, 0))
+    cv2.erode(nearest[0], around, nearest[2], anchor=(0, 0))
     return ShadowMap(to_map, nearest, 1.5 / scale)
 
 
@@ -87,15 +95,19 @@ def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float,
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
     near = to_map[2, 0] * x + to_map[2, 1] * y + to_map[2, 2] * z + to_map[2, 3] + bias
     column, row = int(np.floor(across)) - 1, int(np.floor(down)) - 1
-    size = len(nearest)
-    if column < 0 or row < 0 or column + 4 > size or row + 4 > size:
+    size = nearest.shape[1]
+    if column < 0 or row < 0 or column + _LOOKED_UP > size or row + _LOOKED_UP > size:
         return 1.0
+    if nearest[1, row, column] <= near:  # most points are in the light or in the shadow as a whole
+        return 1.0
+    if nearest[2, row, column] > near:
+        return 0.0
     right, below = across - np.floor(across), down - np.floor(down)
     lit = 0.0
-    for i in range(4):
+    for i in range(_LOOKED_UP):
         high = 1.0 - below if i == 0 else below if i == 3 else 1.0
-        for j in range(4):
-            if nearest[row + i, column + j] <= near:
+        for j in range(_LOOKED_UP):
+            if nearest[0, row + i, column + j] <= near:
                 lit += high * (1.0 - right if j == 0 else right if j == 3 else 1.0)
     return lit / 9.0
 
@@ -122,7 +134,7 @@ def light_behind(
     width, height = (-(-side // _COARSE) for side in camera.size)
     corners = project(fallen, camera.K)
     corners[:, :2] /= _COARSE
-    _, front = nearest_faces(corners, faces, (width, height), farthest=0.0)
+    _, front = nearest_faces([(corners, faces)], (width, height), farthest=0.0)
     mask = (front >= 0).astype(np.float32)
     if not mask.any():
         return None
@@ -301,7 +313,7 @@ def shade(
         lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
         ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
-        nearest: `ShadowMap.nearest` (N, N) of the first lamp [m].
+        nearest: `ShadowMap.nearest` (3, N, N) of the first lamp [m].
         bias: `ShadowMap.bias` of the first lamp [m].
     """
     count = spots.shape[1]

@@ -173,6 +173,8 @@ class Backgrounds:
             raise HandSimError(f"shares of backgrounds are {shares}, expected none negative and one positive")
         if every["photo"] > 0.0 and self.photos is None:
             raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in")
+        if every["photo"] == 0.0 and self.photos is not None:
+            raise HandSimError(f"photos is {self.photos}, expected a share of the background photo with it")
         object.__setattr__(self, "shares", every)
         object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
 

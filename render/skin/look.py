@@ -25,7 +25,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import HandShape
 from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera
-from handsim.space.transforms import MIRROR
+from handsim.space.transforms import MIRROR, cross
 from render.fields import smooth
 from render.frames import Doubles
 
@@ -287,10 +287,10 @@ def bent_rings(rings: Doubles, elbow: float, towards: Doubles) -> Doubles:
     turned = np.flatnonzero(beyond > -_ELBOW_BEND)
     start = middles[turned[0]] - (beyond[turned[0]] + _ELBOW_BEND) * ahead
     beyond[-1] = REACH
-    axis = np.cross(ahead, towards)
+    axis = cross(ahead, towards)
     sine = float(np.linalg.norm(axis))
-    axis = axis / sine if sine > 1e-6 else np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
-    most, aside = np.arctan2(sine, ahead @ towards), np.cross(axis, ahead)
+    axis = axis / sine if sine > 1e-6 else cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    most, aside = np.arctan2(sine, ahead @ towards), cross(axis, ahead)
     fine = np.concatenate([np.linspace(-_ELBOW_BEND, _ELBOW_BEND, 33), [REACH]])
     angles = most * smooth(fine, -_ELBOW_BEND, _ELBOW_BEND)
     ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
@@ -332,7 +332,7 @@ def _out_of_pictures(
     elbow: Doubles, forearm: Doubles, way: Doubles, axis: Doubles, cameras: Sequence[Camera]
 ) -> Doubles:
     """The direction nearest to `way`, rotated about `axis`, in which an arm ends in no picture."""
-    aside = np.cross(axis, way)
+    aside = cross(axis, way)
     flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
     tried = np.concatenate([flat - tilt * axis for tilt in _TILTS])
     tried /= np.linalg.norm(tried, axis=1, keepdims=True)

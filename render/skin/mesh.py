@@ -385,10 +385,10 @@ class PosableSkin:
         shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)
         corners = atlas.corners
         return DrawnSkin(
-            points[corners].astype(np.float32),
-            normals[corners].astype(np.float32),
+            points.astype(np.float32).take(corners, axis=0),
+            normals.astype(np.float32).take(corners, axis=0),
             atlas.uv,
-            shade[corners].astype(np.float32),
+            shade.astype(np.float32).take(corners),
             self._corner_faces,
             face_parts(),
             self._coarse_faces,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -10,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.record import FOLDER, load_figures, save_figures
-from benchmarks.results import PAGE, README, TEMPLATE, filled
+from benchmarks.record import FOLDER, Conditions, load_figures, save_figures
+from benchmarks.results import PAGE, README, TEMPLATE, filled, speed_run
 
 ROOT = Path(__file__).resolve().parents[2]
 NUMBER = re.compile(r"\d+\.\d+")
@@ -34,7 +35,8 @@ def test_the_readme_has_the_kept_figures():
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
 def test_every_file_says_where_its_figures_come_from(path):
     content = json.loads(path.read_text("utf-8"))
-    assert set(content) == {"command", "commit", "machine", "date", "figures"} or "source" in content
+    origin = {"command", "commit", "machine", "date", "figures"}
+    assert set(content) - {"conditions"} == origin or "source" in content
     assert all(figure["what"] and figure["value"] is not None for figure in content["figures"].values())
 
 
@@ -51,3 +53,27 @@ def test_figures_are_kept_with_their_origin(tmp_path):
     assert commit.stdout.startswith(content["commit"]) and "cores" in content["machine"]
     assert content["figures"] == {"median": {"what": "of a frame [ms]", "value": [[0.5, None], 0.666667, 7]}}
     assert load_figures(tmp_path)["speed"].median[0][0] == 0.5
+
+
+def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
+    conditions = Conditions(
+        seeds=(3, 4),
+        is_quick=False,
+        left_out=("the sections rays, labels", "mink"),
+        processors=6,
+        vectors="AVX2",
+        threads={"torch": "1", "OpenBLAS": "5"},
+        load=(0.04, 1.26),
+    )
+    path = save_figures("speed", {}, tmp_path, conditions)
+    origin = json.loads(path.read_text("utf-8"))
+    assert speed_run(tmp_path) == (
+        "This run was of the seeds 3, 4, on 6 processors with AVX2. Left out: the sections rays, labels; "
+        "mink. Threads: torch 1, OpenBLAS 5. 0.0 processes wanted to run before it, and 1.3 at its end. "
+        f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
+    )
+    whole = str(dataclasses.replace(conditions, left_out=(), is_quick=True))
+    assert whole.startswith("This run was of a few frames of the seeds 3, 4, on 6 processors")
+    assert " Nothing was left out. " in whole
+    save_figures("speed", {}, tmp_path)
+    assert speed_run(tmp_path).startswith(f"Commit {origin['commit']}")

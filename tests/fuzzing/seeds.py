@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import struct
 from pathlib import Path
 
 import cv2
@@ -52,7 +53,7 @@ def capture() -> Capture:
 
 
 def trc(folder: Path) -> list[Path]:
-    """As we write it; with commas, twice as many in line 3 trajectories without a name; as Excel's."""
+    """As we write it; with commas, twice as many in line 3 trajectories without a name; Excel's; spaces."""
     write_capture(folder / "take.trc", capture())
     lines = (folder / "take.trc").read_text().splitlines()
     lines[2] = lines[2].replace("\t", "\t\t")
@@ -60,7 +61,12 @@ def trc(folder: Path) -> list[Path]:
     (folder / "commas.trc").write_text("\n".join(lines).replace("\t", ",") + "\n")
     european = (folder / "take.trc").read_text().replace(".", ",").encode("utf-16")
     (folder / "excel.trc").write_bytes(european)
-    return [folder / "take.trc", folder / "commas.trc", folder / "excel.trc"]
+    words = (
+        (folder / "take.trc").read_text().replace("Unlabeled 7", "g").replace("\t" * 4, "\tnan\tnan\tnan\t")
+    )
+    spaced = "\n".join(" ".join(line.split()) for line in words.splitlines())
+    (folder / "spaces.trc").write_text(spaced + "\n")
+    return [folder / f"{name}.trc" for name in ("take", "commas", "excel", "spaces")]
 
 
 def c3d(folder: Path) -> list[Path]:
@@ -121,10 +127,25 @@ def camera_files(folder: Path) -> list[Path]:
             file.write(name, np.diag([500.0, 500.0, 1.0]) if name != "R" else np.eye(3))
         file.write("D1", np.array([[0.1, -0.02, 0.001, 0.002, 0.0]]))
         file.release()
+    pinhole = "[one]\nsize = [640, 480]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\n"
+    pose = "rotation = [0.1, 0.2, 0.3]\ntranslation = [0.1, 0, 1]\n"
+    (folder / "calib.toml").write_text(
+        f"{pinhole}distortions = [0.1, 0, 0, 0]\n{pose}[metadata]\nerror = 0.0\n"
+    )
+    binary = folder / "0"
+    binary.mkdir()
+    (binary / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, 1, 640, 480, 500, 500, 320, 240))
+    image = struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 1, 1) + b"one.jpg\0"
+    (binary / "images.bin").write_bytes(image + struct.pack("<Qddq", 1, 1.0, 2.0, -1))
+    (folder / "info.yaml").write_text(
+        "height: 480\nwidth: 640\ndistortion_model: equidistant\nd:\n- 0.1\n- 0.0\n- 0.0\n- 0.0\n"
+        "k: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
+        "p: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]\n---\n"
+    )
     (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 640 480 500 501 320 240 0.1 0.01 0 0\n")
     (folder / "images.txt").write_text("1 1 0 0 0 0.1 0.2 0.3 1 one.jpg\n\n2 0 1 0 0 0 0 1 1 two.jpg\n\n")
-    names = ("desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt")
-    return [folder / name for name in names]
+    names = ("desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt", "calib.toml", "info.yaml")
+    return [*(folder / name for name in names), binary / "cameras.bin", binary / "images.bin"]
 
 
 def calibrations(folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gloves import MarkerLayout, MarkerPlace, attach, load_layout
+from gloves import Attachment, MarkerLayout, MarkerPlace, attach, load_layout
 from gloves.fit import (
     _ray,
     attach_markers,
@@ -23,7 +23,7 @@ from gloves.fit import (
 )
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import LayoutError
-from handsim.hand.shape import EVERYBODY
+from handsim.hand.shape import BONE_NAMES, BONES, EVERYBODY, PALM, SIZES
 from handsim.hand.skin import vertex_normals
 from tests.meshes import blend_skin
 
@@ -242,3 +242,60 @@ def test_slips_leave_lateral_markers_on_the_skin_of_their_digit(rng):
         np.testing.assert_array_equal(nearest_digits(feet, model), own)
         assert np.linalg.norm(worn.points - designed.points, axis=1).max() < 0.025
         assert worn.layout.names == layout.names
+
+
+def stray(worn: Attachment, model: HandModel) -> list[str]:
+    """Markers whose nearest bone is of another digit.
+
+    Metacarpals are the palm's and their finger's; the thumb has the index finger's and the wrist, too. What
+    the palm carries is its own.
+    """
+    feet, capsules = worn.points - worn.layout.heights[:, None] * worn.normals, model.capsules
+    starts, ends = np.moveaxis(capsules.posed(model.rest_transforms[None])[0], 1, 0)
+    shares = ((feet[:, None] - starts) * (ends - starts)).sum(-1) / ((ends - starts) ** 2).sum(-1)
+    away = feet[:, None] - starts - np.clip(shares, 0.0, 1.0)[..., None] * (ends - starts)
+    distances = np.linalg.norm(away, axis=-1)
+    metacarpals = iter(({1, 0}, {2}, {3}, {4}, {0}, {0}))
+    owners = [
+        {-1} | next(metacarpals) if bone == PALM else {BONES[bone].digit} for bone in capsules.bones.tolist()
+    ]
+    found = []
+    for index, marker in enumerate(worn.layout.markers):
+        own = [BONES[BONE_NAMES.index(marker.bone)].digit in one for one in owners]
+        # Where two bones meet, as in a knuckle, both are equally near.
+        near = distances[index, own].min() <= distances[index].min() + 1e-9
+        if not near and not (marker.bone == "palm" and worn.main_bones[index] == PALM):
+            found.append(marker.name)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("num_places", "num_people"), [(120, 8), pytest.param(2000, 200, marks=pytest.mark.slow)]
+)
+def test_any_place_is_refused_or_stays_on_its_digit_and_slips_a_little(num_places, num_people):
+    rng, places = np.random.default_rng(0), []
+    for _ in range(num_places):
+        bone = BONE_NAMES[rng.integers(len(BONE_NAMES))]
+        across = rng.uniform(-0.5, 0.5) if bone == "palm" else 0.0
+        place = MarkerPlace("x", bone, rng.uniform(0.0, 1.0), rng.uniform(-np.pi, np.pi), across)
+        try:
+            attach(worn_by(place), "M")
+        except LayoutError:
+            continue
+        places.append(place)
+    assert len(places) > 0.9 * num_places
+    gloves = [worn_by(*places[first : first + 60]) for first in range(0, len(places), 60)]
+    for size in SIZES:
+        model = HandModel.named(size)
+        for place in places[:: 1 if num_people > 100 else 20]:
+            try:
+                assert not stray(attach(worn_by(place), size).attachment, model), place
+            except LayoutError:  # the skin of this size is another digit's there
+                assert not stray(settle_glove(worn_by(place), model).attachment, model), place
+    for _ in range(num_people):
+        model = HandModel(sample_shape(EVERYBODY, rng=rng))
+        for glove in gloves:
+            designed = settle_glove(glove, model).attachment
+            worn = wear(glove, model, along=0.1, around=np.deg2rad(10.0), rng=rng)
+            assert not stray(designed, model) and not stray(worn, model)
+            assert np.linalg.norm(worn.points - designed.points, axis=1).max() <= 0.025

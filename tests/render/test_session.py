@@ -15,6 +15,7 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.model import hand_keypoints
 from handsim.space.camera import pinhole, preset
+from handsim.space.transforms import rigid, turned_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
 from render.scenery.backgrounds import photo_files
@@ -110,9 +111,40 @@ def test_takes_are_drawn_from_memory_and_from_files_alike(tmp_path):
         assert one.bodies[0].name == "pen" and one.ids.max() == len(one.hands) + 1
 
 
+@pytest.mark.parametrize("camera", [None, ABOVE])
+def test_a_take_with_y_up_is_drawn_as_the_same_one_with_z_up(camera, tmp_path):
+    take = simulate_take(kind="hand-pen", num_frames=12)
+    to_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    lying = dataclasses.replace(
+        take,
+        qpos=turned_poses(take.qpos, to_y),
+        body_poses=turned_poses(take.body_poses, to_y),
+        point_list=dataclasses.replace(take.point_list, points=take.point_list.points @ to_y.T),
+    )
+    own = None
+    if camera is not None:
+        camera = camera.at(
+            camera.T_world_camera + np.pad(np.nanmean(take.qpos[..., :3], (0, 1))[:, None], ((0, 1), (3, 0)))
+        )
+        own = camera.at(rigid(to_y, np.zeros(3)) @ camera.T_world_camera)
+    config = dataclasses.replace(BARE, dress="glove")
+    pairs = zip(
+        draw(take, config=config, camera=camera, frames=(0, 6)),
+        draw(lying, config=config, camera=own, frames=(0, 6), up="y"),
+        strict=True,
+    )
+    for one, other in pairs:
+        assert (one.ids != other.ids).mean() < 1e-3 and one.ids.any()
+        np.testing.assert_allclose(one.hands[0].keypoints_world, other.hands[0].keypoints_world, atol=1e-6)
+    render_take(lying, tmp_path / "y", "png", config, frames_per_shard=6, num_frames=1, up="y", workers=1)
+    with pytest.raises(HandSimError, match=r"begun with other settings .*up"):
+        render_take(lying, tmp_path / "y", "png", config, frames_per_shard=6, num_frames=1, workers=1)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"up": "x"}, "unknown up 'x'"),
         ({"model": 3}, "model is 3, expected a HandModel"),
         ({"model": "XXL"}, "unknown size 'XXL'"),
         ({"model": ("M", "L")}, "the models are of 2 hands .right and right. and the poses of 1"),

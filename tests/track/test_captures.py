@@ -263,7 +263,7 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.captures import track_capture
 from track.label_confidence import label_confidence
-from track.tracker import warm_up
+from track.tracker import Tracker
 from track.frames import checked_frames
 from train.labelers.storage import load_labeler
 from train.simulation.takes import simulate_take
@@ -275,7 +275,7 @@ def ready():
 take = simulate_take(kind="hand-hand", num_frames=40)
 hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
 labeler = load_labeler("dense19")
-warm_up(hands, labeler)
+Tracker(hands, labeler).warm_up()
 checked_frames(take.capture())  # of a whole capture alone, as the next; a stream has neither
 label_confidence(take)
 before = ready()

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from gloves import load_layout
 from gloves.fit import nominal_fit
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
-from track.live_message import FORMATS, document_format, frame_document, header_document
+from handsim.motion_files.motion import OPENXR_JOINTS
+from track.live_message import FORMATS, Content, document_format, frame_document, header_document, in_axes
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
@@ -25,8 +27,8 @@ DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 @given(number=st.integers(0, 2**40), seed=st.integers(0, 99), lost=st.booleans(), points=st.integers(0, 9))
 def test_a_frame_comes_back(name, message, number, seed, lost, points):
     one = message(number, seed=seed, lost=lost, points=points)
-    there = DECODE[name](document_format(name, points=True).frame(one))
-    assert there == frame_document(one, points=True)
+    there = DECODE[name](document_format(name, Content(points=True)).frame(one))
+    assert there == frame_document(one, Content(points=True))
     assert (there["type"], there["schema"], there["number"]) == ("frame", 1, number)
     assert there["time"] == one.time and there["silent"] is False
     for hand, sent in zip(there["hands"], one.hands, strict=True):
@@ -111,3 +113,70 @@ def test_a_lost_hand_has_no_numbers(message):
     lost = one.hands[1]
     for values in (lost.position, lost.quaternion, lost.angles, lost.positions):
         assert np.isnan(values).all()
+
+
+def as_openxr(position, rotation):
+    """OpenXR: x right, y up, z backward; a world with z up is turned about x by -90 degrees."""
+    turn = Rotation.from_euler("x", -90, degrees=True)
+    return turn.apply(position), turn * rotation
+
+
+def as_unity(position, rotation):
+    """Unity's OpenXR plugin negates z of positions, and x and y of quaternions."""
+    (x, y, z), turned = as_openxr(position, rotation)
+    a, b, c, w = turned.as_quat()
+    return np.array([x, y, -z]), np.array([w, -a, -b, c])
+
+
+def as_unreal(position, rotation):
+    """Unreal is ROS with y to the right, in centimeters: y of positions, x and z of quaternions negated."""
+    a, b, c, w = rotation.as_quat()
+    return 100.0 * np.array([position[0], -position[1], position[2]]), np.array([w, -a, b, -c])
+
+
+BY_HAND = {
+    "ros": lambda position, rotation: (position, rotation.as_quat(scalar_first=True)),
+    "openxr": lambda *pose: (as_openxr(*pose)[0], as_openxr(*pose)[1].as_quat(scalar_first=True)),
+    "unity": as_unity,
+    "unreal": as_unreal,
+}
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+@pytest.mark.parametrize("program", BY_HAND)
+def test_poses_are_those_of_each_program(program, up, message):
+    z_up = Rotation.from_euler("x", 90 if up == "y" else 0, degrees=True)
+    one = message(3, seed=4)
+    document = frame_document(one, Content(points=True, joints=True, axes=program, up=up))
+    ours = frame_document(one, Content(points=True, joints=True))
+    assert len(document["hands"][0]["joints"]) == len(OPENXR_JOINTS)
+
+    def check(sent, position, quaternion):
+        expected = BY_HAND[program](
+            z_up.apply(position), z_up * Rotation.from_quat(quaternion, scalar_first=True)
+        )
+        np.testing.assert_allclose(sent[:3], expected[0], atol=2e-4 if program == "unreal" else 2e-6)
+        sign = np.sign(np.dot(sent[3:], expected[1]))
+        np.testing.assert_allclose(sign * np.array(sent[3:]), expected[1], atol=5e-6)
+
+    for sent, own in zip(document["hands"], ours["hands"], strict=True):
+        for found, joint in zip(sent["joints"], own["joints"], strict=True):
+            check(found, joint[:3], joint[3:])
+        wrist, own_wrist = sent["wrist"], own["wrist"]
+        check(wrist["position"] + wrist["quaternion"], own_wrist["position"], own_wrist["quaternion"])
+        assert sent["angles"] == own["angles"]
+        tip = dict(zip(one.header.positions, sent["positions"], strict=True))["index_tip"]
+        at = OPENXR_JOINTS.index("INDEX_TIP")
+        np.testing.assert_allclose(tip, sent["joints"][at][:3], atol=2e-4 if program == "unreal" else 3e-6)
+    unit = "cm" if program == "unreal" else "m"
+    header = header_document(one.header, Content(joints=True, axes=program, up=up))
+    assert header["axes"] == program and header["units"]["length"] == unit
+    assert 0.003 < header["radii"][0][9] / (100.0 if unit == "cm" else 1.0) < 0.02
+
+
+def test_what_is_lost_has_no_pose_in_any_axes(message):
+    one = in_axes(message(lost=True), Content(axes="unity").program)
+    document = frame_document(message(lost=True), Content(joints=True, axes="unity"))
+    assert np.isnan(one.hands[1].position).all() and one.hands[0].has_pose
+    assert document["hands"][1]["wrist"] is document["hands"][1]["joints"] is None
+    assert document["bodies"][0]["pose"] is None

@@ -68,8 +68,10 @@ NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "
         ("udp://user@localhost:9000", "expected udp://host:port"),
         ("udp://localhost:9000?format", "expected udp://host:port"),
         ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
-        ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?); valid names: format, points"),
-        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format', there are none"),
+        ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?) | format | axes | every"),
+        ("udp://:1?every=yes", "udp://:1?every=yes: unknown option 'every'; valid names: format, points"),
+        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format'; valid names: axes, up"),
+        ("ws://:1?axes=maya", "unknown axes 'maya' | world, ros, openxr, unity, unreal"),
     ],
 )
 def test_wrong_parts_are_told(address, words):
@@ -357,7 +359,7 @@ sink.close()
 
 @pytest.fixture
 def sink():
-    one = open_sink("ws://:0")
+    one = open_sink("ws://:0?every=yes")
     yield one
     one.close()
 
@@ -390,7 +392,7 @@ def test_clients_get_the_header_and_every_frame(sink, message):
 
 def test_a_slow_client_loses_frames_and_delays_nobody(message):
     """It reads nothing at all: sending goes on, and the other client gets everything."""
-    sink = open_sink("ws://:0?points=yes")
+    sink = open_sink("ws://:0?points=yes&every=yes")
     slow = raw_client(sink.port)
     with connect(url(sink)) as quick:
         wait_for(lambda: sink.num_clients == 2)
@@ -483,7 +485,7 @@ def test_an_address_of_the_network_serves_all_pages():
 
 def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
     monkeypatch.setattr(sinks, "_FLUSH", LONG)
-    sink = open_sink("ws://:0?format=msgpack")
+    sink = open_sink("ws://:0?format=msgpack&every=yes")
     got: list[bytes] = []
     with connect(url(sink)) as client:
         wait_for(lambda: sink.num_clients == 1)
@@ -493,7 +495,44 @@ def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
             sink.send(message(number))
         sink.close()
         reader.join()
-    assert [msgpack.unpackb(one)["number"] for one in got[1:]] == list(range(200))
+    *frames, end = [msgpack.unpackb(one) for one in got[1:]]
+    assert [one["number"] for one in frames] == list(range(200))
+    assert end == {"type": "end", "schema": 1}
+
+
+def test_a_client_that_reads_slowly_gets_new_frames_and_the_end(message, monkeypatch):
+    """It takes the next frame when it has confirmed the one before; those between are dropped."""
+    monkeypatch.setattr(sinks, "_FLUSH", LONG)
+    sink = open_sink("ws://:0")
+    with connect(url(sink), max_queue=1) as client:
+        wait_for(lambda: sink.num_clients == 1)
+        sink.send(message(0))
+        assert received(client, 2)[0]["type"] == "header"
+        for last in range(30, 630, 30):
+            for number in range(last - 30, last):
+                sink.send(message(number))
+                time.sleep(0.004)
+            (frame,) = received(client, 1)
+        assert sink.dropped > 300 and frame["number"] > 20, "old frames were dropped before they were sent"
+        closing = threading.Thread(target=sink.close)
+        closing.start()
+        assert json.loads(list(read_until_closed(client))[-1])["type"] == "end"
+    closing.join()
+
+
+def test_a_client_may_ask_for_the_newest_frame(message):
+    sink = open_sink("ws://:0")
+    with connect(f"{url(sink)}/newest") as client:
+        wait_for(lambda: sink.num_clients == 1)
+        sink.send(message(0))
+        assert received(client, 1)[0]["type"] == "header"
+        for last in range(10, 60, 10):
+            for number in range(last - 10, last + 1):
+                sink.send(message(number))
+            wait_for(lambda last=last: sink.dropped == last + 1)
+            client.send("")
+            assert received(client, 1)[0]["number"] == last
+    sink.close()
 
 
 def test_a_stalled_client_does_not_hold_up_the_end(sink, message):

@@ -17,6 +17,7 @@ from gloves import GloveFit, Status, Take, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel, HandSimError
 from handsim.errors import ArgumentError
+from handsim.hand.shape import JOINT_NAMES
 from tests.sentences import error_names
 from track import TrackedFrame, Tracker
 from train import Labeler, load_labeler, simulate_take
@@ -155,6 +156,11 @@ def test_hands_are_initialized_and_tracked_and_what_was_said_stays_said(tracker,
     assert np.rad2deg(np.abs(poses - true)[..., 7:]).mean(axis=(0, 2)).max() <= 1.0
     steps = np.abs(np.diff(poses[:40, :, 7:], axis=0)).max(axis=-1)
     assert (steps > 0.0).all() and steps[1:].max() < 0.2  # the first frame may lack a finger tip
+    left = tracked[-1].hand("left")
+    assert left.side == "left" and list(left.angles.values()) == left.qpos[7:].tolist()
+    assert left.angles["index_PIP_flexion"] == left.qpos[7 + JOINT_NAMES.index("index_PIP_flexion")]
+    with error_names(ArgumentError, "hand 'middle' | right, left"):
+        tracked[-1].hand("middle")
 
 
 def test_the_rms_is_the_distance_from_the_given_hand_in_the_first_frames_too(take, labeler):
@@ -579,3 +585,19 @@ def test_garbage_never_raises_and_leaves_nothing_behind(bench, frames, lead, dat
     assert statuses([last]) == {Status.LOST}
     fed, tracked = feed(tracker, take, range(40, 44), lambda n, one: one._replace(time=begin + n / 120.0))
     assert all(all_right(fed, tracked))
+
+
+@pytest.mark.slow
+def test_the_same_motion_again_and_again_is_tracked_as_before(labeler):
+    """Biases of markers settle: what a pose fits as well does not pile up in them."""
+    take = simulate_take(kind="single-hand", num_frames=240, seed=1).without_body()
+    tracker = Tracker([nominal_fit(hand.layout, "M", hand.side) for hand in take.hands], labeler)
+    there_and_back = [*range(take.num_frames), *range(take.num_frames - 1, -1, -1)]
+    rms = []
+    for number in range(15 * len(there_and_back)):
+        lap, place = divmod(number, len(there_and_back))
+        seen = seen_frame(take, there_and_back[place])
+        frame = tracker.step(seen.points, seen.ids + lap * (int(take.ids.max()) + 1), number / take.rate)
+        rms.append([hand.rms for hand in frame.hands])
+    by_lap = np.nanmedian(np.reshape(rms, (15, len(there_and_back), -1)), axis=1)
+    np.testing.assert_allclose(by_lap[14], by_lap[10], atol=2e-6)  # [m]

@@ -47,6 +47,7 @@ _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that f
 _BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
+_FORGETTING_FRAMES: Final = 2400.0  # in which a bias that nothing confirms shrinks to a third
 _LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
 _FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers of which a fit leaves a residual that tells their spread
@@ -361,6 +362,8 @@ def _learn_bias(
             residual[i] = 0.0
             for j in range(3):
                 residual[i] += rotations[marker, j, i] * residuals[marker, j]
+            # A pose fits what all biases of a hand have in common as well: nothing else brings that back.
+            bias[marker, i] *= 1.0 - 1.0 / _FORGETTING_FRAMES
             bias[marker, i] += residual[i] / bias_frames[marker]
             square += residual[i] ** 2
         if on_part[digits[marker]] >= (_FEWEST_ON_DIGIT if digits[marker] >= 0 else _FEWEST_ON_PALM):

@@ -9,18 +9,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cache
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy import sparse
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, bone_transforms, build_skeleton
 from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
 from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 LENGTH, BREADTH = 0, 1  # log factors
 BONE_LENGTHS: Final = slice(2, 17)  # log factors, three per digit
@@ -79,9 +81,9 @@ def shape_jacobian(
     """Derivative of a function of the shape by the parameters, by finite differences."""
     nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # the first as it is
     values = function([shape_at(start, one) for one in nudged])
-    jacobian = np.zeros((*values.shape[1:], NUM_PARAMETERS))
-    jacobian[..., :count] = np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
-    return jacobian
+    jacobian = np.zeros((NUM_PARAMETERS, *values.shape[1:]))  # each parameter's derivatives together
+    jacobian[:count] = (values[1:] - values[0]) / _DIFFERENCE_STEP
+    return np.moveaxis(jacobian, 0, -1)
 
 
 def skinned_shape_jacobian(
@@ -95,12 +97,13 @@ def skinned_shape_jacobian(
     homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
     def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
+        skeletons = [build_skeleton(shape) for shape in shapes]
+        rest = np.stack([skeleton.rest_transforms() for skeleton in skeletons])
+        local = weights.T[:, None] * (np.linalg.inv(rest) @ homogeneous.T)  # (B, L, 4, M)
         posed = np.empty((len(shapes), 3 * len(qpos), len(points)))
-        for row, shape in zip(posed, shapes, strict=True):
-            skeleton = build_skeleton(shape)
-            local = np.linalg.inv(skeleton.rest_transforms()) @ homogeneous.T  # (L, 4, M)
+        for row, skeleton, one in zip(posed, skeletons, local, strict=True):
             bones = bone_transforms(skeleton, qpos)[:, :, :3].swapaxes(1, 2).reshape(3 * len(qpos), -1)
-            row[:] = bones @ (weights.T[:, None] * local).reshape(-1, len(points))
+            np.matmul(bones, one.reshape(-1, len(points)), out=row)
         return posed.reshape(len(shapes), len(qpos), 3, -1).swapaxes(2, 3)
 
     return shape_jacobian(start, parameters, skinned, GIRTHS.start)
@@ -181,10 +184,9 @@ def skin_mesh() -> SkinTopology:
 def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Neighbors (F, 3) of each triangle of a closed mesh, opposite to its corners."""
     ends = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).reshape(-1, 2)
-    count = int(faces.max()) + 1
-    there, back = ends[:, 0] * count + ends[:, 1], ends[:, 1] * count + ends[:, 0]
-    order = np.argsort(there)
-    neighbors: NDArray[np.int64] = order[np.searchsorted(there[order], back)] // 3
+    order = np.argsort(ends.min(axis=1) * (int(faces.max()) + 1) + ends.max(axis=1)).reshape(-1, 2)
+    neighbors = np.empty(len(ends), dtype=np.int64)
+    neighbors[order] = order[:, ::-1] // 3  # each edge is one of two triangles
     return neighbors.reshape(faces.shape)
 
 
@@ -195,13 +197,15 @@ class SkinPatch:
         mesh = skin_mesh()
         needed = np.isin(mesh.faces, mesh.faces[faces]).any(axis=1)  # the triangles around a vertex
         vertices, local = np.unique(mesh.faces[needed], return_inverse=True)
-        self._rows = mesh.subdivide[vertices]
+        rows = mesh.subdivide[vertices]
+        self._nearby = np.unique(rows.indices)
+        self._rows = rows[:, self._nearby]
         self._faces = local.reshape(-1, 3)
         self._corners = np.searchsorted(vertices, mesh.faces[faces])
 
     def corners(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
         """Corners of the triangles."""
-        points = self._rows @ vertices
+        points = self._rows @ vertices[self._nearby]
         return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
 
 

@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.settings import Limits, Settings
 
 LOOPBACK: Final = "127.0.0.1"
 COMMAND_PORT: Final = 1510
 """NatNet's port for commands."""
+
+
+class NoServerError(CaptureError):
+    """No server answers at an address; it may be started later."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
 from track.frames import StreamedFrame, read_points
-from track.streams import COMMAND_PORT, ReplaySettings, split_address
+from track.streams import COMMAND_PORT, NoServerError, ReplaySettings, split_address
 from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
@@ -425,7 +425,7 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
                 major, minor = info.version
                 raise CaptureError(f"{url}: the server speaks NatNet {major}.{minor}, expected 3.0 or newer")
             return info
-    raise CaptureError(
+    raise NoServerError(
         f"{url}: no NatNet server answers; in Motive, switch streaming on and choose the network that this "
         "machine is in"
     )

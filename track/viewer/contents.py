@@ -23,6 +23,7 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
 from handsim.space.rig import CameraRig, list_rigs, load_rig
+from track.settings import USUAL_SIZE
 from track.user import load_user
 from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
@@ -62,7 +63,7 @@ def open_content(
     name: str,
     *,
     out: Path | None = None,
-    size: str = "M",
+    size: str | None = None,
     rig: CameraRig | str | None = None,
     time: float | None = None,
 ) -> Content:
@@ -77,10 +78,12 @@ def open_content(
         given, keys = path, set(read_toml(path, error=FileError))
         if not keys & {"camera", "field_of_view", "radius_mm"}:
             raise ArgumentError(f"{path}: a TOML file of another kind, expected {ACCEPTED}")
+    if size is not None and (not keys or keys & {"camera", "field_of_view"}):
+        raise ArgumentError(f"--size is {size}, but {name} is no marker layout, which a hand would wear")
     if keys & {"camera", "field_of_view"}:
         content = _rig(load_rig(given))
     elif keys:
-        content = _layout(given, out, size)
+        content = _layout(given, out, USUAL_SIZE if size in (None, "auto") else str(size))
     elif out is not None:
         raise ArgumentError(f"--out is {out}, but {name} is no marker layout: nothing would be saved")
     elif suffix == ".json":
@@ -90,6 +93,10 @@ def open_content(
         return _moving(path, name, None if rig is None else load_rig(rig), time)
     if time is not None:
         raise ArgumentError(f"--time is {time:g}, but {name} is a {content.kind}: nothing in it moves")
+    if rig is not None:
+        raise ArgumentError(
+            f"--rig is {rig}, but {name} is a {content.kind}, which no cameras are shown with"
+        )
     return content
 
 

@@ -57,6 +57,14 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
     )
 
 
+def worn_dtype(num_markers: int) -> np.dtype[np.void]:
+    """The record of one hand: a `HAND_DTYPE`, and the `places` (M, 3) of its glove's markers as worn.
+
+    A place is `along`, `around` [rad] and `across` of a `MarkerPlace`; NaN for a hand that is in no row.
+    """
+    return np.dtype([*HAND_DTYPE.descr, ("places", "<f8", (num_markers, 3))])
+
+
 @dataclass(frozen=True, slots=True)
 class Manifest(Settings):
     """The contents of a finished training set."""
@@ -253,12 +261,37 @@ class Dataset:
         parts, known = [], 0
         for number, shard in enumerate(self.shards):
             parts.append(known + shard["hand"].astype(np.int64) // len(SIDES))
-            known += len(_load_records(self.path / hands_name(number), HAND_DTYPE)) // len(SIDES)
+            known += len(self._hand_records(number)) // len(SIDES)
         return np.concatenate(parts)
 
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""
-        return [unpack_hand(record) for record in _load_records(self.path / hands_name(shard), HAND_DTYPE)]
+        return [unpack_hand(record) for record in self._hand_records(shard)]
+
+    def gloves(self, shard: int) -> list[MarkerLayout | None]:
+        """The glove of each hand of a shard as it was worn, slips and all; None for a hand that is in no row.
+
+        `attach(glove, hand)` puts it on; the markers of rows are those of their hand's glove.
+
+        Raises:
+            DatasetError: The set is of a version that did not keep them.
+        """
+        records = self._hand_records(shard)
+        if "places" not in (records.dtype.names or ()):
+            raise DatasetError(f"{self.path / hands_name(shard)} holds no places of markers as worn")
+        names = ("along", "around", "across")
+        return [
+            None if np.isnan(places).any() else dataclasses.replace(self.layout, markers=tuple(
+                dataclasses.replace(marker, **dict(zip(names, place, strict=True)))
+                for marker, place in zip(self.layout.markers, places.tolist(), strict=True)
+            ))
+            for places in records["places"]
+        ]  # fmt: skip
+
+    def _hand_records(self, shard: int) -> NDArray[np.void]:
+        """The memory-mapped hands of a shard; those of old sets have no places of markers."""
+        worn = worn_dtype(len(self.manifest.marker_names))
+        return _load_records(self.path / hands_name(shard), worn, HAND_DTYPE)
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:
@@ -269,16 +302,16 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
     return Dataset(dataset)
 
 
-def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Memory-mapped records of this type; a `DatasetError` if the file holds something else."""
+def _load_records(file: Path, *dtypes: np.dtype[np.void]) -> NDArray[np.void]:
+    """Memory-mapped records of one of these types; a `DatasetError` if the file holds something else."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)
         records: NDArray[np.void] = np.load(file, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise DatasetError(f"{file} is damaged: it is no .npy file") from error
-    if records.dtype != dtype or records.ndim != 1:
-        raise DatasetError(f"{file} holds other records than those of this set; expected {dtype.names}")
+    if records.dtype not in dtypes or records.ndim != 1:
+        raise DatasetError(f"{file} holds other records than those of this set; expected {dtypes[0].names}")
     return records
 
 

@@ -6,7 +6,6 @@ blobs in the pictures. Gloves are scored on the single frames of `observe_poses`
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, cast
@@ -82,7 +81,7 @@ def sample_work(
         for _ in range(people):
             scene = _work_scene(kind, layout, num_frames, rng)
             walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
-            work[kind].append(moved(scene, walk + center - ROOM_CENTER))
+            work[kind].append(scene.moved(walk + center - ROOM_CENTER))
     return work
 
 
@@ -106,21 +105,6 @@ def _walk(
     reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
     turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND_TRIP + rng.random(3)
     return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))
-
-
-def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
-    """A scene whose frames are moved by offsets [m]."""
-    hands = []
-    for hand in scene.hands:
-        qpos = hand.qpos.copy()
-        qpos[:, :3] += offsets
-        hands.append(GlovedHand(hand.fit, qpos))
-    held = scene.moving_object
-    if held is not None:
-        poses = held.motion.T_world_body.copy()
-        poses[:, :3, 3] += offsets
-        held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
-    return dataclasses.replace(scene, hands=tuple(hands), moving_object=held)
 
 
 def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:

@@ -23,12 +23,13 @@ from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.rig import (
     FEWEST_CAMERAS,
     HAND_REACH,
+    LONGEST_SIDE,
     MAX_CAMERAS,
     CameraRig,
     load_rig,
 )
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
-from train.forecast.settings import LONGEST_SIDE, Mount, PlanRigSettings
+from train.forecast.settings import Mount, PlanRigSettings
 from train.simulation.room import SceneSight, marker_radii
 from train.simulation.scenes import SceneMotion
 

@@ -368,7 +368,8 @@ def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
     if np.linalg.norm(point - ROOM_CENTER) > _OFF_CENTER:
         yield (
             f"the cameras look at {_place(point)}; simulated hands move around "
-            f"{_place(np.array(ROOM_CENTER))}, so give rig score --center, or move the rig's origin"
+            f"{_place(np.array(ROOM_CENTER))}, so give generate, simulate and rig score --center, or move "
+            "the rig's origin"
         )
     gaps = np.linalg.norm(positions - np.clip(positions, point - HALF_SIDE, point + HALF_SIDE), axis=1)
     for number in np.flatnonzero(gaps < HAND_REACH) + 1:

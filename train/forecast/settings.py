@@ -10,17 +10,14 @@ from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, list_layou
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
+from handsim.space.rig import LONGEST_SIDE, ROOM_CENTER, CameraRig, Center, list_rigs
 from train.labelers.protocol import Labeler
 
-LONGEST_SIDE: Final = 50.0
-"""No volume or room is longer, and no middle of one farther from the origin [m]."""
 Mount = Literal["walls", "truss", "tripods"]
 MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)
 POSES: Final = "poses"
 TWINS: Final = "twins"
 _Sides = Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)]
-_Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
 _Rig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
 _Layout = Annotated[
     MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
@@ -34,7 +31,7 @@ class ScoreRigSettings(Settings):
 
     volume: _Sides = (0.6, 0.6, 0.6)
     """Sides of the space that hands work in [m]."""
-    center: _Center | None = None
+    center: Center | None = None
     """Its middle [m]; (0, 0, 1.1) when not given, or where the hands of the take are."""
     take: Annotated[Take | str | Path | None, Expected("a Take, or the path of one")] = None
     """A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are; simulated
@@ -57,7 +54,7 @@ class PlanRigSettings(Settings):
     tripods."""
     volume: _Sides = (0.6, 0.6, 0.6)
     """Sides of the space that hands work in [m]."""
-    center: _Center = ROOM_CENTER
+    center: Center = ROOM_CENTER
     """Its middle [m]."""
     keep: _Rig | None = None
     """A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like its
@@ -72,7 +69,12 @@ class PlanRigSettings(Settings):
     """Seed of people and motion."""
 
     def check(self) -> None:
-        """Refuse a plan without a mount."""
+        """Refuse a plan without a mount, and a picture of new cameras that are like a rig's first."""
+        if self.keep is not None and (self.size, self.field_of_view) != ((1280, 1280), 60.0):
+            raise ArgumentError(
+                f"given keep {self.keep}, and size or field of view, expected none of them: new cameras are "
+                "like the first one that is kept"
+            )
         if not self.mounts:
             raise ArgumentError(f"mounts is empty, expected some of {', '.join(MOUNTS)}")
 

@@ -1,7 +1,7 @@
 """A labeler for any layout, without a training set: one network that takes the layout as an input.
 
-A few seconds of simulation describe a layout: they give the distribution of the distance between every two
-markers over people and poses, and the pose prior (`train.labelers.pose_prior`). A minute of training makes
+Some seconds of simulation describe a layout: they give the distribution of the distance between every two
+markers over people and poses, and the pose prior (`train.labelers.pose_prior`). Some minutes of training make
 the labeler better. The user's cache folder keeps it under a digest of the layout, the cameras, the shipped
 weights and the version.
 """
@@ -28,6 +28,7 @@ from torch import Tensor
 
 from gloves.layout import MarkerLayout
 from handsim import __version__
+from handsim.app.messages import tell_state, told_share
 from handsim.errors import WeightsError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import atomic_write, save_json, written_together
@@ -183,8 +184,9 @@ def sample_worn_markers(
     """Markers [m] of right hands in valid poses, with another person and glove fit every hundred frames."""
     config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
-    parts = []
+    parts, show = [], told_share(f"learning glove '{layout.name}', once: its poses")
     for first in range(0, num_frames, _POSES_PER_PERSON):
+        show(first, num_frames)
         count = min(_POSES_PER_PERSON, num_frames - first)
         right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
         scene = sample_single_hand(right, count, config, rng=rng)
@@ -206,7 +208,7 @@ def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
-    """The labeler of a glove: learned in a minute or two the first time, and read from the cache later."""
+    """The labeler of a glove: learned in some minutes the first time, and read from the cache later."""
     file = _file_of(layout, rig)
     found = _read(file, layout)
     if found is not None:
@@ -282,17 +284,22 @@ def fine_tuned_labeler(
     labeler = LayoutLabeler.at_once(layout, seed=seed)
     source = FrameSource(GenerateSettings(), layout, load_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
+    show = told_share(f"learning glove '{layout.name}', once: its simulation")
     for first in range(0, len(rows), _POSES_PER_PERSON):
+        show(first, len(rows))
         models = sample_hands(source.settings.population, rng=rng)
         simulate_frames(rows[first : first + _POSES_PER_PERSON], models, source, rng=rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = batch_recipe(TrainSettings(batch=batch), layout.num_markers)
     optimizer = new_optimizer(network)
     steps = -(-num_clouds // batch)
+    show = told_share(f"learning glove '{layout.name}', once: its training")
     with torch_threads(1):
         for step in range(steps):
+            show(step, steps)
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
             layout_step(network, optimizer, rate, draw_batch(rows, recipe, rng=rng).cloud, labeler.distances)
+    tell_state("")
     labeler.network = network.eval()
     return labeler
 

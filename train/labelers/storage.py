@@ -206,7 +206,9 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
-    how = "has learned it before" if is_learned(layout) else "learns it in one minute or two, once"
+    how = (
+        "has learned it before" if is_learned(layout) else "learns it now, once, in a minute of an idle core"
+    )
     warnings.warn(
         f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
         f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "

@@ -34,7 +34,7 @@ from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, json_text, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.model import HandModel
-from handsim.hand.shape import HAND_DTYPE, SIDES, pack_hand
+from handsim.hand.shape import SIDES, pack_hand
 from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
 from poses.shapes import PoseSampler, load_sampler
 from train.data.shards import (
@@ -50,6 +50,7 @@ from train.data.shards import (
     row_dtype,
     rows_name,
     save_array,
+    worn_dtype,
 )
 from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
@@ -120,7 +121,7 @@ def make_dataset(
 def _resolved(settings: GenerateSettings) -> FrameSource:
     """The settings with the glove, rig and sampler that they name, checked against each other."""
     layout, rig = load_layout(settings.glove), load_rig(settings.rig)
-    check_outside_volume(rig, np.array(ROOM_CENTER), settings.volume)
+    check_outside_volume(rig, np.array(settings.center), settings.volume)
     if settings.min_cameras > len(rig.positions):
         raise DatasetError(
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
@@ -154,6 +155,10 @@ def _record(source: FrameSource) -> dict[str, Any]:
     record = dataclasses.replace(settings, optics=settings.optics.worn(layout.radius)).record()
     if settings.sampler is None:
         del record["sampler"]
+    if settings.center == ROOM_CENTER:  # sets of versions without this setting go on
+        del record["center"]
+    if not settings.flesh:
+        del record["flesh"]
     return record | {
         "rig": rig_setting(rig),
         "rig_digest": rig.digest(),  # releases may change a shipped rig
@@ -261,7 +266,7 @@ def _check_space(source: FrameSource, out: Path) -> None:
     """Refuse a set that does not fit on the disk."""
     frames, row = source.settings.num_frames, row_dtype(source.layout.num_markers).itemsize
     people = frames // source.settings.frames_per_hand + 1
-    needed = frames * row + people * len(SIDES) * HAND_DTYPE.itemsize
+    needed = frames * row + people * len(SIDES) * worn_dtype(source.layout.num_markers).itemsize
     if needed > _SMALL_BYTES:  # checked before shards are counted
         there = sum(file.stat().st_size for file in out.glob("*.npy"))
         check_free(out, needed - there, f"{frames} frames", "ask for fewer frames", error=DatasetError)
@@ -291,13 +296,16 @@ def make_shard(source: FrameSource, out: Path, shard: int) -> int:
     rows = np.zeros(_shard_size(settings.num_frames, shard), dtype=row_dtype(source.layout.num_markers))
     people = -(-len(rows) // settings.frames_per_hand)
     redrawn: Counter[str] = Counter()
-    hands = np.zeros(len(SIDES) * people, dtype=HAND_DTYPE)
+    hands = np.zeros(len(SIDES) * people, dtype=worn_dtype(source.layout.num_markers))
     for person in range(people):
         block = rows[person * settings.frames_per_hand : (person + 1) * settings.frames_per_hand]
         models = sample_hands(settings.population, redrawn=redrawn, rng=rng)
         first = len(SIDES) * person
-        hands[first : first + len(SIDES)] = [pack_hand(model.shape) for model in models]
-        simulate_frames(block, models, source, redrawn=redrawn, rng=rng)
+        fits = simulate_frames(block, models, source, redrawn=redrawn, rng=rng)
+        worn = {fit.side: [(one.along, one.around, one.across) for one in fit.layout.markers] for fit in fits}
+        nowhere = np.full((source.layout.num_markers, 3), np.nan)
+        for number, shape in enumerate((model.shape for model in models), first):
+            hands[number] = (*pack_hand(shape), worn.get(shape.side, nowhere))
         block["hand"] += first
     save_array(out / hands_name(shard), hands)
     save_json(out / redrawn_name(shard), dict(sorted(redrawn.items())))

@@ -15,11 +15,10 @@ from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
-from handsim.hand.shape import BONES, EVERYBODY, NUM_JOINTS, SIDES
+from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import CameraRig
-from handsim.space.transforms import quaternion_matrix
 from poses.motion import (
     MotionConfig,
     WristConfig,
@@ -34,7 +33,7 @@ from poses.object_motion import keep_apart, point_pen, pointing_path, sample_obj
 from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
-from train.simulation.training_frames import sample_hands, wear_gloves
+from train.simulation.training_frames import move_skin, sample_hands, wear_gloves
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -89,6 +88,20 @@ class SceneMotion:
             motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
             held = dataclasses.replace(held, motion=motion)
         return SceneMotion(hands, held, self.rate)
+
+    def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
+        """The scene moved by one offset, or by one for each frame [m]; without markers of others."""
+        hands = []
+        for hand in self.hands:
+            qpos = hand.qpos.copy()
+            qpos[:, :3] += offsets
+            hands.append(GlovedHand(hand.fit, qpos))
+        held = self.moving_object
+        if held is not None:
+            poses = held.motion.T_world_body.copy()
+            poses[:, :3, 3] += offsets
+            held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+        return dataclasses.replace(self, hands=tuple(hands), moving_object=held, others=None)
 
 
 def sample_scene_motion(
@@ -217,10 +230,6 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
 # that variance, and half of the captures are about twice as fast as simulated hands.
 NUM_FRAMES: Final = 3000
 """Default number of frames of real-like and free takes."""
-NOISE: Final = 0.00125
-"""Standard deviation of the markers' independent noise per axis [m]."""
-FLESH: Final = 0.0008
-"""RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
 SPEED: Final = 2
 """Speed of these hands as a multiple of the speed in the other takes."""
 _SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
@@ -232,19 +241,6 @@ def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.ran
     fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
     return dataclasses.replace(fast, skin=tuple(move_skin(hand, rng=rng) for hand in fast.hands))
-
-
-def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
-    """Displacement of a hand's markers in the world [m]: one part depends on the pose, the other is noise."""
-    turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
-    moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
-    for marker, bone in enumerate(hand.fit.attachment.main_bones):
-        digit = BONES[bone].digit
-        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
-        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
-        way *= FLESH / max(np.sqrt((way**2).mean()), 1e-9)
-        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
-    return moved
 
 
 # Markers of others move rigidly with an arm, a thing or a person.

@@ -18,7 +18,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
-from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
+from handsim.space.rig import ROOM_CENTER, Center, check_outside_volume, load_rig, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MAX_OTHERS,
@@ -62,6 +62,8 @@ class SimulateSettings(Settings):
     """Camera rig: a shipped name or the path of a .toml file."""
     seed: Annotated[int, Limits(0)] = 0
     """Seed of people, motion and losses."""
+    center: Center = ROOM_CENTER
+    """Middle of the space that hands move in, in the rig's room [m]."""
     optics: OpticsOptions = field(default_factory=OpticsOptions)
     """The optical system, where it differs from the one fitted to this kind of capture."""
     hands: tuple[Side, ...] = BOTH
@@ -104,17 +106,21 @@ def simulate_take(
     given = SimulateSettings.of(settings, options if kind is None else {"kind": kind, **options})
     rig, layout = load_rig(given.rig), load_layout(given.glove)
     given = dataclasses.replace(given, hands=_worn_hands(given, layout))
-    check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
+    check_outside_volume(rig, np.array(given.center), WRIST_VOLUME)
     draw = TWINS[given.kind].draw if given.kind in TWINS else 0
     seeds = np.random.SeedSequence(given.seed, spawn_key=(SIMULATED_KINDS.index(given.kind), draw))
     rng = np.random.default_rng(seeds)
     scene = _sample_scene(given, layout, rng)
+    if given.center != ROOM_CENTER:
+        scene = scene.moved(np.subtract(given.center, ROOM_CENTER))
     if given.others:
         scene = dataclasses.replace(scene, others=other_markers(scene, given.others, rng=rng))
     room = usual_room(given.kind)
     room = dataclasses.replace(room, optics=given.optics.applied(room.optics).worn(layout.radius))
     record = given.record() | {"rig": rig_setting(rig), "room": room.record()}
     del record["optics"]  # the room has all of them
+    if given.center == ROOM_CENTER:
+        del record["center"]
     if set(given.hands) == set(BOTH):
         del record["hands"]
     if not given.others:

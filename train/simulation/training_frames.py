@@ -11,27 +11,32 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit, settle_glove, wear
+from gloves.fit import GlovedHand, GloveFit, settle_glove, wear
 from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.reconstruction import FrameOptics, OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import ADULTS, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
+from handsim.hand.shape import ADULTS, BONES, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
 from handsim.settings import Expected, Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.rig import ROOM_CENTER, CameraRig, list_rigs
-from handsim.space.transforms import pose_matrices, random_quaternions
+from handsim.space.rig import ROOM_CENTER, CameraRig, Center, list_rigs
+from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
 from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
 """Reason to draw another person."""
+# Fitted to the published captures of Han et al. 2018, as the speed of real-like takes (docs/room.md).
+NOISE: Final = 0.00125
+"""Standard deviation of the markers' independent noise per axis [m]."""
+FLESH: Final = 0.0008
+"""RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
 _MAX_PEOPLE: Final = 1000
 _SHOWN_PEOPLE: Final = 100  # whose slips are drawn
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
@@ -81,8 +86,10 @@ class GenerateSettings(Settings):
     """Standard deviation of the markers' slip along the bones [bone lengths]."""
     slip_around: Annotated[float, Limits(0.0, 90.0)] = 10.0
     """The same around the bones [deg]."""
+    center: Center = ROOM_CENTER
+    """Middle of the cube that wrists move in, in the rig's room [m]."""
     volume: Annotated[float, Limits(0.0, 10.0)] = 0.3
-    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    """Half side of that cube [m]."""
     population: Population = field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = field(default_factory=PoseMix)
     sampler: Annotated[PoseSampler | str, SAMPLER] | None = None
@@ -90,6 +97,9 @@ class GenerateSettings(Settings):
     an entry point. Whole poses (T, 27) say where the hands are; joint angles (T, 20) [rad], and wrists left
     at the origin, are put anywhere."""
     scenes: SceneMix = field(default_factory=SceneMix)
+    flesh: bool = False
+    """Whether markers move with the skin, as in real-like takes of `simulate`: by 0.8 mm per axis that depend
+    on the digit's angles, and 1.25 mm of noise."""
     ghosts: GhostConfig = field(default_factory=GhostConfig)
     optics: FrameOptics = field(default_factory=FrameOptics)
     blob_loss: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.15)
@@ -146,7 +156,7 @@ def sample_hands(
     """
     for _ in range(_MAX_PEOPLE):
         shape = sample_shape(population, side=SIDES[0], rng=rng)
-        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
+        models = HandModel(shape), HandModel(shape.with_side(SIDES[1]))
         try:
             resting_angles(models[0])
         except PoseError:
@@ -163,7 +173,7 @@ def sample_hands(
 def sample_adult_hands(*, rng: np.random.Generator) -> tuple[HandModel, HandModel]:
     """Right and left hand of a random adult."""
     shape = sample_shape(ADULTS, side="right", rng=rng)
-    return HandModel(shape), HandModel(dataclasses.replace(shape, side="left"))
+    return HandModel(shape), HandModel(shape.with_side("left"))
 
 
 def wear_gloves(
@@ -190,6 +200,19 @@ def slipped_gloves(
     return tuple(settle_glove(fit.layout, model) for (fit,) in worn)
 
 
+def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
+    """Displacement of a hand's markers in the world [m]: one part depends on the pose, the other is noise."""
+    turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
+    moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
+    for marker, bone in enumerate(hand.fit.attachment.main_bones):
+        digit = BONES[bone].digit
+        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
+        way *= FLESH / max(np.sqrt((way**2).mean()), 1e-9)
+        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
+    return moved
+
+
 def simulate_frames(
     block: NDArray[np.void],
     models: tuple[HandModel, ...],
@@ -197,11 +220,11 @@ def simulate_frames(
     *,
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
-) -> None:
+) -> tuple[GloveFit, ...]:
     """Fill rows with random poses of one person's gloved hands, as rig and optical system capture them.
 
     Of a scene with two hands, the first half of the rows is the right hand's. Impossible scenes are counted
-    in `redrawn`, by reason.
+    in `redrawn`, by reason. Returns the hands with their gloves as worn.
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
@@ -216,7 +239,7 @@ def simulate_frames(
         min_rays=settings.min_cameras,
         min_rays_to_start=settings.min_cameras,
     )
-    observed = observe_scene(scene, fits, rig, optics, settings.ghosts, rng=rng)
+    observed = observe_scene(scene, fits, rig, optics, settings.ghosts, flesh=settings.flesh, rng=rng)
     begin = 0
     for model, qpos, frames in zip(scene.hands, scene.qpos, observed, strict=True):
         part = block[begin : begin + len(qpos)]
@@ -225,6 +248,7 @@ def simulate_frames(
         for name in HandFrames._fields:
             part[name] = getattr(frames, name)[: len(part)]
         begin += len(qpos)
+    return fits
 
 
 def sample_frame_scene(
@@ -246,9 +270,12 @@ def sample_frame_scene(
     try:
         if kind == 1:
             left, right = models
-            return FrameScene((right, left), sample_two_hand_poses(right, left, -(-num_rows // 2), rng=rng))
+            both = sample_two_hand_poses(right, left, -(-num_rows // 2), rng=rng)
+            for qpos in both:
+                qpos[:, :3] += np.subtract(settings.center, ROOM_CENTER)
+            return FrameScene((right, left), both)
         if kind == 2:
-            return sample_holding_hand(model, num_rows, settings.volume, rng=rng)
+            return sample_holding_hand(model, num_rows, settings, rng=rng)
     except PoseError:
         if redrawn is not None:
             redrawn[NO_TOUCH if kind == 1 else NO_GRASP] += 1
@@ -267,7 +294,7 @@ def sample_single_hand(
 
     A sampler of whole poses also places the wrists, unless it leaves all of them at the origin.
     """
-    position = ROOM_CENTER + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
+    position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     if sampler is None:
         angles = sample_valid_angles(model, num_frames, settings.poses, rng=rng)
     else:
@@ -281,14 +308,14 @@ def sample_single_hand(
 
 
 def sample_holding_hand(
-    model: HandModel, num_frames: int, volume: float, *, rng: np.random.Generator
+    model: HandModel, num_frames: int, settings: GenerateSettings, *, rng: np.random.Generator
 ) -> FrameScene:
-    """Poses of a hand that holds a random object, in a cube of half side `volume` [m]."""
+    """Poses of a hand that holds a random object, anywhere in the volume."""
     names = object_names()
     rigid_object = named_object(names[rng.integers(len(names))])
     hold = settle_hold(model, rigid_object, rng=rng)
     angles, T_wrist_object = sample_held_poses(model, rigid_object, hold, num_frames, rng=rng)
-    position = ROOM_CENTER + rng.uniform(-volume, volume, size=(num_frames, 3))
+    position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     quaternion = random_quaternions(num_frames, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
     return FrameScene((model,), (qpos,), rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
@@ -301,11 +328,18 @@ def observe_scene(
     optics: OpticsConfig,
     ghosts: GhostConfig,
     *,
+    flesh: bool = False,
     rng: np.random.Generator,
 ) -> tuple[HandFrames, ...]:
-    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers."""
+    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers.
+
+    With `flesh`, markers move with the skin.
+    """
     bones = [fit.model.forward_kinematics(qpos) for fit, qpos in zip(fits, scene.qpos, strict=True)]
     worn = [fit.attachment.markers(fit.model, frames) for fit, frames in zip(fits, bones, strict=True)]
+    if flesh:
+        for fit, qpos, part in zip(fits, scene.qpos, worn, strict=True):
+            part[0][:] += move_skin(GlovedHand(fit, qpos), rng=rng)
     markers, normals = (np.concatenate(parts, axis=1) for parts in zip(*worn, strict=True))
     posed = [fit.model.capsules.posed(frames) for fit, frames in zip(fits, bones, strict=True)]
     segments = np.concatenate(posed, axis=1)
@@ -321,11 +355,18 @@ def observe_scene(
     for number, (centers, _) in enumerate(worn):
         columns = slice(number * centers.shape[1], (number + 1) * centers.shape[1])
         strays = sample_ghosts(centers, rig, segments, radii, ghosts, min_cameras=optics.min_rays, rng=rng)
-        distance = np.linalg.norm(found.false_points[:, :, None] - centers[:, None], axis=-1).min(axis=2)
-        near = np.where((distance < GHOST_REACH)[..., None], found.false_points, np.nan)
+        near = np.where(_near(found.false_points, centers)[..., None], found.false_points, np.nan)
         kept = keep_some(np.concatenate([strays, near], axis=1), rng=rng)
         hands.append(HandFrames(centers, cameras[:, columns], found.positions[:, columns], kept))
     return tuple(hands)
+
+
+def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]) -> Bool[np.ndarray, "T P"]:
+    """Which points, of which most are NaN, are within `GHOST_REACH` of a marker center of their frame."""
+    near: NDArray[np.bool_] = np.isfinite(points[..., 0])
+    distance = np.linalg.norm(points[near][:, None] - centers[near.nonzero()[0]], axis=-1)
+    near[near] = distance.min(axis=1) < GHOST_REACH
+    return near
 
 
 @cache

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gloves import Capture, read_capture, write_capture
-from gloves.captures.capture import check_place, count_gaps, run_lengths, unit_fault, zeros_as_missing
+from gloves.captures.capture import check_place, count_gaps, run_lengths, unit_fault
+from gloves.captures.coordinates import zeros_as_missing
 from gloves.captures.formats import READABLE, WRITABLE
 from handsim import HandSimWarning
 from handsim.errors import CaptureError

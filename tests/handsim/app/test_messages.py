@@ -131,6 +131,21 @@ def test_a_line_of_state_goes_where_the_command_shows_its_own(capsys):
     assert capsys.readouterr().err.splitlines() == lines
 
 
+def test_a_share_is_told_where_a_command_shows_its_state(capsys, monkeypatch):
+    monkeypatch.setattr(messages, "EVERY", 0.0)
+    messages.told_share("learning")(1, 2)
+    assert capsys.readouterr().err == "", "no command runs"
+    with named_steps(""):
+        show = messages.told_share("learning")
+        for done in range(3):
+            show(done, 4)
+    lines = capsys.readouterr().err.splitlines()
+    assert [re.sub(r"\d+ s", "N s", line) for line in lines] == [
+        "learning: 25 %, about N s left",
+        "learning: 50 %, about N s left",
+    ]
+
+
 def test_a_bar_shows_a_line_of_state_until_more_is_done():
     with Progress(disable=True) as progress:
         bar = ProgressBar(progress, progress.add_task(""))

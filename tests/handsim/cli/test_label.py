@@ -72,6 +72,16 @@ def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
     assert np.isclose(labeled.positions[:30, :19], positions[:30], atol=1e-5, equal_nan=True).mean() > 0.97
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_one_of_two_hands_is_labeled_where_it_is_named(side, take, tmp_path, capsys):
+    write_capture(tmp_path / "in.c3d", take.capture())
+    command = ["label", str(tmp_path / "in.c3d"), "--hands", side, "--out", str(tmp_path / "out.trc")]
+    assert main(command) == 0
+    assert f"a {side} hand in {FRAMES} frames" in capsys.readouterr().out
+    truth, given = take.observed(side), read_capture(tmp_path / "out.trc").positions[:, :19]
+    assert np.isclose(given, truth, atol=1e-5, equal_nan=True).all(axis=-1).mean() > 0.95
+
+
 def test_a_capture_without_a_hand_is_told(take, tmp_path, capsys, rng):
     body = rng.uniform(-0.9, 0.9, size=(40, 3)) + np.zeros((10, 1, 1))
     capture = Capture(tuple(f"*{number}" for number in range(40)), body, take.rate)

@@ -13,7 +13,7 @@ from handsim import HandSimError
 from handsim.cli import render as command
 from handsim.cli.parsing import registry
 from handsim.cli.render import RenderOptions
-from render import Backgrounds, DepthSensor, RenderConfig
+from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig
 from render.painting.figures import sample_people
 from render.skin.look import TONES
 
@@ -35,21 +35,23 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(command, "render_take", stub)
     line = (
-        "take.npz --out pics --format coco png --passes depth --placement rig --camera sr300 --views 2 "
-        "--share 0.4 --distance 0.5 0.6 --rig eight --dress glove --tones dark brown --background room plain "
+        "take.npz --out pics --format coco png --passes rgb depth --placement rig --camera sr300 "
+        "--rig eight --dress glove --tones dark brown --background room plain "
         "--vary frame --depth-sensor none --no-color-sensor --motion-blur --painter opengl --every 3 "
         "--frames-per-shard 5 --seed 7 --workers 1"
     )
     tyro.cli(command.render, args=line.split(), registry=registry())
     take, out, formats, config, workers = given[0]
     assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
-    assert dataclasses.astuple(config.view) == ("rig", "sr300", 2, 0.4, (0.5, 0.6), "eight", None)
-    assert (config.passes, config.dress, config.tones) == (("depth",), "glove", (-52.0, 10.0))
+    assert dataclasses.astuple(config.view) == ("rig", "sr300", 1, 1 / 3, None, "eight", None)
+    assert (config.passes, config.dress, config.tones) == (("rgb", "depth"), "glove", (-52.0, 10.0))
     assert config.background == Backgrounds({"plain": 1, "room": 1})
     assert (config.vary, config.painter, config.seed) == ("frame", "opengl", 7)
     assert (config.every, config.frames_per_shard) == (3, 5)
     assert config.depth_sensor is None and config.color_sensor is None
     assert config.shutter is not None
+    assert parsed("--views", "2", "--share", "0.4").view == ViewConfig(views=2, share=0.4)
+    assert parsed("--distance", "0.5", "0.6").view == ViewConfig(distance=(0.5, 0.6))
 
 
 @pytest.mark.parametrize(

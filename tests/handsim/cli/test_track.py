@@ -25,11 +25,13 @@ from gloves.takes.archives import CutOffWarning, GrownArchive
 from gloves.takes.corrections import NO_MARKER
 from gloves.takes.take import LOST
 from handsim import HandModel, sample_shape
+from handsim.app import messages
 from handsim.cli.main import main
 from handsim.space.objects import named_object
 from tests.waiting import LONG, wait_for
-from track import Recorder, ReplayServer, captures, load_user, open_source, track_capture
+from track import Recorder, ReplayServer, User, captures, load_user, open_source, track_capture
 from track.rigid_body import load_body
+from track.streams import natnet
 from track.viewer.editors import Corrector
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
@@ -44,6 +46,14 @@ def capture(tmp_path_factory):
         main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
     )
     return out
+
+
+@pytest.fixture(scope="module")
+def right_user(tmp_path_factory):
+    """The file of a user with a right hand."""
+    path = tmp_path_factory.mktemp("right_user") / "user.json"
+    User((nominal_fit(load_layout("dense19"), "L", "right"),)).save(path)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +90,8 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert "right hand: tracked" in said
 
 
-def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):
-    shape, out = str(user[0] / "user.json"), str(tmp_path / "out.npz")
+def test_users_that_do_not_fit_are_told(right_user, capture, tmp_path, capsys):
+    shape, out = str(right_user), str(tmp_path / "out.npz")
     for arguments, words in (
         (["--size", "M"], "expected one of them"),
         (["--hands", "left"], "unknown hand 'left'; valid names: right"),
@@ -177,7 +187,7 @@ def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
 def test_hands_that_are_not_there_get_the_usual_size(tmp_path, capsys):
     rng = np.random.default_rng(0)
     path, out = tmp_path / "clutter.trc", tmp_path / "out.npz"
-    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (15, 30, 3)), 120.0))
+    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (5, 30, 3)), 120.0))
     main(["track", str(path), "--out", str(out)])
     assert "no hand was found to measure its size; size M is used" in capsys.readouterr().err
 
@@ -285,6 +295,29 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     assert ready == "getting ready"
     assert lines[0] == "waiting for hands, to measure their size" and lines[1].startswith("size of the hands")
     assert lines[2] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
+
+
+def test_a_server_may_start_after_the_tracker(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(natnet, "_PATIENCE", 0.5)
+    started, took = [], messages.LiveStatus.show
+
+    def show(status: messages.LiveStatus, line: str, *, now: bool = False) -> None:
+        took(status, line, now=now)
+        if "no NatNet server answers" in line and not started:
+            started.append(ReplayServer(capture.with_suffix(".truth.npz"), loop=True, port=port))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    monkeypatch.setattr(messages.LiveStatus, "show", show)
+    out, address = tmp_path / "live.npz", f"natnet://127.0.0.1:{port}"
+    try:
+        assert main(["track", "--live", address, "--size", "M", "--seconds", "0.3", "--out", str(out)]) == 0
+    finally:
+        for server in started:
+            server.close()
+    assert "it is waited for, Ctrl-C ends it" in capsys.readouterr().err
+    assert load_take(out).num_frames > 1
 
 
 LATE = """

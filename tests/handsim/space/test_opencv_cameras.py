@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
-from handsim.errors import RigError
+from handsim import load_rig
+from handsim.errors import HandSimWarning, RigError
 from handsim.space.rig_formats import load_cameras
 from tests.handsim.space.known_rig import POINTS, K, R, T, projected
 
@@ -66,6 +69,98 @@ def test_fisheyes(tmp_path):
     (camera,) = load_cameras(stored(tmp_path / "fish.yml", values))
     expected = cv2.fisheye.projectPoints(POINTS[:, None], np.zeros(3), np.zeros(3), K, k)[0][:, 0]
     np.testing.assert_allclose(camera.project(POINTS), expected + 0.5, atol=1e-6)
+
+
+FISH = np.array([-0.012, 0.004, -0.006, 0.001])
+
+
+def calibrated(path, lines):
+    """The file of one camera with four coefficients, and further lines."""
+    stored(path, {"camera_matrix": K, "distortion_coefficients": FISH, **SIZE})
+    path.write_text(path.read_text() + lines)
+    return path
+
+
+def is_the_fisheye(camera):
+    expected = cv2.fisheye.projectPoints(POINTS[:, None], np.zeros(3), np.zeros(3), K, FISH)[0][:, 0]
+    np.testing.assert_allclose(camera.project(POINTS), expected + 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("key", ["distortion_model", "camera_model", "lens_model", "model"])
+@pytest.mark.parametrize("name", ["equidistant", "Equidistant", "KANNALA-BRANDT", "Fisheye", "kb4  # four"])
+def test_other_names_of_a_fisheye(tmp_path, key, name):
+    is_the_fisheye(load_cameras(calibrated(tmp_path / "fish.yml", f"{key}: {name}\n"))[0])
+
+
+@pytest.mark.parametrize(
+    ("lines", "kind"),
+    [
+        ("fisheye: true\n", "fisheye"),
+        ("camera_model: pinhole\ndistortion_model: equidistant\n", "fisheye"),
+        ("fisheye: false\n", "brown"),
+        ("distortion_model: PLUMB_BOB\n", "brown"),
+        ("camera_model: pinhole\n", "brown"),
+        ("model: Basler ace\n", "brown"),
+    ],
+)
+def test_other_words_for_a_lens(tmp_path, lines, kind):
+    (camera,) = load_cameras(calibrated(tmp_path / "lens.yml", lines))
+    assert (camera.lens.kind, camera.lens.coefficients[:4]) == (kind, tuple(FISH))
+
+
+def test_a_lens_that_is_named_for_all_cameras(tmp_path):
+    one = {"K": K.tolist(), "D": FISH.tolist(), "R": R.tolist(), "T": T.ravel().tolist()}
+    values = {"distortion_model": "fisheye", "cameras": [one, one | {"name": "b"}]} | SIZE
+    (tmp_path / "many.json").write_text(json.dumps(values))
+    assert [camera.lens.kind for camera in load_cameras(tmp_path / "many.json")] == ["fisheye", "fisheye"]
+
+
+@pytest.mark.parametrize("key", ["distortion_model", "camera_model", "model"])
+@pytest.mark.parametrize("name", ["mei", "Omni", "ds", "FOV"])
+def test_unknown_lenses_are_refused(tmp_path, key, name):
+    path = calibrated(tmp_path / "other.yml", f"{key}: {name}\n")
+    with pytest.raises(RigError, match=f"{key}: unknown lens '{name}'.* valid names: .*fisheye"):
+        load_cameras(path)
+
+
+def test_a_lens_of_two_kinds_is_refused(tmp_path):
+    path = calibrated(tmp_path / "both.yml", "camera_model: fisheye\ndistortion_model: radtan\n")
+    with pytest.raises(RigError, match="named both as Brown's and as a fisheye"):
+        load_cameras(path)
+
+
+@pytest.mark.parametrize("lower", [False, True])
+@pytest.mark.parametrize("block", [False, True])
+def test_camera_info_of_ros(tmp_path, lower, block):
+    text = "header:\n  frame_id: head\nheight: 480\nwidth: 640\ndistortion_model: equidistant\n"
+    values = {"D": FISH, "K": K.ravel(), "R": np.eye(3).ravel(), "P": np.c_[K, np.zeros(3)].ravel()}
+    for name, numbers in values.items():
+        listed = "\n" + "\n".join(f"- {n}" for n in numbers) if block else f" {numbers.tolist()}"
+        text += f"{name.lower() if lower else name}:{listed}\n"
+    message = text + "roi:\n  height: 0\n  width: 0\n  do_rectify: false\n---\n"
+    (tmp_path / "info.yaml").write_text(2 * message)
+    with pytest.warns(HandSimWarning, match="R beside P is ROS' rectification and no pose"):
+        (camera,) = load_cameras(tmp_path / "info.yaml")
+    assert camera.size == (640, 480)
+    is_the_fisheye(camera)
+
+
+def test_the_calibration_of_pose2sim(tmp_path):
+    turn, shift = cv2.Rodrigues(R)[0].ravel().tolist(), T.ravel().tolist()
+    pose = f"rotation = {turn}\ntranslation = {shift}\n"
+    inner = f"name = 'a'\nsize = [640.0, 480.0]\nmatrix = {K.tolist()}\n"
+    tables = f"[a]\n{inner}{pose}distortions = {D.ravel()[:4].tolist()}\nfisheye = false\n"
+    tables += f"[b]\n{inner}{pose}distortions = {FISH.tolist()}\nfisheye = true\n"
+    path = tmp_path / "Calib.toml"
+    path.write_text(tables + "[metadata]\nadjusted = false\nerror = 0.0\n")
+    brown, fish = load_cameras(path)
+    assert [brown.name, fish.name, fish.lens.kind] == ["a", "b", "fisheye"]
+    np.testing.assert_allclose(brown.project(POINTS), projected(R, T, K, D.ravel()[:4]), atol=1e-6)
+    with pytest.raises(RigError, match=r"\[a\] .* Pose2Sim or anipose, .* handsim rig import"):
+        load_rig(path)
+    path.write_text(path.read_text().replace(str(shift[0]), "1e5"))
+    with pytest.raises(RigError, match="are these millimeters"):
+        load_cameras(path)
 
 
 def test_a_calibration_without_opencvs_header(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 import warnings
 
 import cv2
@@ -186,6 +187,32 @@ def test_colmap_fisheyes_and_points_of_images(tmp_path):
     expected = cv2.fisheye.projectPoints(POINTS[:, None], cv2.Rodrigues(R)[0], T, matrix, k)[0][:, 0]
     np.testing.assert_allclose(cameras[1].project(POINTS), expected, atol=1e-6)
     np.testing.assert_allclose(quaternion_matrix(rotation_quaternions(R[None])[0]), R, atol=1e-12)
+
+
+def test_colmap_in_binary(tmp_path):
+    parameters = [600.0, 601.0, 320.0, 240.0, 0.02, -0.006, 0.001, 0.002]
+    camera = f"7 OPENCV_FISHEYE 640 480 {' '.join(map(str, parameters))}"
+    text = colmap(tmp_path, camera, "1 {0} 7 a b.png\n\n")
+    expected = load_cameras(text)
+    folder = tmp_path / "0"
+    folder.mkdir()
+    words = (text / "images.txt").read_text().split("\n")[1].split()
+    pose = struct.pack("<Qi7di", 1, 1, *map(float, words[1:8]), 7)
+    points = struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.0, 2.0, -1)
+    contents = {
+        "cameras.bin": struct.pack("<QiiQQ8d", 1, 7, 5, 640, 480, *parameters),
+        "images.bin": pose + b"a b.png\0" + points,
+    }
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
+    for path in (folder, folder / "cameras.bin", folder / "images.bin"):
+        assert load_cameras(path) == expected
+    for name, data in contents.items():
+        for cut in (2, 8, 30, len(data) - 3):
+            (folder / name).write_bytes(data[:cut])
+            with pytest.raises(RigError, match=rf"{name}: cut or damaged.* model_converter writes text"):
+                load_cameras(folder)
+        (folder / name).write_bytes(data)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,16 @@ from handsim.hand.skin import vertex_normals
 from handsim.space.camera import pinhole, preset
 from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
-from render.painting.rasterizer import Triangles, faces_for, join, rasterize, warp, warp_depth, warp_normals
+from render.painting.rasterizer import (
+    Triangles,
+    faces_for,
+    join,
+    nearest_faces,
+    rasterize,
+    warp,
+    warp_depth,
+    warp_normals,
+)
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
 
@@ -260,3 +269,30 @@ def test_mistakes_are_told():
     blind = Camera("blind", (320, 240), narrow, lens=Lens("brown", (-0.45, 0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(ArgumentError, match="its lens sees nothing"):
         faces_for(blind)
+
+
+def test_a_face_fills_the_pixels_whose_centers_it_holds(rng: np.random.Generator) -> None:
+    """Also where a side is level or upright, where the face is thin, and where it ends beside the picture."""
+    width, height = 40, 30
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    faces, filled = np.array([[0, 1, 2]]), 0
+    for attempt in range(300):
+        corners = rng.uniform(-15.0, 55.0, (3, 3))
+        corners[:, 2] = rng.uniform(0.5, 2.0, 3)
+        if attempt % 3 == 0:
+            corners[1, attempt % 2] = corners[0, attempt % 2]
+        elif attempt % 3 == 1:
+            corners[2, :2] = corners[1, :2] + rng.uniform(-1.0, 1.0, 2)
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        v = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
+        w = ((y - ay) * (bx - ax) - (x - ax) * (by - ay)) / area
+        inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0) & (area < 0.0)
+        behind = corners * [1.0, 1.0, 0.5]
+        surfaces = [(behind, faces), (corners, faces), (behind, faces)]
+        nearness, first = nearest_faces(surfaces, (width, height), farthest=0.0)
+        np.testing.assert_array_equal(first, np.where(inside, 1, -1))
+        plane = az + v * (bz - az) + w * (cz - az)
+        np.testing.assert_allclose(nearness, np.where(inside, plane, 0.0), rtol=1e-6)
+        filled += inside.sum()
+    assert filled > 1000

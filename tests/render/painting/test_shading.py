@@ -124,3 +124,23 @@ def test_backdrops_come_as_often_as_they_should(rng: np.random.Generator) -> Non
     drawn = [sample_backdrop(rng=rng) for _ in range(500)]
     assert sum(one is not None for one in drawn) / 500 == pytest.approx(SHARE, abs=0.08)
     assert all(0.0 < one.gap < 0.5 for one in drawn if one is not None)
+
+
+def test_shadows_are_the_mean_over_the_texels_around_a_point(rng: np.random.Generator) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    points, towards = ball.vertices.astype(np.float32), np.array([0.0, 0.6, -0.8])
+    found = shading.shadow_map(points, ball.faces, towards, np.ones(len(points), np.bool_))
+    nearest = found.nearest[0]
+    assert np.isinf(nearest).any() and np.isfinite(nearest).any()
+    shares = []
+    for point in rng.uniform(-0.15, 0.15, (300, 3)):
+        across, down, near = found.to_map @ [*point, 1.0]
+        (column, right), (row, below) = ((int(np.floor(x - 0.5)), (x - 0.5) % 1.0) for x in (across, down))
+        window = nearest[row - 1 : row + 3, column - 1 : column + 3] <= near + found.bias
+        if row < 1 or column < 1 or window.shape != (4, 4):
+            wanted = 1.0
+        else:
+            wanted = np.array([1 - below, 1, 1, below]) @ window @ np.array([1 - right, 1, 1, right]) / 9.0
+        shares.append(shading.lit_share(found.to_map, found.nearest, found.bias, *point))
+        assert shares[-1] == pytest.approx(wanted, abs=1e-9)
+    assert {0.0, 1.0} < set(shares)

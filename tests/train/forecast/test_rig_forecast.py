@@ -21,7 +21,6 @@ from train.forecast.rig_forecast import (
     forecast,
     light,
     light_work,
-    moved,
     sample_work,
     work_of_take,
 )
@@ -127,7 +126,7 @@ def test_people_walk_through_a_long_volume():
 def test_an_object_stays_in_the_hand(work):
     scene = work[-1]
     offset = np.tile([1.0, 2.0, 0.1], (scene.num_frames, 1))
-    there = moved(scene, offset)
+    there = scene.moved(offset)
     before, after = (
         one.moving_object.motion.T_world_body[:, :3, 3] - one.hands[0].qpos[:, :3] for one in (scene, there)
     )

@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, MarkerPlace, load_layout
+from gloves import MarkerLayout, MarkerPlace, attach, load_layout
 from handsim import HandModel, HandSimWarning, Population, join_qpos, load_rig
 from handsim.app.output import CHECKSUMS
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
+from handsim.hand.shape import HAND_DTYPE
+from handsim.space.rig import ROOM_CENTER, CameraRig
+from handsim.space.transforms import rigid
 from poses import sample_poses
 from poses.shapes import HIGH, LOW
 from tests.rigs import mixed_rig
@@ -32,7 +35,7 @@ from train.data.shards import MANIFEST, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
-from train.simulation.training_frames import NO_GRASP, NO_REST, NO_TOUCH
+from train.simulation.training_frames import FLESH, NO_GRASP, NO_REST, NO_TOUCH, NOISE
 
 CONFIG = GenerateSettings(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
@@ -100,6 +103,67 @@ def test_rows_are_what_they_say(finished):
     assert 0.85 < np.isfinite(off).mean() < 1.0
     assert np.nanmedian(off) < 0.0005
     assert 0.1 < np.isfinite(rows["ghosts"][..., 0]).sum(axis=1).mean() < 2.0
+
+
+def test_gloves_are_kept_as_each_person_wore_them(finished):
+    dataset, usual = Dataset(finished), load_layout("dense19")
+    slips = []
+    for shard, rows in enumerate(dataset.shards):
+        hands, gloves = dataset.hands(shard), dataset.gloves(shard)
+        assert len(gloves) == len(hands)
+        used = np.unique(rows["hand"])
+        assert [number for number, glove in enumerate(gloves) if glove is not None] == used.tolist()
+        for number in used:
+            mine = rows[rows["hand"] == number]
+            fit = attach(gloves[number], hands[number])
+            markers = fit.markers(mine["qpos"].astype(np.float64))[0]
+            np.testing.assert_allclose(markers, mine["markers"], atol=1e-5)
+            slips += [
+                one.along - two.along for one, two in zip(fit.layout.markers, usual.markers, strict=True)
+            ]
+    assert 0.05 < np.std(slips) < 0.12
+    assert all((finished / hands_name(shard)).stat().st_size < 20_000 for shard in range(len(dataset.shards)))
+
+
+def test_markers_move_with_flesh_where_that_is_asked_for(tmp_path):
+    given = {"num_frames": 200, "frames_per_hand": 50, "workers": 1}
+    plain, moved = (generate_dataset(tmp_path / str(flesh), flesh=flesh, **given) for flesh in (False, True))
+    assert "flesh" not in plain.manifest.config and moved.manifest.config["flesh"] is True
+    (rows,), hands, gloves = moved.shards, moved.hands(0), moved.gloves(0)
+    away = []
+    for number in np.unique(rows["hand"]):
+        mine = rows[rows["hand"] == number]
+        away.append(mine["markers"] - attach(gloves[number], hands[number]).markers(mine["qpos"])[0])
+    assert np.sqrt((np.concatenate(away) ** 2).mean()) == pytest.approx(np.hypot(NOISE, FLESH), rel=0.15)
+
+
+def test_a_set_of_a_version_that_kept_no_gloves_is_read(finished, tmp_path):
+    copy = shutil.copytree(finished, tmp_path / "copy")
+    path, manifest = copy / hands_name(0), json.loads((copy / MANIFEST).read_text())
+    records = np.load(path)
+    np.save(path, records[list(HAND_DTYPE.names)].astype(HAND_DTYPE))
+    manifest["files"][hands_name(0)] = checksum(path)
+    (copy / MANIFEST).write_text(json.dumps(manifest))
+    old = Dataset(copy)
+    assert old.hands(0)[3].length == Dataset(finished).hands(0)[3].length
+    assert len(old.people()) == 700
+    with pytest.raises(DatasetError, match=r"hands-00000\.npy holds no places of markers"):
+        old.gloves(0)
+
+
+def test_hands_are_where_the_center_is(finished, tmp_path):
+    shift, rig = np.array([0.5, -2.0, 0.25]), load_rig("figure5")
+    cameras = (camera.at(rigid(np.eye(3), shift) @ camera.T_world_camera) for camera in rig.cameras)
+    there = CameraRig("elsewhere", tuple(cameras))
+    made = dataclasses.replace(CONFIG, num_frames=400, rig=there, center=tuple(ROOM_CENTER + shift))
+    make_dataset(made, tmp_path / "set", workers=1)
+    rows, usual = Dataset(tmp_path / "set").rows(), Dataset(finished).rows()[:400]
+    np.testing.assert_allclose(rows["qpos"][:, :3], usual["qpos"][:, :3] + shift, atol=1e-5)
+    np.testing.assert_allclose(rows["markers"], usual["markers"] + shift, atol=1e-5)
+    assert (rows["cameras"] == usual["cameras"]).mean() > 0.99
+    assert np.nanmedian(np.linalg.norm(rows["observed"] - usual["observed"] - shift, axis=-1)) < 1e-5
+    with pytest.raises(ArgumentError, match="camera"):
+        make_dataset(dataclasses.replace(CONFIG, center=tuple(rig.positions[3])), tmp_path / "other")
 
 
 def test_two_workers_make_the_same_bytes(finished, tmp_path, monkeypatch):

@@ -17,16 +17,14 @@ from poses.touch import FINGERS, is_touching
 from train import simulate_take
 from train.simulation import scenes
 from train.simulation.scenes import (
-    FLESH,
-    NOISE,
     RATE,
     CalibrationTakeConfig,
     SceneMotion,
     calibration_angles,
-    move_skin,
     sample_real_like_scene,
 )
 from train.simulation.takes import sample_scene, simulate_calibration
+from train.simulation.training_frames import FLESH, NOISE, move_skin
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])

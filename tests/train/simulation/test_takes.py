@@ -14,8 +14,8 @@ from gloves.captures.capture import count_gaps
 from handsim import HandModel, load_rig
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
-from handsim.space.rig import ROOM_CENTER
-from handsim.space.transforms import pose_matrices, quaternion_matrix
+from handsim.space.rig import ROOM_CENTER, CameraRig
+from handsim.space.transforms import pose_matrices, quaternion_matrix, rigid
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
 from poses.two_hands import two_hands_penetration
@@ -132,6 +132,23 @@ def thick_glove(folder: Path, radius_mm: float) -> str:
     file = folder / f"balls{radius_mm:g}.toml"
     dataclasses.replace(load_layout("dense19"), radius=radius_mm * 1e-3).save(file)
     return str(file)
+
+
+def test_hands_move_where_the_center_is():
+    shift = np.array([3.0, -2.0, 0.4])
+    usual, rig = short("hand-pen"), load_rig("figure5")
+    cameras = (camera.at(rigid(np.eye(3), shift) @ camera.T_world_camera) for camera in rig.cameras)
+    options = dict(num_frames=usual.num_frames, rig=CameraRig("elsewhere", tuple(cameras)), others=0)
+    take = simulate_take("hand-pen", center=tuple(ROOM_CENTER + shift), **options)
+    np.testing.assert_allclose(take.qpos[..., :3], usual.qpos[..., :3] + shift, atol=1e-9)
+    np.testing.assert_allclose(take.body_poses[..., :3], usual.body_poses[..., :3] + shift, atol=1e-9)
+    assert take.settings["center"] == list(ROOM_CENTER + shift) and "center" not in usual.settings
+    for one, other in zip(take.hand_labels, usual.hand_labels, strict=True):
+        away = np.linalg.norm(take.observed(one) - shift - usual.observed(other), axis=-1)
+        assert np.nanmedian(away) < 1e-6
+        assert (np.isfinite(take.observed(one)) == np.isfinite(usual.observed(other))).mean() > 0.98
+    with pytest.raises(ArgumentError, match="center is 51"):
+        simulate_take("hand-pen", center=(51.0, 0.0, 1.0))
 
 
 def test_the_gloves_radius_reaches_the_optics(tmp_path):

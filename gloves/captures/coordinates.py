@@ -1,0 +1,197 @@
+"""What the coordinates in a file are: measured points, or else missing, held, doubled, or no marker's.
+
+Programs write more than was measured. Gaps hold zeros or the last position, a marker of two subjects comes
+twice, outputs of models lie between the markers, and unlabeled points get a column for each piece of their
+path. Every format is settled here, once, and a sentence counts what was found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gloves.captures.capture import Capture
+from handsim.errors import CaptureError
+
+OUTPUTS: Final = "model_outputs"
+UNMARKED: Final = "marked_as_missing"
+PIECES: Final = "columns_of_pieces"
+_ZEROS: Final = "zeros"
+_DOUBLED: Final = "doubled"
+_HELD: Final = "held"
+_SENTENCES: Final = {
+    OUTPUTS: "{} columns are outputs of models, such as angles and forces, and are left out",
+    UNMARKED: "all points are marked as missing (residual -1), and the {} with coordinates are read",
+    PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
+    _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
+    _DOUBLED: "{} points are exactly where another is, as a marker of two subjects is, and are left out",
+    _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
+    "read as missing",
+}
+"""The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
+_MODELED: Final = re.compile(r".(?:Angle|Force|Moment|Power|Scalar)s?$")
+"""Names that Vicon's models give their outputs: RThumbAngles, LWristMoment."""
+_MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
+_NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
+_COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
+_GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
+_GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
+_AT_REST: Final = 0.4  # of the next step: the first step of a marker that speeds up smoothly is a third
+
+
+def findings_sentence(findings: Mapping[str, int]) -> str:
+    """What was found in a file, in words; blank if nothing was."""
+    return "; ".join(text.format(findings[kind]) for kind, text in _SENTENCES.items() if findings.get(kind))
+
+
+def settled(capture: Capture) -> Capture:
+    """The measured points of a capture as it was read, and in its findings what the others are."""
+    capture = without_outputs(capture)
+    counts = {}
+    capture, counts[_ZEROS] = zeros_as_missing(capture)
+    if capture.num_frames >= _MIN_FRAMES:
+        capture, counts[_DOUBLED] = _once(capture)
+        held = _held(capture.positions)
+        counts[_HELD] = int(held.sum())
+        if held.any():
+            positions = np.where(held[..., None], np.nan, capture.positions)
+            capture = dataclasses.replace(capture, positions=positions)
+    found = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
+    return dataclasses.replace(capture, findings=dict(found))
+
+
+def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
+    """The capture without columns that are listed as outputs of a model, or named as such.
+
+    The list or the columns may lack a subject's prefix ("Anna:RThumbAngles").
+    """
+    whole, bare = set(listed), {name.rpartition(":")[2] for name in listed}
+    kept = [
+        column
+        for column, name in enumerate(capture.names)
+        if not (
+            name in whole
+            or (name in bare if ":" not in name else name.rpartition(":")[2] in whole)
+            or _MODELED.search(name)
+        )
+    ]
+    count = len(capture.names) - len(kept)
+    if not count:
+        return capture
+    if not kept:
+        raise CaptureError(
+            f"no markers: all {count} columns are outputs of models, such as angles and forces"
+        )
+    return dataclasses.replace(
+        capture,
+        names=tuple(capture.names[column] for column in kept),
+        positions=capture.positions[:, kept],
+        findings={**capture.findings, OUTPUTS: count + capture.findings.get(OUTPUTS, 0)},
+    )
+
+
+def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
+    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
+
+    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
+    in which nothing moves is left as it is.
+    """
+    positions = capture.positions
+    zero = (positions == 0.0).all(axis=-1)
+    count = int(zero.sum())
+    there = np.isfinite(positions[..., 0]) & ~zero
+    tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
+    if count < 2 or not any((track != track[:1]).any() for track in tracks):  # nothing moves
+        return capture, 0
+    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
+
+
+def _once(capture: Capture) -> tuple[Capture, int]:
+    """The capture with one of all points at one place in a frame, and how many the others were.
+
+    Two columns that always agree where both have a point become one, with the points of both.
+    """
+    positions = capture.positions
+    key = positions @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # equal for equal points
+    key[(positions == 0.0).all(axis=-1)] = np.nan  # of a capture in which nothing moves
+    order = np.argsort(key, axis=1, kind="stable")
+    ranked = np.take_along_axis(key, order, axis=1)
+    frames, ranks = np.nonzero(ranked[:, 1:] == ranked[:, :-1])
+    first, second = order[frames, ranks], order[frames, ranks + 1]
+    equal = (positions[frames, first] == positions[frames, second]).all(axis=-1)
+    frames, first, second = frames[equal], first[equal], second[equal]
+    if not len(frames):
+        return capture, 0
+    positions = positions.copy()
+    positions[frames, second] = np.nan
+    kept = np.arange(len(capture.names))  # the column that each column's points belong to
+    pairs, counts = np.unique(np.stack([first, second], axis=1), axis=0, return_counts=True)
+    there = np.isfinite(key)
+    for (one, other), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        if count >= _MIN_FRAMES and count == int((there[:, one] & there[:, other]).sum()):
+            kept[kept == kept[other]] = kept[one]
+    for column in np.flatnonzero(kept != np.arange(len(kept))).tolist():
+        moved = np.isfinite(positions[:, column, 0]) & np.isnan(positions[:, kept[column], 0])
+        positions[moved, kept[column]] = positions[moved, column]
+    left = np.unique(kept)
+    names = tuple(capture.names[column] for column in left.tolist())
+    return dataclasses.replace(capture, names=names, positions=positions[:, left]), len(frames)
+
+
+def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
+    """Points of gaps that were filled with the last position, or with the first one before the marker came.
+
+    Such a marker stops and starts abruptly. One that rests slows down and speeds up, and does not repeat its
+    position to the last digit, unless the capture is simulated or its digits are few.
+    """
+    num_frames, num_columns = positions.shape[:2]
+    moves = np.diff(positions, axis=0)
+    repeated = (moves == 0.0).all(axis=-1)
+    if not repeated.any():
+        return np.zeros((num_frames, num_columns), dtype=np.bool_)
+    steps = np.full((num_frames + 3, num_columns), np.nan)  # two frames without a step at each end
+    steps[2:-2] = np.linalg.norm(moves, axis=-1)
+    grid = _grid(moves)
+    abrupt = max(_NEVER_STILL, _GRID_STEPS * grid)
+
+    flags = np.zeros((num_columns, num_frames + 1), dtype=np.int8)
+    flags[:, 1:-1] = repeated.T
+    edges = np.diff(flags, axis=1)
+    columns, first = np.nonzero(edges == 1)  # the first and the last frame of each run of equal positions
+    last = np.nonzero(edges == -1)[1]
+    ends = [
+        np.where(step > _AT_REST * np.nan_to_num(steps[beyond, columns]), step, 0.0)
+        for at, beyond in ((first + 1, first), (last + 2, last + 3))
+        for step in (steps[at, columns],)
+    ]
+    known = [np.isfinite(steps[at, columns]) for at in (first + 1, last + 2)]
+    abruptly = [end > abrupt for end in ends]
+    if grid > _COARSE:  # a marker may rest here, and be stopped abruptly by what it touches
+        held = (known[0] | known[1]) & (abruptly[0] | ~known[0]) & (abruptly[1] | ~known[1])
+        held &= last > first + 1
+    else:
+        held = abruptly[0] | abruptly[1]
+    alive = (steps[2:-2] > 0.0).any(axis=1)
+    for _ in range(2):
+        others = np.concatenate([[0], np.cumsum(alive)])
+        chosen = held & (others[last] > others[first])
+        marks = np.zeros((num_frames + 1, num_columns), dtype=np.int32)
+        # before the marker came, all are held; otherwise the first was measured
+        marks[(first + (first > 0))[chosen], columns[chosen]] += 1
+        marks[last[chosen] + 1, columns[chosen]] -= 1
+        missing = np.cumsum(marks, axis=0)[:-1] > 0
+        alive |= missing[1:].any(axis=1)  # where nothing moves, all are held beside one that is
+    return missing
+
+
+def _grid(moves: Float[np.ndarray, "T-1 N 3"]) -> float:
+    """The step [m] of the grid that coordinates are rounded to; 0 if none shows."""
+    sizes = np.abs(moves[np.isfinite(moves) & (moves != 0.0)])
+    smallest = float(sizes.min(initial=np.inf))
+    return smallest if int((sizes < 1.3 * smallest).sum()) >= _GRID_COUNT else 0.0

@@ -1,0 +1,83 @@
+"""Trajectories of a wide table, in memory that goes with the number of points.
+
+An optical system gives an unlabeled marker another number whenever it comes back, and its export another
+column. Such columns hold a piece of a path each, thousands a minute, and are packed into a few.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+_FAMILY: Final = 100  # columns whose names differ by a number alone, from which they may be pieces
+_LITTLE: Final = 0.5  # share of the frames in which pieces have points
+
+
+def _pieces_of(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    """Which columns, with points in this share of the frames, hold pieces of unlabeled paths."""
+    stems = [name.rstrip("0123456789") for name in names]
+    counts = Counter(stems)
+    many = np.array([counts[stem] > _FAMILY for stem in stems])
+    return many & (present < _LITTLE)
+
+
+def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
+    """A place for each point (P,) among as few columns as possible, and the number of these.
+
+    A piece is an unbroken run of points of a column. A blank frame parts the pieces of a place.
+    """
+    order = np.lexsort((frames, columns))
+    frames, columns = frames[order], columns[order]
+    begins = np.flatnonzero(np.diff(frames, prepend=-2) * (np.diff(columns, prepend=-1) == 0) != 1)
+    ends = np.append(begins[1:], len(frames))
+    free: list[tuple[int, int]] = []  # the frame from which a place is free, and the place
+    number, place = 0, np.empty(len(frames), dtype=np.int64)
+    for piece in np.argsort(frames[begins], kind="stable").tolist():
+        begin, end = begins[piece], ends[piece]
+        if free and free[0][0] <= frames[begin]:
+            chosen = heapq.heappop(free)[1]
+        else:
+            chosen, number = number, number + 1
+        place[begin:end] = chosen
+        heapq.heappush(free, (int(frames[end - 1]) + 2, chosen))
+    packed = np.empty_like(place)
+    packed[order] = place
+    return packed, number
+
+
+class Trajectories(NamedTuple):
+    """The columns of a marker file."""
+
+    names: tuple[str, ...]
+    positions: Float[np.ndarray, "T N 3"]
+    """[m], NaN where there is none."""
+    pieces: int = 0
+    """Columns of the file that were packed."""
+
+
+def packed_trajectories(
+    names: Sequence[str],
+    num_frames: int,
+    frames: Int[np.ndarray, "P"],
+    columns: Int[np.ndarray, "P"],
+    points: Float[np.ndarray, "P 3"],
+) -> Trajectories:
+    """Trajectories of a list of points, those in pieces behind the others."""
+    share = np.bincount(columns, minlength=len(names)) / num_frames
+    in_pieces = _pieces_of(names, share)
+    whole = np.flatnonzero(~in_pieces)
+    packed = in_pieces[columns]
+    places = np.searchsorted(whole, columns)
+    more, number = _packed(frames[packed], columns[packed])
+    places[packed] = len(whole) + more
+    positions = np.full((num_frames, len(whole) + number, 3), np.nan)
+    positions[frames, places] = points
+    kept = [names[column] for column in whole.tolist()]
+    kept += [f"*{place}" for place in range(len(whole) + 1, len(whole) + number + 1)]
+    return Trajectories(tuple(kept), positions, int(in_pieces.sum()))

@@ -1,0 +1,228 @@
+"""Every option of every command acts: another value writes something else, or is refused where it cannot."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+
+from gloves import write_capture
+from gloves.layout import load_layout
+from handsim import look_at
+from handsim.cli.main import _HELP, _target, load, main
+from handsim.cli.parsing import PresetCommand, _with_hints, registry
+from handsim.space.camera import pinhole
+from handsim.space.rig import CameraRig
+from tests.handsim.space.known_rig import XCP
+from tests.train.simulation.test_options import GENERATE, SIMULATE
+from track.settings import nominal_user
+from train import generate_dataset, simulate_take
+from train.labelers.storage import CARD, WEIGHTS
+
+ELSEWHERE = {
+    "demo": "out", "hand": "out mesh", "glove list": "out", "glove check": "out", "glove score": "out",
+    "glove improve": "out", "rig import": "out", "rig score": "out json", "rig plan": "out",
+    "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
+    "export": "out", "evaluate": "json threads", "simulate": "out cluster", "calibrate": "out",
+    "track": "out live seconds send labelled", "report": "out", "replay": "host port rate loop",
+    "view": "host port out video live", "body": "out", "doctor": "compile",
+    "render": "out merge format workers cluster painter frames-per-shard",
+}  # fmt: skip
+"""Options that say only where something is or goes, as what, or how quickly."""
+SHOWN = {"view": "rig time glove size shape hands body labeler"}
+"""Options of what is shown and not written."""
+SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
+QUICK = [
+    ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
+    ("glove check", "dense19 --out g.png", "size XS"),
+    ("rig import", "lab.xcp --out r.toml", "up y"),
+    ("export", "take.npz --out x.bvh", "fps 30|up y"),
+    ("evaluate", "labeled.trc --json f.json --occlude 4 --ghosts 2",
+     "glove sparse13|labeler run|occlude 1|ghosts 0|every 7|seed 4"),
+    ("evaluate", "labeled.trc --json f.json", "truth single.truth.npz"),
+    ("label", "capture.c3d --out l.trc", "hands right"),
+    ("train", f"set --out run2 --samples 128 {SMALL}",
+     "samples 160|batch 64|optimizer sgd|learning-rate 0.01|schedule steps|weight-decay 9|average 0.1|"
+     "average-every 3|precision bf16|jitter 0.05|rig-share 0|occlude 9|ghosts 7|anisotropy 0.5|seed 5|"
+     "corruption tests.handsim.cli.test_options:unchanged|"
+     "network.width 16|network.gates 4|network.depth 2|network.num-distances 8|network.reach 0.1"),
+    ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --camera vga",
+     "passes rgb|dress glove|tones dark|background plain|depth-sensor kinect1|no-color-sensor|motion-blur|"
+     "num-frames 2|seed 4|placement orbit|camera sr300|views 2|share 0.6|distance 0.9 1.0|cameras own.toml|"
+     "background photo --photos photos"),
+    ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes depth", "every 9"),
+    ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes rgb", "vary frame"),
+    ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --passes depth --placement rig",
+     "rig eight"),
+    ("render", "--poses poses.npz --out pics --format png --workers 1 --passes depth --frames-per-shard 1",
+     "hands left|people 1|glove sparse13|up y"),
+]  # fmt: skip
+"""Commands, how they are run, and other values of their options; some 50 s of a processor in all."""
+SLOW = [
+    ("label", "capture.c3d --out l.trc", "glove sparse13|labeler run"),
+    ("train", "set --out run2 --samples 32 --batch 16 --labeler cnn",
+     "labeler set|knee 0.5|cnn.views random|cnn.reject 0.005|cnn.spread 0.05"),
+    ("train", "set --out run2 --samples 32 --batch 16", "preset han2018 --average 0.5"),
+    ("track", "capture.c3d --out t.npz",
+     "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate"),
+    ("calibrate", "capture.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
+    ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
+    ("glove score", "dense19 --out s.html --num-frames 100 --captures 0",
+     "rig six|motion twins|num-frames 150|labeler run|captures 1|seed 3"),
+    ("glove improve", "dense19 --out i.toml --minutes 0.1 --captures 0",
+     "markers 18|keep ThumbTip|rig six|minutes 0.3|captures 1|seed 3"),
+    ("rig score", "six --out s.html --json s.json --num-frames 60",
+     "volume 1 1 1|center 0.1 0 1.2|take take.npz|glove sparse13|num-frames 90|seed 3"),
+    ("rig plan", "--out p.toml --cameras 5 --room 4 4 2.5",
+     "cameras 6|room 5 4 3|mounts walls|volume 1 1 1|center 0.2 0 1.2|keep eight --cameras 10|size 640 480|"
+     "field-of-view 80|glove sparse13|seed 3"),
+]  # fmt: skip
+"""The same for what takes some minutes."""
+
+
+def unchanged(markers, *, rng):
+    """A corruption of one's own that changes nothing."""
+    return markers, np.tile(np.arange(markers.shape[1]), (len(markers), 1))
+
+
+def options_of(name: str) -> set[str]:
+    """The options of a command as they are typed, without the dashes."""
+    command = load(_target(name))
+    if isinstance(command, PresetCommand):
+        command = command.choose((), name)
+    with pytest.warns(DeprecationWarning):
+        parser = tyro.extras.get_parser(_with_hints(command), registry=registry())
+    names = {one.option_strings[0] for one in parser._actions if one.option_strings} - {"-h"}
+    return {"num-frames" if name == "--frames" else name[2:] for name in names}
+
+
+COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_has_its_place(name):
+    told = set(" ".join((ELSEWHERE.get(name, ""), SHOWN.get(name, ""))).split())
+    varied = {one.split()[0] for command, _, others in (*QUICK, *SLOW) if command == name
+              for one in others.split("|")}  # fmt: skip
+    simulated = {"generate": GENERATE, "simulate": SIMULATE}.get(name, ())
+    varied |= {option.replace("_", "-") for option, _ in simulated}
+    if "photos" not in varied and name == "render":
+        varied |= {"photos", "poses"}  # in the situations above
+    named = {one.replace("no-color", "color") for one in varied} | ({"num-frames"} if simulated else set())
+    assert options_of(name) == named | told
+    assert not named & told
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    """What the commands read."""
+    folder = tmp_path_factory.mktemp("files")
+    take = simulate_take(kind="hand-pen", num_frames=48)
+    take.save(folder / "take.npz")
+    single = simulate_take(num_frames=30)
+    single.save(folder / "single.truth.npz")
+    write_capture(folder / "labeled.trc", single.labeled_capture(sides=False))
+    nominal_user(load_layout("dense19"), "L", ["right"]).save(folder / "user.json")
+    (folder / "lab.xcp").write_text(XCP)
+    assert main(["simulate", "--num-frames", "60", "--out", str(folder / "capture.c3d")]) == 0
+    generate_dataset(folder / "set", num_frames=300, frames_per_hand=20, scenes={"alone": 1.0}, workers=1)
+    assert (
+        main(["train", str(folder / "set"), "--out", str(folder / "run"), "--samples", "64", *SMALL.split()])
+        == 0
+    )
+    place = take.qpos[0, 0, :3]
+    camera = pinhole("own", (320, 240), 200.0).at(look_at(place + [0.1, -0.5, 0.2], place))
+    other = dataclasses.replace(camera, name="other").at(look_at(place + [0.4, -0.4, 0.2], place))
+    CameraRig("own", (camera, other)).save(folder / "own.toml")
+    np.savez(folder / "poses.npz", qpos=take.qpos[:2, 0])
+    (folder / "photos").mkdir()
+    from render.captions import write_png
+
+    write_png(folder / "photos" / "one.png", np.full((48, 64, 3), 90, np.uint8))
+    return folder
+
+
+def written(command: str, line: str, files: Path, folder: Path) -> dict[str, object]:
+    """What a command writes, run in a folder of copies of the files."""
+    shutil.copytree(files, folder)
+    before = set(folder.rglob("*"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for page in ("run_page", "dataset_page", "hand_plot"):
+            patch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
+        code = main([*command.split(), *line.split()])
+    if command in ("track", "calibrate") and code == 1:
+        return {}  # a glove that the hands do not wear, or a labeler of no use, is refused
+    assert code == 0, line
+    made = {path.relative_to(folder).as_posix(): path for path in set(folder.rglob("*")) - before}
+    if command == "train":  # other files hold times
+        card = json.loads(made[f"run2/{CARD}"].read_text())
+        return {"weights": made[f"run2/{WEIGHTS}"].read_bytes(), "figures": card["held_out_simulated"]}
+    settings = ("render.json", "checksums")  # they name the options
+    return {
+        name: path.read_bytes() for name, path in made.items()
+        if path.is_file() and not path.name.startswith(settings)
+    }  # fmt: skip
+
+
+def cases(table: list[tuple[str, str, str]]) -> Iterator[object]:
+    for command, line, others in table:
+        for other in others.split("|"):
+            marks = pytest.mark.slow if table is SLOW else ()
+            yield pytest.param(command, line, other, id=f"{command} --{other}", marks=marks)
+
+
+@pytest.fixture(scope="module")
+def usual(files, tmp_path_factory):
+    known: dict[str, dict[str, object]] = {}
+
+    def usual(command: str, line: str) -> dict[str, object]:
+        if (key := f"{command} {line}") not in known:
+            known[key] = written(command, line, files, tmp_path_factory.mktemp("usual") / "work")
+        return known[key]
+
+    return usual
+
+
+@pytest.mark.filterwarnings("ignore::handsim.HandSimWarning")
+@pytest.mark.parametrize(("command", "line", "other"), [*cases(QUICK), *cases(SLOW)])
+def test_every_option_acts(command, line, other, usual, files, tmp_path):
+    assert written(command, f"{line} --{other}", files, tmp_path / "work") != usual(command, line)
+
+
+REFUSED = {
+    "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
+    "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
+    "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
+    "render take.npz --out p --passes depth --tones dark": "given tones and the passes depth, expected rgb",
+    "render take.npz --out p --passes depth --motion-blur": "given shutter and the passes depth",
+    "render take.npz --out p --passes rgb --depth-sensor d435": "given depth_sensor and the passes rgb",
+    "render take.npz --out p --background plain --photos photos": "expected a share of the background photo",
+    "render take.npz --out p --placement head --share 0.5": "given share and the placement head",
+    "render take.npz --out p --placement rig --views 2": "given views and the placement rig",
+    "render take.npz --out p --share 0.5 --distance 1 2": "given share 0.5 and distance (1.0, 2.0)",
+    "render take.npz --out p --cameras own.toml --share 0.5": "leave out the placement",
+    "render --merge a b --out p --people 3": "leave out the options of drawing",
+    "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
+    "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
+    "view user.json --rig six": "--rig is six, but user.json is a user",
+    "view take.npz --video v.mp4 --time 0": "given --time 0 and --video v.mp4",
+    "train set --out r --labeler cnn --network.width 32": "given network with the labeler cnn",
+    "train set --out r --knee 0.5": "given knee with the labeler set",
+    "train set --out r --ghosts 1 --corruption m:f": "given occlude or ghosts beside a corruption",
+    "rig plan --out p.toml --cameras 9 --room 4 4 3 --keep six --size 9 9": "given keep six, and size",
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_cannot_act_is_refused(line, files, tmp_path, monkeypatch, capsys):
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    assert main(line.split()) == 1
+    assert REFUSED[line] in capsys.readouterr().err
