@@ -13,7 +13,7 @@ from time import perf_counter
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -21,6 +21,7 @@ from gloves.takes.points import Status
 from handsim._checks import shown_value
 from handsim.errors import ArgumentError
 from handsim.hand.shape import NUM_QPOS
+from handsim.kernels import kernel, squared_distance
 from handsim.space.transforms import rotation_quaternions
 from track.association.frame_state import FrameState, Numbering, PointHistory, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction
@@ -237,22 +238,17 @@ class Tracker:
         evidence = frame.evidence.copy()
         for hand, state in enumerate(self._states):
             markers, estimate = frame.markers(hand), estimates.get(hand)
-            labeled = np.flatnonzero(markers >= 0)
-            enough = len(labeled) >= self.config.fewest_labels
+            labeled = np.count_nonzero(markers >= 0)
+            enough = labeled >= self.config.fewest_labels
             if estimate is not None and enough and estimate.rms <= self.config.most_rms:
-                own, before = markers[labeled], evidence[labeled]
-                settled = np.zeros(state.num_markers, dtype=bool)
-                settled[own] = before >= SETTLED_EVIDENCE
                 rms = state.rms_without_bias(estimate)  # by the biases that the pose was fitted with
+                settled = _weigh_labels(frame.points, markers, estimate.positions, state.variance, evidence)
                 state.update(estimate, settled, frame.time)
-                squares = ((frame.points[labeled] - state.positions[own]) ** 2).sum(axis=1)
-                gain = _EVIDENCE_PER_FRAME - 0.5 * squares / state.variance[own]
-                evidence[labeled] = np.clip(before + gain, 0.0, _MOST_EVIDENCE)
                 outcomes.append(_Outcome(Status.TRACKED, rms))
                 continue
             if state.qpos is not None and self._coasted_out(state, frame.time):
                 state.qpos = None
-            if state.qpos is None and len(labeled):
+            if state.qpos is None and labeled:
                 frame = frame.with_markers(hand, np.full(len(markers), -1))
             outcomes.append(_Outcome(Status.LOST if state.qpos is None else Status.COASTING))
         return frame._replace(evidence=evidence), tuple(outcomes)
@@ -326,6 +322,26 @@ class Tracker:
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 
 
+@kernel
+def _weigh_labels(
+    points: Float[np.ndarray, "P 3"],
+    markers: Int[np.ndarray, "P"],
+    positions: Float[np.ndarray, "M 3"],
+    variance: Float[np.ndarray, "M"],
+    evidence: Float[np.ndarray, "P"],
+) -> Bool[np.ndarray, "M"]:
+    """Update the evidence of a hand's labels; return the markers whose labels were settled before."""
+    settled = np.zeros(len(positions), dtype=np.bool_)
+    for point in range(len(markers)):
+        marker = markers[point]
+        if marker >= 0:
+            settled[marker] = evidence[point] >= SETTLED_EVIDENCE
+            square = squared_distance(points[point], positions[marker])
+            gain = _EVIDENCE_PER_FRAME - 0.5 * square / variance[marker]
+            evidence[point] = min(max(evidence[point] + gain, 0.0), _MOST_EVIDENCE)
+    return settled
+
+
 def _tracked_hand(
     state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
 ) -> TrackedHand:
@@ -334,10 +350,8 @@ def _tracked_hand(
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
         return TrackedHand(side, outcome.status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
-    markers, labeled = state.positions.copy(), own >= 0
-    markers[own[labeled]] = frame.points[labeled]
-    present = np.zeros(count, dtype=bool)
-    present[own[labeled]] = True
-    filled = np.flatnonzero(~present)
+    seen = targets_of(frame.points, own, count)
+    is_missing = np.isnan(seen[:, 0])
+    markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
     return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)

@@ -22,7 +22,7 @@ from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.frame_state import peak_log_odds
 from track.config import HandOrigin, TrackerConfig
 from track.frames import Spreads
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, FramePriors, PoseSolver, priors_of_frame
 from track.kinematics.pose_spread import (
     JointPrior,
     MarkerPrediction,
@@ -68,6 +68,7 @@ class Prediction(NamedTuple):
     positions: Float[np.ndarray, "M 3"]  # its markers in the world [m]
     joint_prior: JointPrior  # distribution of the hinges
     wrist_spread: tuple[float, float]  # standard deviations of the wrist's position [m] and orientation [rad]
+    priors: FramePriors  # the same for the solver
 
 
 class HandEstimate(NamedTuple):
@@ -151,24 +152,24 @@ class HandState:
             _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
             _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2,
         )
-        joint_prior = predict_joints(moved[7:], self._joint_covariance, span)
-        return Prediction(moved, self.solver.marker_positions(moved), joint_prior, wrist_spread)
+        return self._prediction(moved, predict_joints(moved[7:], self._joint_covariance, span), wrist_spread)
+
+    def _prediction(
+        self, qpos: NDArray[np.float64], joint_prior: JointPrior, wrist_spread: tuple[float, float]
+    ) -> Prediction:
+        """The prediction of a pose with these uncertainties."""
+        priors = priors_of_frame(joint_prior.angles, joint_prior.spread, qpos[:7], wrist_spread)
+        return Prediction(qpos, self.solver.marker_positions(qpos), joint_prior, wrist_spread, priors)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
     ) -> HandEstimate:
         """Fit the pose to four labeled markers or more, and what they leave open to the prediction."""
-        qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
-        if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
-            fit = self.solver.solve_frame(
-                targets,
-                start,
-                prediction.joint_prior.angles,
-                prediction.joint_prior.spread,
-                prediction.qpos[:7],
-                prediction.wrist_spread,
-            )
+        if np.count_nonzero(np.isfinite(targets[:, 0])) >= FEWEST_MARKERS:
+            fit = self.solver.solve_frame(targets, start, prediction.priors)
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
+        else:
+            qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
         predicted = predict_markers(
             self.solver.hand,
             self.solver.on_part,
@@ -226,8 +227,7 @@ class HandState:
         self._last_seen[:] = time
         self._last_label[:] = -np.inf
         self.confirmed[:] = False
-        positions = self.solver.marker_positions(qpos)
-        unknown = Prediction(qpos, positions, resting_prior(), (1.0, 1.0))
+        unknown = self._prediction(qpos, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
         if not (self._bias_frames.any() and estimate.rms < _BIAS_REUSE_RMS):
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
@@ -272,14 +272,12 @@ class HandState:
             change = velocity_of(self.qpos, qpos, span) - self._velocity
             self._velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
-        self.confirmed[self.digits[settled & (self.digits >= 0)]] = True
-        parts = self.digits + 1
-        seen = np.bincount(parts[np.isfinite(estimate.residuals[:, 0])], minlength=len(DIGITS) + 1)
         _learn_bias(
             estimate.residuals,
             estimate.predicted.rotations,
             settled,
-            seen[parts] >= np.where(parts > 0, _FEWEST_ON_DIGIT, _FEWEST_ON_PALM),
+            self.digits,
+            self.confirmed,
             self._bias_frames,
             self._bias,
             self._variance,
@@ -291,11 +289,9 @@ class HandState:
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
-        present = np.isfinite(estimate.residuals[:, 0])
-        missing = np.bincount(self.digits[~present & (self.digits >= 0)], minlength=len(DIGITS))
-        hidden = self._velocity[6:].reshape(len(DIGITS), -1)
-        hidden[missing > 0] *= _HIDDEN_DIGIT_DAMPING
-        self._last_seen[present] = self._last_label[present] = time
+        _note_markers(
+            estimate.residuals, self.digits, time, self._last_seen, self._last_label, self._velocity
+        )
         square = self.rms_without_bias(estimate) ** 2
         if np.isnan(self._usual_square):
             self._usual_square = square
@@ -319,17 +315,43 @@ class HandTrack(NamedTuple):
 
 
 @kernel
+def _note_markers(
+    residuals: Float[np.ndarray, "M 3"],
+    digits: Int[np.ndarray, "M"],
+    time: float,
+    last_seen: Float[np.ndarray, "M"],
+    last_label: Float[np.ndarray, "M"],
+    velocity: Float[np.ndarray, "26"],
+) -> None:
+    """Note when markers with a residual were seen [s], and slow down the hinges of digits that lack one."""
+    lacks = np.zeros(len(DIGITS) + 1, dtype=np.bool_)
+    for marker in range(len(residuals)):
+        if np.isfinite(residuals[marker, 0]):
+            last_seen[marker] = last_label[marker] = time
+        else:
+            lacks[digits[marker]] = True
+    for hinge in range(NUM_JOINTS):
+        velocity[6 + hinge] *= _HIDDEN_DIGIT_DAMPING if lacks[hinge // 4] else 1.0
+
+
+@kernel
 def _learn_bias(
     residuals: Float[np.ndarray, "M 3"],
     rotations: Float[np.ndarray, "M 3 3"],
     settled: Bool[np.ndarray, "M"],
-    is_tested: Bool[np.ndarray, "M"],
+    digits: Int[np.ndarray, "M"],
+    confirmed: Bool[np.ndarray, "5"],
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
 ) -> None:
     """Average the residuals [m] of settled markers in the frames of their bones, and their variance [m^2]."""
     # Any pose fits markers that are not tested by others on their part: their variance stays.
+    on_part = np.zeros(len(DIGITS) + 1, dtype=np.int64)
+    for marker in range(len(residuals)):
+        on_part[digits[marker]] += np.isfinite(residuals[marker, 0])
+        if settled[marker] and digits[marker] >= 0:
+            confirmed[digits[marker]] = True
     residual = np.empty(3)
     for marker in range(len(residuals)):
         if not settled[marker] or np.isnan(residuals[marker, 0]):
@@ -344,7 +366,7 @@ def _learn_bias(
             bias[marker, i] *= 1.0 - 1.0 / _FORGETTING_FRAMES
             bias[marker, i] += residual[i] / bias_frames[marker]
             square += residual[i] ** 2
-        if is_tested[marker]:
+        if on_part[digits[marker]] >= (_FEWEST_ON_DIGIT if digits[marker] >= 0 else _FEWEST_ON_PALM):
             variance[marker] += (square - variance[marker]) / bias_frames[marker]
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim.kernels import kernel, squared_distance
+from handsim.hand.shape import DIGITS
+from handsim.kernels import kernel, point_distance, squared_distance
 from track.association.frame_state import FrameState, peak_log_odds, targets_of
 from track.association.hand_state import (
     MOST_AGE_LOG_ODDS,
@@ -133,9 +134,12 @@ def _gate(
 
 
 def fit_labels(
-    frame: FrameState, hand: int, state: HandState, prediction: Prediction
+    frame: FrameState, hand: int, state: HandState, prediction: Prediction, *, is_sure: bool = False
 ) -> tuple[FrameState, HandEstimate]:
-    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first."""
+    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first.
+
+    With a sure prediction nothing else is tried; most labels being far off it, the RMS distance is NaN.
+    """
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
     while True:
@@ -146,10 +150,15 @@ def fit_labels(
             break
         if estimate.rms > _RESTART_RMS and not restarted:
             restarted = True
-            restart = state.solver.solve(targets[None], iterations=_RESTART_STEPS)
-            if restart.rms[0] < 0.5 * estimate.rms:
-                start = restart.qpos[0]
-                continue
+            if is_sure:
+                if np.nanmedian((estimate.residuals**2).sum(axis=1)) > _RESTART_RMS**2:
+                    estimate = estimate._replace(rms=np.nan)
+                    break
+            else:
+                restart = state.solver.solve(targets[None], iterations=_RESTART_STEPS)
+                if restart.rms[0] < 0.5 * estimate.rms:
+                    start = restart.qpos[0]
+                    continue
         markers[worst] = -1
         dropped = True
     return frame.with_markers(hand, markers) if dropped else frame, estimate
@@ -211,7 +220,9 @@ class LabelerReview:
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
         """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
         markers = frame.markers(track.hand)
-        near = self._near(frame, track, markers)
+        near = _near_missing(
+            frame.points, frame.labels, markers, track.state.digits, track.estimate.positions
+        )
         if not self._is_due(track.hand, frame, near):
             return frame, track
         cloud = np.flatnonzero((markers >= 0) | near)
@@ -220,6 +231,8 @@ class LabelerReview:
         named, confidence = np.full(len(near), -1), np.full(len(near), np.nan)
         labeling = self._labeler.label_frames([frame.points[cloud]])[0]
         named[cloud], confidence[cloud] = labeling.labels, labeling.confidence
+        if (named == markers).all():
+            return frame, track
         proposal = self._compare(frame, track, named, confidence)
         if proposal is None:
             doubted = _doubted_biases(frame, track, named)
@@ -245,8 +258,9 @@ class LabelerReview:
         confidence: NDArray[np.float64],
     ) -> _Proposal | None:
         """Fit the labeler's labels; None if those of the frame are likelier or the same."""
+        named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
         proposed, estimate = fit_labels(
-            frame.with_markers(track.hand, named), track.hand, track.state, track.prediction
+            named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
         )
         before, after = frame.markers(track.hand), proposed.markers(track.hand)
         if (after == before).all() or np.isnan(estimate.rms):
@@ -263,18 +277,6 @@ class LabelerReview:
         if gain > 0.0:
             self._earlier[track.hand] = {change: earlier.get(change, 0) + 1 for change in changes}
         return None
-
-    def _near(self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64]) -> Bool[np.ndarray, "P"]:
-        """Which points without a label may be markers that the hand lacks."""
-        near = frame.unlabeled
-        if near.any():
-            missing = np.ones(track.state.num_markers, dtype=bool)
-            missing[markers[markers >= 0]] = False
-            digits = track.state.digits
-            radius = np.where(np.isin(digits, digits[~missing]), _CLOUD_RADIUS, _DIGIT_CLOUD_RADIUS)
-            offsets = frame.points[near, None] - track.estimate.positions[missing]
-            near[near] = (np.linalg.norm(offsets, axis=-1) < radius[missing]).any(axis=1)
-        return near
 
     def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
         """Whether a review is due; the next one is planned then."""
@@ -313,6 +315,29 @@ class LabelerReview:
         peak = peak_log_odds(variance, self._config.stray_density)
         squares = ((frame.points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
         return float((peak - 0.5 * squares / variance).sum())
+
+
+@kernel
+def _near_missing(
+    points: Float[np.ndarray, "P 3"],
+    labels: Int[np.ndarray, "P"],
+    markers: Int[np.ndarray, "P"],
+    digits: Int[np.ndarray, "M"],
+    positions: Float[np.ndarray, "M 3"],
+) -> Bool[np.ndarray, "P"]:
+    """Which points without a label may be markers that a hand lacks, by its markers' positions [m]."""
+    near, missing = np.zeros(len(points), dtype=np.bool_), np.ones(len(digits), dtype=np.bool_)
+    seen = np.zeros(len(DIGITS) + 1, dtype=np.bool_)
+    for point in range(len(points)):
+        if markers[point] >= 0:
+            missing[markers[point]] = False
+            seen[digits[markers[point]]] = True
+    for point in range(len(points)):
+        for marker in range(len(digits)):
+            if labels[point] < 0 and missing[marker]:
+                radius = _CLOUD_RADIUS if seen[digits[marker]] else _DIGIT_CLOUD_RADIUS
+                near[point] |= point_distance(points[point], positions[marker]) < radius
+    return near
 
 
 def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64]) -> Int[np.ndarray, "K"]:

@@ -77,7 +77,7 @@ class _StartingShapes(NamedTuple):
     weights: Float[np.ndarray, "M"]  # of each marker in aligning whole hands [1/m^2]: small if shapes differ
 
 
-class _PosePrior(NamedTuple):
+class FramePriors(NamedTuple):
     """What is known of the poses of frames before their markers are used."""
 
     angles: Float[np.ndarray, "P 20"]  # mean of the hinges [rad], one row per frame or none
@@ -87,6 +87,17 @@ class _PosePrior(NamedTuple):
 
 _NO_ROWS: Final = np.empty((0, NUM_JOINTS))
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # no rotation, and zero precisions
+
+
+def priors_of_frame(
+    angles: Float[np.ndarray, "20"],
+    spread: Float[np.ndarray, "20"],
+    wrist: Float[np.ndarray, "7"],
+    wrist_spread: tuple[float, float],
+) -> FramePriors:
+    """What is known of one frame's pose: hinges and wrist with their standard deviations [m, rad]."""
+    wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
+    return FramePriors(angles[None], spread[None] ** -2.0, wrist_prior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,40 +145,23 @@ class PoseSolver:
         # The prior is that of digits that lack a marker or have under three: mean angles, their spread [rad].
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
+        targets[~np.isfinite(targets).all(axis=-1)] = np.nan
         starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
-        known = _PosePrior(_NO_ROWS, _NO_ROWS, _NO_WRIST)
+        known = FramePriors(_NO_ROWS, _NO_ROWS, _NO_WRIST)
         if prior is not None:
             precision = np.full(prior[0].shape, np.asarray(prior[1]) ** -2)
-            known = _PosePrior(np.array(prior[0], order="C"), precision, _NO_WRIST)
-        return self._run(targets, starts, known, iterations, _CONVERGED)
+            known = FramePriors(np.array(prior[0], order="C"), precision, _NO_WRIST)
+        steps = self._robust_scale, iterations, _CONVERGED
+        return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, targets, starts, known, *steps))
 
     def solve_frame(
-        self,
-        target: Float[np.ndarray, "M 3"],
-        start: Float[np.ndarray, "27"],
-        angles: Float[np.ndarray, "20"],
-        spread: Float[np.ndarray, "20"],
-        wrist: Float[np.ndarray, "7"],
-        wrist_spread: tuple[float, float],
+        self, target: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prior: FramePriors
     ) -> PoseFit:
-        """`solve` for one frame from a near start in real time; [m] and [rad]."""
-        wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
-        prior = _PosePrior(angles[None], spread[None] ** -2.0, wrist_prior)
-        return self._run(target[None], start[None], prior, _MOST_STEPS, _ACCURATE)
-
-    def _run(
-        self,
-        targets: NDArray[np.float64],
-        starts: NDArray[np.float64],
-        prior: _PosePrior,
-        iterations: int,
-        small_gain: float,
-    ) -> PoseFit:
-        """Solve with the arrays of the kernel."""
-        whole = np.isfinite(targets).all(axis=-1, keepdims=True)
-        frames = np.where(whole, targets, np.nan), starts, prior
-        steps = self._robust_scale, iterations, small_gain
-        return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, *frames, *steps))
+        """`solve` for one frame from a near start in real time; a marker [m] is complete or NaN."""
+        steps = self._robust_scale, _MOST_STEPS, _ACCURATE
+        return PoseFit(
+            *_fit_frames(self.hand, self._shapes, self.on_part, target[None], start[None], prior, *steps)
+        )
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
@@ -223,7 +217,7 @@ def _fit_frames(
     on_part: Int[np.ndarray, "6"],
     targets: Float[np.ndarray, "T M 3"],
     initial: Float[np.ndarray, "S 27"],
-    prior: _PosePrior,
+    prior: FramePriors,
     robust_scale: float,
     iterations: int,
     small_gain: float,
@@ -268,7 +262,7 @@ def _set_prior(
     digits: Int[np.ndarray, "M"],
     on_part: Int[np.ndarray, "6"],
     target: Float[np.ndarray, "M 3"],
-    prior: _PosePrior,
+    prior: FramePriors,
     frame: int,
     mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],

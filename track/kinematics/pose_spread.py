@@ -142,13 +142,26 @@ def predict_joints(
     angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
 ) -> JointPrior:
     """Prior of the hinges `span` seconds after they were estimated, near these predicted angles [rad]."""
-    kept, resting = np.exp(-max(span, 0.0) / _JOINT_MEMORY), resting_prior()
-    mean = angles + (1.0 - kept) * (resting.angles - angles)
-    covariance = kept**2 * covariance + (1.0 - kept**2) * resting.covariance
-    covariance += _JOINT_SPREAD**2 * np.eye(NUM_JOINTS)
-    precision = covariance.copy()
+    kept = float(np.exp(-max(span, 0.0) / _JOINT_MEMORY))
+    return _relax(angles, covariance, resting_prior(), kept)
+
+
+@kernel
+def _relax(
+    angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], resting: JointPrior, kept: float
+) -> JointPrior:
+    """The prior of hinges of which this share is kept, and the rest is that of resting hands."""
+    count, share = len(angles), kept**2
+    mean, spread, precision = np.empty(count), np.empty((count, count)), np.empty((count, count))
+    for row in range(count):
+        mean[row] = angles[row] + (1.0 - kept) * (resting.angles[row] - angles[row])
+        for column in range(count):
+            spread[row, column] = share * covariance[row, column]
+            spread[row, column] += (1.0 - share) * resting.covariance[row, column]
+        spread[row, row] += _JOINT_SPREAD**2
+        precision[row] = spread[row]
     invert_positive(precision)
-    return JointPrior(mean, covariance, precision)
+    return JointPrior(mean, spread, precision)
 
 
 @kernel
@@ -260,20 +273,24 @@ def _marker_covariance(
     first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
     jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
+    unknowns = np.empty(count, dtype=np.int64)
     for number in range(count):
-        unknown = first + number if number < last - first else NUM_JOINTS + number - (last - first)
+        unknowns[number] = first + number if number < last - first else NUM_JOINTS + number - (last - first)
         for i in range(3):
             for j in range(3):
-                in_world[i, number] += wrist[i, j] * jacobian[j, unknown]
+                in_world[i, number] += wrist[i, j] * jacobian[j, unknowns[number]]
     covariance[:] = 0.0
     for one in range(count):
-        row = first + one if one < last - first else NUM_JOINTS + one - (last - first)
+        x, y, z = 0.0, 0.0, 0.0
         for other in range(count):
-            column = first + other if other < last - first else NUM_JOINTS + other - (last - first)
-            share = posterior[row, column]
-            for i in range(3):
-                for j in range(3):
-                    covariance[i, j] += in_world[i, one] * share * in_world[j, other]
+            share = posterior[unknowns[one], unknowns[other]]
+            x += share * in_world[0, other]
+            y += share * in_world[1, other]
+            z += share * in_world[2, other]
+        for i in range(3):
+            covariance[i, 0] += in_world[i, one] * x
+            covariance[i, 1] += in_world[i, one] * y
+            covariance[i, 2] += in_world[i, one] * z
     # A marker moves on an arc, not on its tangent: a variance along the tangent means a deviation
     # across it, by the square over twice the radius.
     bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)

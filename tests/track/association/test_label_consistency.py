@@ -207,6 +207,17 @@ def test_without_labels_the_pose_is_the_predicted_one(hand, motion, markers):
     assert gated(state, np.zeros((0, 3)), np.zeros(0, dtype=int), prediction).shape == (0,)
 
 
+def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(hand, motion, markers):
+    state, prediction = followed(hand, motion, markers, 20)
+    shuffled = np.roll(np.arange(19), 5)
+    frame, estimate = fit_labels(frame_of(markers[20], shuffled), 0, state, prediction, is_sure=True)
+    assert np.isnan(estimate.rms)
+    np.testing.assert_array_equal(frame.labels, shuffled)
+    one_off = planted(markers[20], 6, 0.1, 0)
+    sure = fit_labels(frame_of(one_off, np.arange(19)), 0, state, prediction, is_sure=True)
+    assert sure[0].labels[6] == -1 and sure[1].rms < 0.001
+
+
 TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
 KNUCKLE = 4  # of the index finger
 
