@@ -71,7 +71,7 @@ SLOW = [
     ("train", "set --out run2 --samples 32 --batch 16", "preset han2018 --average 0.5"),
     ("track", "capture.c3d --out t.npz",
      "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate"),
-    ("calibrate", "capture.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
+    ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
     ("glove score", "dense19 --out s.html --num-frames 100 --captures 0",
      "rig six|motion twins|num-frames 150|labeler run|captures 1|seed 3"),
@@ -130,7 +130,8 @@ def files(tmp_path_factory) -> Path:
     write_capture(folder / "labeled.trc", single.labeled_capture(sides=False))
     nominal_user(load_layout("dense19"), "L", ["right"]).save(folder / "user.json")
     (folder / "lab.xcp").write_text(XCP)
-    assert main(["simulate", "--num-frames", "60", "--out", str(folder / "capture.c3d")]) == 0
+    for name, count in (("capture", "60"), ("long", "200")):
+        assert main(["simulate", "--num-frames", count, "--out", str(folder / f"{name}.c3d")]) == 0
     generate_dataset(folder / "set", num_frames=300, frames_per_hand=20, scenes={"alone": 1.0}, workers=1)
     assert (
         main(["train", str(folder / "set"), "--out", str(folder / "run"), "--samples", "64", *SMALL.split()])
@@ -185,6 +186,7 @@ def usual(files, tmp_path_factory):
     def usual(command: str, line: str) -> dict[str, object]:
         if (key := f"{command} {line}") not in known:
             known[key] = written(command, line, files, tmp_path_factory.mktemp("usual") / "work")
+            assert known[key], f"handsim {key} wrote nothing"
         return known[key]
 
     return usual
