@@ -73,14 +73,14 @@ SLOW = [
      "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate"),
     ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
-    ("glove score", "dense19 --out s.html --num-frames 100 --captures 0",
-     "rig six|motion twins|num-frames 150|labeler run|captures 1|seed 3"),
-    ("glove improve", "dense19 --out i.toml --minutes 0.1 --captures 0",
-     "markers 18|keep ThumbTip|rig six|minutes 0.3|captures 1|seed 3"),
+    ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
+     "rig six|motion twins|num-frames 120|labeler run|captures 1|seed 3"),
+    ("glove improve", "starter6 --out i.toml --minutes 0.02 --captures 0",
+     "markers 7|keep ThumbTip|rig six|minutes 0.1|captures 1|seed 3"),
     ("rig score", "six --out s.html --json s.json --num-frames 60",
      "volume 1 1 1|center 0.1 0 1.2|take take.npz|glove sparse13|num-frames 90|seed 3"),
-    ("rig plan", "--out p.toml --cameras 5 --room 4 4 2.5",
-     "cameras 6|room 5 4 3|mounts walls|volume 1 1 1|center 0.2 0 1.2|keep eight --cameras 10|size 640 480|"
+    ("rig plan", "--out p.toml --cameras 3 --room 3 3 2.5",
+     "cameras 4|room 5 4 3|mounts walls|volume 1 1 1|center 0.2 0 1.2|keep eight --cameras 10|size 640 480|"
      "field-of-view 80|glove sparse13|seed 3"),
 ]  # fmt: skip
 """The same for what takes some minutes."""
