@@ -14,7 +14,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gloves import Capture, Take, load_take, read_capture, write_capture
-from train import evaluate_labeler, load_labeler, simulate_take
+from track import label_capture
+from train import evaluate_labeler, evaluate_labels, load_labeler, simulate_take
 
 
 def main() -> None:
@@ -33,6 +34,9 @@ def main() -> None:
     figures = evaluate_labeler(load_labeler("dense19"), [take]).figures
     for name in ("slot_accuracy", "occlusion_recall", "ghost_recall"):
         print(f"{name.replace('_', ' ')}: {100 * figures[name]:.2f} %")
+    labeled = label_capture(capture, glove="dense19").labeled_capture()  # frames with those before and after
+    report = evaluate_labels(labeled, take)
+    print(f"slot accuracy in motion: {100 * report.figures['slot_accuracy']:.2f} %")
 
 
 if __name__ == "__main__":

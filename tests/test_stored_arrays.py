@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_rows_and_hands_of_a_training_set(folder: Path) -> None:
     rows, hands = (np.load(folder / "set" / f"{name}-00000.npy") for name in ("rows", "hands"))
     assert fields(rows.dtype) == stated("A row:", "A hand,", {"M": 19})
-    assert fields(hands.dtype) == stated("A hand,", "## Takes", {})
+    assert fields(hands.dtype) == stated("A hand,", "## Takes", {"M": 19})
 
 
 @pytest.mark.parametrize("file", ["tracked.npz", "take.truth.npz"])

@@ -18,7 +18,10 @@ from train.simulation.generation import make_dataset
 
 FRAMES = 240
 BASE = GenerateSettings(num_frames=FRAMES, frames_per_hand=60, scenes=SceneMix(1.0, 1.0, 1.0))
-NOT_NUMBERS = {"glove": "sparse13", "rig": "six", "kind": "hand-hand", "hands": ("left",)}
+NOT_NUMBERS = {
+    "glove": "sparse13", "rig": "six", "kind": "hand-hand", "hands": ("left",), "center": (0.1, -0.1, 1.2),
+    "flesh": True,
+}  # fmt: skip
 # What a few frames of the default optics do not show needs a larger change.
 STRONG = {
     "roundness": 40.0, "min_angle": 60.0, "min_distance": 0.03, "max_residual": 0.0002, "partial": 3.0,
