@@ -291,7 +291,7 @@ class Subject:
             raise ArgumentError("there is no hand in any frame, expected one to draw")
 
     def upright(self, up: UpAxis) -> Subject:
-        """The same in a world whose z axis points up, where that of the take has another."""
+        """This subject in a world with z up, if `up` is the axis that points up in the take's own world."""
         if up == "z":
             return self
         take, turn = self.take, upright(up)

@@ -273,7 +273,7 @@ class _Search:
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
     """The argument between two bounds [m] with the least value of a function: Brent's method (1973)."""
-    # scipy.optimize has the same, and takes as long to load as all of a capture's searches.
+    # SciPy has this search in scipy.optimize, but importing that takes as long as all searches of a capture.
     best = second = third = low + _GOLDEN * (high - low)
     least = second_least = third_least = function(best)
     step = before = 0.0

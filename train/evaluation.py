@@ -249,7 +249,7 @@ class LabelingReport:
     right_slots: Bool[np.ndarray, "T M"] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.bool_))
     """Whether each slot of each frame is right."""
     marker_names: tuple[str, ...] = ()
-    """Names of the M markers, in label order."""
+    """Names of the M markers; label m is the marker of index m."""
     seconds: Int[np.ndarray, "T"] | None = None
     """The second of each frame, for labels of a take; frames of one second are alike."""
 

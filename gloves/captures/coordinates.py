@@ -42,7 +42,7 @@ _NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was no
 _COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
 _GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
 _GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
-_AT_REST: Final = 0.4  # of the next step: the first step of a marker that speeds up smoothly is a third
+_AT_REST: Final = 0.4  # A marker starts abruptly if its first step is more than this share of the second one.
 
 
 def findings_sentence(findings: Mapping[str, int]) -> str:

@@ -58,7 +58,7 @@ class Trajectories(NamedTuple):
     positions: Float[np.ndarray, "T N 3"]
     """[m], NaN where there is none."""
     pieces: int = 0
-    """Columns of the file that were packed."""
+    """Number of the file's columns that held pieces of paths and were packed into fewer."""
 
 
 def packed_trajectories(

@@ -104,7 +104,7 @@ def motion_format(path: Path) -> MotionFormat:
 
 
 def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
-    """Write the keypoints of all hands as markers in every frame, with y up, for OpenSim."""
+    """Write a .trc file for OpenSim: every keypoint of the hands is a marker, and the y axis points up."""
     turn, positions, names = file_axes(up), [], []
     for hand in motion.hands:
         positions.append(hand_keypoints(hand.model, hand.qpos) @ turn.T)

@@ -144,7 +144,7 @@ def coordinate_names(side: Side) -> tuple[str, ...]:
 
 
 def coordinate_values(qpos: Float[np.ndarray, "T 27"], up: UpAxis) -> NDArray[np.float64]:
-    """The coordinates (T, 26) of poses of a hand [m, rad], without jumps of a turn."""
+    """Coordinates (T, 26) of a hand's poses in OpenSim's model [m, rad]; angles never jump by a full turn."""
     turn = file_axes(up)
     turns = np.unwrap(body_fixed_angles(turn @ quaternion_matrix(qpos[:, 3:7])), axis=0)
     return np.concatenate([qpos[:, :3] @ turn.T, turns, qpos[:, 7:]], axis=1)

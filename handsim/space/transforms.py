@@ -28,7 +28,7 @@ class ProgramAxes(NamedTuple):
     """How a program writes positions and orientations."""
 
     turn: Float[np.ndarray, "3 3"]
-    """Its axes in those of the world; a program with a left-handed world mirrors."""
+    """Takes positions in our world to its axes; a reflection if the program's axes are left-handed."""
     quaternion: Float[np.ndarray, "4 4"]
     """Takes a wxyz quaternion of a thing in the world to that in the program."""
     unit: str
@@ -65,22 +65,25 @@ def program_axes(name: str, up: UpAxis) -> ProgramAxes:
     axes, mirror, unit = _PROGRAMS[name]
     turn = np.array(axes, dtype=float) @ _Z_UP[up]
     # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
-    w, x, y, z = rotation_quaternions((turn @ np.diag(mirror))[None])[0]
-    after = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return ProgramAxes(turn, after @ np.diag([1.0, *np.prod(mirror) * np.array(mirror)]), unit)
+    mirrored = np.diag([1.0, *np.prod(mirror) * np.array(mirror)])
+    return ProgramAxes(turn, _turning(turn @ np.diag(mirror)) @ mirrored, unit)
+
+
+def _turning(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """The matrix (4, 4) that turns an orientation, as a wxyz quaternion, by a rotation of the world."""
+    w, x, y, z = rotation_quaternions(turn[None])[0]
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of a world in which an axis points up to ours, with z up."""
-    return np.asarray(file_axes("z").T @ file_axes(up))
+    return _Z_UP[up]
 
 
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
     """Poses in a rotated world: positions and orientations (wxyz), and what follows them; NaN stays."""
     turned = np.array(poses, dtype=np.float64)
-    w, x, y, z = rotation_quaternions(turn[None])[0]
-    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ product.T
+    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ _turning(turn).T
     return turned
 
 

@@ -76,7 +76,7 @@ def _subtract_above(rows: Bytes, filtered: Bytes) -> None:
 
 @kernel
 def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16], counts: Integers) -> Any:
-    """Write the tokens of some bytes and the end's, and count them; return their number and Adler's checksum.
+    """Turn bytes into counted tokens for compression; return how many there are and Adler's checksum.
 
     `words` are the same bytes, eight in each, behind which zeros follow.
     """

@@ -127,7 +127,7 @@ def evaluate_digit(
 def _fit_hypotheses(
     own: DigitPoints, model: DigitModel, label_log_odds: Float[np.ndarray, "C K"], found: DigitHypotheses
 ) -> None:
-    """Fit each hypothesis that may be the best one for its points; those with fewer labels come first."""
+    """Fit the hypotheses that may still be the best for their points, those with the fewest labels first."""
     scores, runners_up, assignments = found
     count, choices, angles_before = len(own.markers), len(own.points) + 1, model.predicted.qpos[7:]
     work = workspace(len(own.hand.digits))

@@ -7,7 +7,7 @@ import functools
 import pickle
 import warnings
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -166,21 +166,20 @@ def _record(source: FrameSource) -> dict[str, Any]:
     }
 
 
-def _recorded_files(output: Output) -> dict[str, str]:
-    """Checksums of files of finished shards: those that a shard has written, or else the manifest's."""
-    output.fetch(CHECKSUMS)
+def _recorded_files(output: Output, own: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+    """Checksums of files of finished shards: those of the shards' own lists, or else the manifest's."""
     try:
         recorded = load_manifest(output.folder).files
     except DatasetError:  # unfinished, damaged, or of another version
         recorded = {}
-    own = _shard_records(output)
     numbers = set(map(_number, own))
     recorded = {name: one for name, one in recorded.items() if _number(name) not in numbers}
     return recorded | {name: one for table in own.values() for name, one in table.items()}
 
 
 def _shard_records(output: Output) -> dict[str, dict[str, str]]:
-    """The checksums that shards have written, by the names of their files; none in a damaged file."""
+    """Checksums of each shard's files, by the name of the file that lists them; a damaged list is empty."""
+    output.fetch(CHECKSUMS)
     records = {path.name: load_checksums(path) for path in output.folder.glob(CHECKSUMS)}
     return {
         name: table if table.keys() == set(_names(_number(name))) else {} for name, table in records.items()
@@ -191,11 +190,12 @@ def _whole_files(output: Output) -> dict[str, str]:
     """Checksums of the files of undamaged shards; files that are not as they were made are told."""
     if not output.is_here and MANIFEST in output.sizes():
         (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
-    recorded, there = _recorded_files(output), output.sizes()
+    own, there = _shard_records(output), output.sizes()
+    recorded = _recorded_files(output, own)
     damaged = {name for name in recorded if name in there and output.checksum(name) != recorded[name]}
     lists = MANIFEST if (output.folder / MANIFEST).is_file() else CHECKSUMS
     _tell(output, damaged, f"are not what {lists} lists (other checksums)")
-    _tell(output, [name for name, table in _shard_records(output).items() if not table], "are damaged")
+    _tell(output, [name for name, table in own.items() if not table], "are damaged")
     numbers = {_number(name) for name in damaged}
     return {name: one for name, one in recorded.items() if _number(name) not in numbers}
 
@@ -243,7 +243,7 @@ def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Man
     """Write the manifest of a set with all its shards."""
     shards = _shards(source.settings.num_frames)
     output.fetch("redrawn-*.json")
-    recorded = whole | _recorded_files(output)
+    recorded = whole | _recorded_files(output, _shard_records(output))
     names = sorted(name(shard) for shard in shards for name in (rows_name, hands_name))
     manifest = Manifest(
         config=load_json(output.folder / CONFIG),

@@ -85,7 +85,7 @@ SLOW = [
      "cameras 4|room 5 4 3|mounts walls|volume 1.6 1.6 1.2|center 0.2 0 1.2|keep eight --cameras 10|"
      "size 640 480|field-of-view 80|glove sparse13|seed 3"),
 ]  # fmt: skip
-"""The same for what takes some minutes."""
+"""Commands that take minutes, how they are run, and other values of their options."""
 
 
 def unchanged(markers, *, rng):
