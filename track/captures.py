@@ -37,6 +37,7 @@ from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
 from track.sinks import SinkGroup
+from track.smoothed_take import smooth_take
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.take_summary import no_points
 from track.tracker import Tracker
@@ -167,7 +168,7 @@ def track_capture(
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
     if corrections is None:
-        return take
+        return smooth_take(take) if chosen.smooth else take
     corrected = correct_take(take, pins)
     for sentence in told(Path(corrections), corrected.unfitting):
         warnings.warn(sentence, HandSimWarning, stacklevel=2)

@@ -16,8 +16,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
 from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
-from track.kinematics.pose_spread import SpreadModel
-from track.user import hand_origin
+from track.smoothed_take import smooth_take, spread_model
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] of hinges that markers leave open, around the tracked ones
 _BAD_RMS: Final = 0.006  # [m] after which a fit from general poses is tried too
@@ -55,17 +54,19 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
         if len(frames):
             targets = points.labeled(span, frames)
             qpos[frames, number], rms[frames, number] = _fit_again(take, number, frames, targets)
-    spreads = _spreads(take, points, qpos)
     corrected = dataclasses.replace(
-        take, **spreads, point_list=points, qpos=qpos, rms=rms,
+        take, point_list=points, qpos=qpos, rms=rms,
         settings={**take.settings, "corrections": _records(take, corrections, pins.unfitting)},
     )  # fmt: skip
+    if take.settings.get("smooth"):
+        corrected = smooth_take(corrected)
+    else:
+        corrected = dataclasses.replace(corrected, **_spreads(take, points, qpos))
     return CorrectedTake(corrected, int(about.sum()), len(np.unique(before.frames[about])), pins.unfitting)
 
 
 def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[str, Any]:
     """Standard deviations of all poses with the labels of these points, by the names of a take's fields."""
-    notes = str(take.settings.get("user", ""))
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)
     keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS), np.nan)
     for number, (hand, span) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
@@ -77,7 +78,7 @@ def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[s
         unseen = (take.times[:, None] - last)[there]
         rms = take.rms[there, number]
         usual = float(np.sqrt(np.nanmean(rms**2))) if np.isfinite(rms).any() else np.nan
-        model = SpreadModel(hand, hand_origin(notes, hand.side))
+        model = spread_model(take, hand)
         angles[there, number], keypoints[there, number] = model.spreads(qpos[there, number], unseen, usual)
     return {"angle_spread": angles, "keypoint_spread": keypoints}
 

@@ -28,7 +28,7 @@ from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
 from track.config import BOTH
 from track.kinematics.marker_kinematics import hand_arrays
-from track.kinematics.pose_spread import known_hand, pose_spreads, with_keypoints
+from track.kinematics.pose_spread import NOT_SMOOTHED, known_hand, pose_spreads, with_keypoints
 from track.user import AnyGlove
 from train.data.batches import Corruption, corrupt, paper_corruption
 from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
@@ -277,8 +277,8 @@ def layout_spreads(
     for fit, qpos, seen in poses:
         good = seen.sum(axis=1) >= _FEWEST
         unseen, known = np.where(seen[good], 0.0, np.inf), known_hand(hand_arrays(fit).digits, NOISE)
-        spreads, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen)
-        squares += (spreads**2).sum(axis=0)
+        variances, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen, NOT_SMOOTHED)
+        squares += variances.sum(axis=(0, 2))
         squares += np.count_nonzero(~good) * free_spreads() ** 2
         count += len(good)
     return np.sqrt(squares / max(1, count))

@@ -33,6 +33,7 @@ from handsim.files.outputs import remove_abandoned
 from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
+from track.user import stored_errors
 
 _SUMMARIZED: Final = 20_000  # most frames that are read for a summary
 _ID_BITS: Final = (1 << 31) - 1  # bits of an ID that takes store
@@ -66,7 +67,9 @@ class TakeRecorder:
 
 def settings_of(tracker: Tracker) -> dict[str, Any]:
     """The entries of a take's settings on the tracker that made it, as JSON."""
-    known = {"user": tracker.user.notes} if tracker.user.notes else {}
+    known: dict[str, Any] = {"user": tracker.user.notes} if tracker.user.notes else {}
+    errors = stored_errors(tracker.user)
+    known |= {"angle_errors": errors} if errors else {}
     return {"glove": tracker.user.layout.name, **known, "tracker": dataclasses.asdict(tracker.config)}
 
 

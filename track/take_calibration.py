@@ -112,7 +112,7 @@ def kept_user(
         before: The hands that it was labeled with, for each side in `done`.
         source: Where the frames are from, as "from take.c3d".
     """
-    worn, hands, whole = {hand.side: hand for hand in before}, [], []
+    worn, hands, whole, errors = {hand.side: hand for hand in before}, [], [], dict(before.angle_errors)
     notes = [f"calibrated {source}, {before.notes.removeprefix(MEASURED) or before} to begin with"]
     for one in done:
         side, remark = one.hand.side, ""
@@ -120,12 +120,13 @@ def kept_user(
             markers, on_step = _markers(take, side), _steps(side, on_part)
             again = calibrate_hand(markers, one.start, take.rate, progress=on_step)
             one = dataclasses.replace(again, held_out=one.held_out)  # noqa: PLW2901
+            errors[side] = one.angle_errors
         elif not before.is_calibrated(side):
             remark = AS_MEASURED  # by which `is_calibrated` knows it
         hands.append(one.hand if one.is_better else worn[side])
         notes.append(f"{side} hand: {one}{remark}")
         whole.append(one)
-    return User(tuple(hands), "; ".join(notes), tuple(whole))
+    return User(tuple(hands), "; ".join(notes), tuple(whole), errors)
 
 
 def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:

@@ -20,9 +20,10 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
+from track.kinematics.pose_spread import SOURCES
 from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
 from track.user import MEASURED
 from train.evaluation import percent
@@ -42,8 +43,7 @@ _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
-    "Joint angles of such hands are typically 5 to 7 degrees off in the mean, those of calibrated hands 1 to "
-    "2 (simulated captures, whose truth is known); the bands say how much for each joint. "
+    "The bands say how far off each joint angle may be; with a calibrated hand they are narrower. "
 )
 _CALIBRATE: Final = (
     "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
@@ -251,6 +251,7 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
     return [
         Section(f"{side} hand: joint angles", angles, pictures=[(curves, _SHADES)]),
         _range_section(f"{side} hand: range of motion", hand),
+        _error_section(f"{side} hand: errors of angles", take, hand),
         _markers_section(f"{side} hand: markers", take, hand),
         Section(f"{side} hand: residuals", residuals, pictures=drawn),
     ]
@@ -290,6 +291,29 @@ def _range_section(title: str, hand: HandFigures) -> Section:
         "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
         "angle, from what is not known of the hand, hidden markers and noise."
     )
+    return Section(title, text, table=table)
+
+
+def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
+    """What each angle's standard deviation is made of, what filtered it, and how long its digit lacked a marker."""
+    cutoffs, budget = (take.settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
+    filtered = cutoffs is not None and budget is not None
+    text = (
+        "Filter: all poses were solved together, forward and backward in time, without a delay. At the cut-off an "
+        "oscillation keeps half of its size. The standard deviation [deg], root of the mean square, is the root of "
+        "the sum of the squares of its parts; gluing, flesh and bones are the same or nearly so in all frames."
+        if filtered
+        else "Filter: none, each pose was fitted to the markers of its frame."
+    )
+    digits = np.array(
+        [BONES[bone].digit for bone in take.hands[take.hand_index(hand.side)].attachment.main_bones]
+    )
+    gaps = np.array([marker.longest_gap for marker in hand.markers()]) / take.rate
+    table = [["joint", *(("band", *SOURCES, "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
+    for number, joint in enumerate(JOINTS):
+        parts = [np.linalg.norm(budget[number]), *budget[number], cutoffs[number]] if filtered else []
+        longest = float(gaps[digits == number // 4].max(initial=0.0))
+        table.append([joint.name.replace("_", " "), *(f"{part:.1f}" for part in parts), f"{longest:.3f}"])
     return Section(title, text, table=table)
 
 

@@ -94,7 +94,15 @@ class Tracker:
         self.labeler = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [HandState(hand, config, origin=self.user.origin(hand.side)) for hand in self.hands]
+        self._states = [
+            HandState(
+                hand,
+                config,
+                origin=self.user.origin(hand.side),
+                angle_errors=self.user.angle_errors.get(hand.side),
+            )
+            for hand in self.hands
+        ]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
@@ -19,7 +20,7 @@ from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIDES, HandShape, Side
+from handsim.hand.shape import NUM_JOINTS, SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, Size
 from train.labelers.protocol import Labeler
@@ -65,6 +66,8 @@ class User(Sequence[GloveFit]):
     """Where they are from, in words."""
     calibrations: tuple[Calibration, ...] = ()
     """How `calibrate` found each hand, and how well it fits frames that were held out; not in a file."""
+    angle_errors: Mapping[Side, Float[np.ndarray, "20 2"]] = field(default_factory=dict)
+    """What a side's calibration leaves open of each joint angle [rad]: by places of markers, by bones."""
 
     def __post_init__(self) -> None:
         expected = "a left hand, a right hand, or one of each in its glove"
@@ -167,6 +170,7 @@ class User(Sequence[GloveFit]):
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
+            "angle_errors": stored_errors(self),
         }
         try:
             with atomic_write(Path(path)) as temporary:
@@ -236,10 +240,30 @@ def load_user(path: str | Path) -> User:
     try:
         layout = stored_layout(content["glove"])
         return User(
-            tuple(_from_json(hand, layout) for hand in content["hands"]), str(content.get("notes", ""))
+            tuple(_from_json(hand, layout) for hand in content["hands"]),
+            str(content.get("notes", "")),
+            angle_errors=read_errors(content.get("angle_errors", {})),
         )
     except _DAMAGE as error:
         raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
+
+
+def stored_errors(user: User) -> dict[Side, list[list[float]]]:
+    """The errors that calibrations leave of a user's angles, as JSON."""
+    return {
+        side: np.round(user.angle_errors[side], 6).tolist()
+        for side in user.sides
+        if side in user.angle_errors
+    }
+
+
+def read_errors(stored: Any) -> dict[Side, Float[np.ndarray, "20 2"]]:
+    """What `stored_errors` stored; a `ValueError` if it is anything else."""
+    errors = {side: np.array(stored[side], dtype=np.float64) for side in SIDES if side in stored}
+    for values in errors.values():
+        if values.shape != (NUM_JOINTS, 2) or not (np.isfinite(values) & (values >= 0.0)).all():
+            raise ValueError(f"angle_errors are not {NUM_JOINTS} pairs of numbers from 0 on")
+    return errors
 
 
 def _reason(error: Exception) -> str:

@@ -41,7 +41,7 @@ class TrackerOptions:
         """Options that may name files, which no output must overwrite."""
         return self.shape, self.glove, self.labeler, *self.body
 
-    def settings(self, *, calibrate: bool = False) -> TrackSettings:
+    def settings(self, *, calibrate: bool = False, smooth: bool = True) -> TrackSettings:
         """The settings of `track_capture`."""
         from track.settings import TrackSettings
         from track.user import load_user
@@ -52,7 +52,9 @@ class TrackerOptions:
         if self.shape is not None and self.hands is not None:
             hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
         size = self.size or "auto"
-        return TrackSettings(self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate)
+        return TrackSettings(
+            self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate, smooth=smooth
+        )
 
 
 def check_source(noun: str, file: object, live: str | None) -> None:

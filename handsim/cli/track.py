@@ -35,6 +35,7 @@ def track(
     send: tuple[str, ...] = (),
     options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     calibrate: bool = False,
+    smooth: bool = True,
     labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
@@ -55,6 +56,8 @@ def track(
         options: Which hands to track.
         calibrate: Track a capture twice: first to calibrate its hands, then with those that fit frames better
             which they were not calibrated on. For those who did not capture a minute for handsim calibrate.
+        smooth: Solve the poses of a capture over all of its time, forward and backward, in place of frame by
+            frame. A live stream is tracked frame by frame.
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """
@@ -69,7 +72,7 @@ def track(
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
     check_outputs((capture, *options.files()), (out, labeled))
-    settings = options.settings(calibrate=calibrate)
+    settings = options.settings(calibrate=calibrate, smooth=smooth)
     times: deque[float] = deque(maxlen=_TIMED)  # [s]
 
     def on_frame(frame: StreamedFrame, tracked: TrackedFrame) -> None:

@@ -103,6 +103,7 @@ class HandState:
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
         *,
         origin: HandOrigin = "calibrated",
+        angle_errors: Float[np.ndarray, "20 2"] | None = None,
     ) -> None:
         self.hand = hand
         self.config = config
@@ -132,7 +133,7 @@ class HandState:
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.zeros(count)  # [s] of each marker
         self._last_label = np.full(count, -np.inf)  # [s] of each marker
-        self._spread_model = SpreadModel(hand, origin)
+        self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(hand)

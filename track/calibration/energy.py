@@ -564,6 +564,22 @@ def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[n
     return np.linalg.inv(reduced[:, :-1])
 
 
+def angle_errors(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "20 2"]:
+    """What a solution leaves open of each joint angle [rad]: by places of markers, and by the shape."""
+    # Both are correlated. Their shares of the whole variance are as they would be alone.
+    equations = problem.normal_equations(estimate, fit)
+    reduced, solved = eliminate_poses(equations, 0.0)
+    covariance = np.linalg.inv(reduced[:, :-1])
+    by_angle = solved[:, 6:, :-1]
+    places, bones, both = (
+        np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
+        for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))
+        for of in (by_angle[..., part],)
+    )
+    variances = np.stack([places, bones], axis=1) * (both / (places + bones) / len(by_angle))[:, None]
+    return np.asarray(np.sqrt(variances))
+
+
 def _damped_step(
     equations: NormalEquations, damping: float
 ) -> tuple[Float[np.ndarray, "F 26"], Float[np.ndarray, "S"]]:

@@ -32,6 +32,7 @@ from track.calibration.energy import (
     Fit,
     Problem,
     Progress,
+    angle_errors,
     contact_geometry,
     contact_weights,
     find_touches,
@@ -71,7 +72,8 @@ _ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cove
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
-_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
+# Frames whose deformation of the flesh is independent: it follows the four angles of a digit.
+_INDEPENDENT_POSES: Final = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +128,8 @@ class Calibration:
     """Standard error of each marker's position on its bone, or among the knuckles on the palm [m]."""
     length_errors: Float[np.ndarray, "5 3"]
     """Standard error of each bone's length [m]."""
+    angle_errors: Float[np.ndarray, "20 2"]
+    """Standard deviation of each joint angle [rad]: by the places of markers, and by the bones."""
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
     """Joints that moved too little to determine the bones on either side."""
@@ -228,6 +232,7 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
+        angle_errors=angle_errors(problem, estimate, fit),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )

@@ -9,7 +9,8 @@
 - Standard deviations of joint angles and keypoints come from a model that is linear and normal around the
   pose. Each marker is seen with noise, and tells less the longer it is hidden. The hand differs from its
   user's in the same way in every frame, so that no number of frames averages it out: in its size, in the
-  places of its markers, in where its digits begin and point, in the lengths of its bones.
+  places of its markers, in where its digits begin and point, in the lengths of its bones. Flesh moves markers
+  slowly, so that frames beside each other do not average it out either.
 """
 
 from __future__ import annotations
@@ -64,8 +65,13 @@ _CALIBRATED_WRIST: Final = 0.0007  # [m]
 _CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m], tips last
 _SINGLE: Final = (7.0, 3.0)  # times these, of a digit with one marker
 _LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
+SOURCES: Final = ("noise and gaps", "gluing", "flesh", "bones")
+"""What makes an angle uncertain: markers that are noisy or not seen, the places where they were glued on,
+their motion over the bones, and the sizes and directions of these."""
 _OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
 _NUMBERS: Final = 5 * _OWN + 1  # numbers of a hand that are not known: those of its digits, and its size
+NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
+"""Covariances of poses that were fitted frame by frame."""
 # Unknowns by which a digit's keypoints respond to each number: its own hinges, and the wrist.
 _OWN_UNKNOWNS: Final = np.ones((NUM_UNKNOWNS, _NUMBERS))
 _OWN_UNKNOWNS[:NUM_JOINTS, :-1] = np.kron(np.eye(5), np.ones((4, _OWN)))
@@ -107,6 +113,7 @@ class HandDoubt(NamedTuple):
     bones: Float[np.ndarray, "5 2"]  # of the length of each bone of a digit, and of all together, logarithms
     wrist: float  # of where the wrist is in the palm, which no marker shows, in each direction [m]
     joints: Float[np.ndarray, "5 2"]  # of a digit's joints and tip, beyond what markers show, each way [m]
+    flesh: float = 0.0  # of a marker around its place, alike in frames that follow each other [m]
 
 
 class _Proportions(NamedTuple):
@@ -379,10 +386,16 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
 
 
 class SpreadModel:
-    """Standard deviations of the poses of one hand, which depend on where the hand is from."""
+    """Standard deviations of the poses of one hand, which depend on where the hand is from.
 
-    def __init__(self, fit: GloveFit, origin: HandOrigin) -> None:
+    `angle_errors` are what the solution of the hand leaves open of each angle, see `energy.angle_errors`.
+    """
+
+    def __init__(
+        self, fit: GloveFit, origin: HandOrigin, angle_errors: Float[np.ndarray, "20 2"] | None = None
+    ) -> None:
         self._hand, self._digits, self._origin = with_keypoints(fit), hand_arrays(fit).digits, origin
+        self._angle_errors = angle_errors
         self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
 
     def of_pose(
@@ -397,12 +410,38 @@ class SpreadModel:
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
         """Standard deviations of angles [rad] and keypoints [m]; markers are unseen for [s] or for ever."""
         digits = self._digits
-        freedom = max(3 * len(digits) - NUM_UNKNOWNS, _LEAST_FREEDOM)
-        noise = max(rms * np.sqrt(len(digits) / freedom), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
+        noise = max(rms * freedom_factor(len(digits)), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
+        variances, keypoints = self.variances(qpos, unseen, noise)
+        return np.sqrt(variances.sum(axis=-1)), keypoints
+
+    def variances(
+        self,
+        qpos: Float[np.ndarray, "T 27"],
+        unseen: Float[np.ndarray, "T M"],
+        noise: float,
+        flesh: float = 0.0,
+        smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
+        share: float = 1.0,
+    ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
+        """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
+
+        Of a smoothed hand the covariances of its unknowns by noise and gaps are given, and how often the
+        prior counts in a frame.
+        """
         steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
-            self._doubts[steps] = hand_doubt(digits, self._origin, steps * _NOISE_STEP)
-        return pose_spreads(self._hand, resting_prior().precision, self._doubts[steps], qpos, unseen)
+            self._doubts[steps] = hand_doubt(self._digits, self._origin, steps * _NOISE_STEP)
+        doubt = self._doubts[steps]._replace(flesh=flesh)
+        prior = share * resting_prior().precision
+        variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
+        if self._angle_errors is not None:
+            variances[..., [1, 3]] = self._angle_errors**2
+        return variances, keypoints
+
+
+def freedom_factor(num_markers: int) -> float:
+    """The noise of markers over their distance from a fitted pose, which takes some of their freedom."""
+    return float(np.sqrt(num_markers / max(3 * num_markers - NUM_UNKNOWNS, _LEAST_FREEDOM)))
 
 
 def with_keypoints(fit: GloveFit) -> HandArrays:
@@ -431,16 +470,17 @@ def pose_spreads(
     doubt: HandDoubt,
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
-) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-    """Standard deviations of joint angles [rad] and keypoints [m] of a hand `with_keypoints`.
+    smoothed: Float[np.ndarray, "S 26 26"],
+) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
+    """Variances of joint angles by `SOURCES` [rad^2], standard deviations of keypoints [m] `with_keypoints`.
 
     A marker off its place moves the fit as noise does. The hand's numbers move markers, through them the fit,
     and the keypoints also by themselves.
     """
-    angles, keypoints = np.empty((len(qpos), NUM_JOINTS)), np.empty((len(qpos), NUM_KEYPOINTS))
+    angles, keypoints = np.empty((len(qpos), NUM_JOINTS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
     moved, posterior = np.zeros((len(weights), 3, _NUMBERS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
-    weighted, places = np.empty((3 * count, NUM_UNKNOWNS)), np.empty((3 * count, NUM_UNKNOWNS))
+    weighted = np.empty((3 * count, NUM_UNKNOWNS))
     jacobian, numbers = work.jacobian.reshape(-1, NUM_UNKNOWNS), moved.reshape(-1, _NUMBERS)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
@@ -458,12 +498,11 @@ def pose_spreads(
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
                 weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
-                places[row, unknown] = doubt.places[row // 3] * weighted[row, unknown]
         forces = weighted.T @ numbers[: 3 * count]
-        off, answers = places @ posterior, posterior @ forces
-        covariance = posterior + off.T @ off + answers @ answers.T
-        for hinge in range(NUM_JOINTS):
-            angles[frame, hinge] = np.sqrt(covariance[hinge, hinge])
+        off, answers = weighted @ posterior, posterior @ forces
+        covariance, noise = answers @ answers.T, smoothed[frame] if len(smoothed) > 0 else posterior
+        _write_variances(doubt, noise, covariance, off, angles[frame])
+        covariance += noise + off.T @ off
         spread = jacobian[3 * count :] @ covariance
         response = jacobian[3 * count :] @ (posterior @ (_OWN_UNKNOWNS * forces))
         for keypoint in range(NUM_KEYPOINTS):
@@ -477,6 +516,27 @@ def pose_spreads(
             beyond = doubt.joints[digit, (keypoint - 1) % 4 // 3] if keypoint > 0 else doubt.wrist
             keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
     return angles, keypoints
+
+
+@kernel
+def _write_variances(
+    doubt: HandDoubt,
+    noise: Float[np.ndarray, "26 26"],
+    bones: Float[np.ndarray, "26 26"],
+    off: Float[np.ndarray, "R 26"],
+    variances: Float[np.ndarray, "20 4"],
+) -> None:
+    """Fill the variances of angles [rad^2]; `off` is what a meter moves, then what the doubt does."""
+    variances[:] = 0.0
+    for hinge in range(NUM_JOINTS):
+        variances[hinge, 0], variances[hinge, 3] = noise[hinge, hinge], bones[hinge, hinge]
+    for row in range(len(off)):
+        place, flesh = doubt.places[row // 3] ** 2, doubt.flesh**2
+        for hinge in range(NUM_JOINTS):
+            square = off[row, hinge] ** 2
+            variances[hinge, 1] += place * square
+            variances[hinge, 2] += flesh * square
+        off[row] *= np.sqrt(place + flesh)
 
 
 @kernel

@@ -1,0 +1,308 @@
+"""A tracked take whose poses are solved over all of its time, forward and backward.
+
+A pose that is fitted to the markers of one frame has their noise: on a short bone a millimeter is ten
+degrees. Here all poses of a hand, from one start of its track to the next, are solved together. A motion goes
+on with its velocity but for unforeseen accelerations, and hinges are near those of the gestures that people
+make, as in the tracker, which sees only the past. The offset of each marker of a hand that is not calibrated
+is its mean over the whole take. So a frame has the same pose wherever in a file it stands.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from gloves.captures.capture import runs_of
+from gloves.fit import GloveFit
+from gloves.takes.take import INITIALIZED, LOST, Take
+from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
+from handsim.kernels import kernel, move, velocity_of
+from handsim.space.transforms import quaternion_matrix
+from track.kinematics.marker_kinematics import (
+    LIMIT_PRECISION,
+    NUM_UNKNOWNS,
+    HandArrays,
+    accumulate_normal_equations,
+    hand_arrays,
+    marker_residuals,
+    workspace,
+)
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
+from track.user import hand_origin, read_errors
+
+# Chosen on simulated real-like hands; the error hardly changes within a factor of ten.
+_ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
+"""Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
+_GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
+_WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
+_ROUNDS, _LEARNING_ROUNDS = 5, 10  # steps of a fit, and of one in which biases are learned
+_OVERSHOOT: Final = 1.5  # times the step of a bias, of which poses take a part
+_LONGEST_STEP: Final = 0.5  # [rad], [m]
+_FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m]
+_OUTLIER: Final = 0.01  # [m] where the loss of a marker levels off (Geman and McClure 1987)
+# From the order of a step's unknowns (hinges, place and turn of the wrist) to that of MuJoCo and back.
+_TO_MUJOCO: Final = np.r_[NUM_JOINTS:NUM_UNKNOWNS, 0:NUM_JOINTS]
+_FROM_MUJOCO: Final = np.argsort(_TO_MUJOCO)
+
+
+class _Window(NamedTuple):
+    """Frames whose poses are solved together."""
+
+    frames: slice
+    kept: slice
+    """Those whose poses are kept; the others are near the end of a window, where another one goes on."""
+
+    @property
+    def inner(self) -> slice:
+        """The kept frames, counted in the window."""
+        first = self.frames.start
+        return slice(self.kept.start - first, self.kept.stop - first)
+
+
+def smooth_take(take: Take) -> Take:
+    """The take with the poses of its hands smoothed, and their standard deviations.
+
+    Labels and statuses stay. Of each hand the settings hold under "filter" the cut-off of each joint angle
+    [Hz], and under "budget" its standard deviation by `SOURCES` [deg].
+    """
+    qpos, rms = take.qpos.copy(), take.rms.copy()
+    angles = np.full((*rms.shape, NUM_JOINTS), np.nan)
+    keypoints, cutoffs, budgets = np.full((*rms.shape, NUM_KEYPOINTS), np.nan), {}, {}
+    for number, side in enumerate(take.sides):
+        windows = _windows(take.status[:, number])
+        if windows:
+            hand = _SmoothedHand(take, number)
+            cutoff, budget = hand.solve(windows)
+            cutoffs[side], budgets[side] = np.round(cutoff, 2).tolist(), np.round(budget, 3).tolist()
+            qpos[:, number], fits = hand.qpos, np.isfinite(rms[:, number])
+            rms[fits, number] = hand.rms()[fits]
+            angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
+    known = {"angle_spread": angles, "keypoint_spread": keypoints}
+    return dataclasses.replace(
+        take, **known, qpos=qpos, rms=rms, settings={**take.settings, "filter": cutoffs, "budget": budgets}
+    )
+
+
+def spread_model(take: Take, hand: GloveFit) -> SpreadModel:
+    """The standard deviations of a hand of a take, by what its settings tell of its user."""
+    errors = read_errors(take.settings.get("angle_errors", {}))
+    origin = hand_origin(str(take.settings.get("user", "")), hand.side)
+    return SpreadModel(hand, origin, errors.get(hand.side))
+
+
+def times_unseen(times: Float[np.ndarray, "T"], seen: Bool[np.ndarray, "T M"]) -> Float[np.ndarray, "T M"]:
+    """Time to the nearest frame with each marker [s]; infinite where there is none."""
+    last = np.maximum.accumulate(np.where(seen, times[:, None], -np.inf), axis=0)
+    following = np.minimum.accumulate(np.where(seen, times[:, None], np.inf)[::-1], axis=0)[::-1]
+    return np.asarray(np.minimum(times[:, None] - last, following - times[:, None]))
+
+
+def _windows(status: Int[np.ndarray, "T"]) -> list[_Window]:
+    """The windows of a hand; none goes on over a frame in which the hand is initialized."""
+    windows = []
+    for first, last in runs_of(status != LOST):
+        begins = first + np.flatnonzero(status[first : last + 1] == INITIALIZED)
+        bounds = np.unique([first, *begins, last + 1])
+        for start, stop in pairwise(bounds.tolist()):
+            for kept in range(start, stop, _WINDOW):
+                end = min(kept + _WINDOW, stop)
+                frames = slice(max(kept - _MARGIN, start), min(end + _MARGIN, stop))
+                windows.append(_Window(frames, slice(kept, end)))
+    return windows
+
+
+class _SmoothedHand:
+    """A hand of a take, on the way to smooth poses."""
+
+    def __init__(self, take: Take, number: int) -> None:
+        worn = self._worn = take.hands[number]
+        self.qpos = take.qpos[:, number].copy()
+        """Poses (T, 27), NaN where the hand is lost."""
+        self.angles = np.full((take.num_frames, NUM_JOINTS), np.nan)
+        """Standard deviations of joint angles (T, 20) [rad]."""
+        self.keypoints = np.full((take.num_frames, NUM_KEYPOINTS), np.nan)
+        """Standard deviations of keypoints (T, 21) [m]."""
+        self._targets = np.ascontiguousarray(take.observed(worn.side))
+        self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
+        self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
+        self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
+        self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        self._learns = hand_origin(str(take.settings.get("user", "")), worn.side) != "calibrated"
+
+    def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
+        """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
+        for number in range(_LEARNING_ROUNDS if self._learns else _ROUNDS):
+            for window in windows:
+                self._step(window, self._equations(window))
+            self._estimate_noise(learns=self._learns and number > 0)
+        cutoffs, parts = [], []
+        for window in windows:
+            equations = self._equations(window)
+            covariances = self._step(window, equations)
+            kept, inner = window.kept, window.inner
+            alone = np.linalg.inv(equations[0])[inner]
+            # What the gestures are off by is alike in frames that follow each other.
+            by_hinges = self._share * alone[:, :, :NUM_JOINTS]
+            same = by_hinges @ resting_prior().precision @ by_hinges.swapaxes(1, 2)
+            variances, self.keypoints[kept] = self._model.variances(
+                self.qpos[kept],
+                self._unseen[kept],
+                self._weight_noise,
+                self._flesh,
+                covariances[inner] + same,
+                self._share,
+            )
+            self.angles[kept] = np.sqrt(variances.sum(axis=-1))
+            parts.append(variances)
+            spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
+            cutoffs.append((_ACCELERATIONS[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
+        budget = np.rad2deg(np.sqrt(np.concatenate(parts).mean(axis=0)))
+        return np.median(np.concatenate(cutoffs), axis=0), budget
+
+    def rms(self) -> Float[np.ndarray, "T"]:
+        """3D RMS distance of the markers from the hand as it was given [m]; NaN without markers."""
+        squares = ((self._worn.markers(self.qpos)[0] - self._targets) ** 2).sum(axis=-1)
+        seen = np.isfinite(squares)
+        count = np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)
+        return np.asarray(np.sqrt(squares.sum(axis=1, where=seen) / count))
+
+    @property
+    def _share(self) -> float:
+        """How often the prior of the hinges counts in a frame."""
+        return min(1.0, _GESTURES / self._rate)
+
+    @property
+    def _weight_noise(self) -> float:
+        """Noise and flesh together [m], by which a marker counts."""
+        return float(np.hypot(self._noise, self._flesh))
+
+    def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Normal matrices (F, 26, 26) and gradients (F, 26) of frames, each by itself."""
+        qpos, prior = self.qpos[window.frames], resting_prior()
+        normal, gradient, self._residuals[window.frames] = _frame_equations(
+            self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
+        )
+        normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
+        gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
+        return normal, gradient
+
+    def _step(
+        self, window: _Window, equations: tuple[NDArray[np.float64], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Move all poses of a window by a Gauss-Newton step; return the covariances of its unknowns."""
+        # The wrist's place is solved in the world, where its accelerations are.
+        normal, gradient = equations[0].copy(), equations[1].copy()
+        qpos = self.qpos[window.frames]
+        turns = np.tile(np.eye(NUM_UNKNOWNS), (len(qpos), 1, 1))
+        place = slice(NUM_JOINTS, NUM_JOINTS + 3)
+        turns[:, place, place] = quaternion_matrix(qpos[:, 3:7])
+        normal = turns @ normal @ turns.swapaxes(1, 2)
+        gradient = np.einsum("tij,tj->ti", turns, gradient)
+        precision = self._rate**3 / _ACCELERATIONS
+        if len(qpos) > 2:
+            velocities = np.array([velocity_of(*pair, 1.0) for pair in pairwise(qpos)])[:, _FROM_MUJOCO]
+            pull = precision * np.diff(velocities, axis=0)
+            gradient[:-2] += pull
+            gradient[1:-1] -= 2.0 * pull
+            gradient[2:] += pull
+        step, covariances = _solve_in_time(normal, gradient, precision)
+        moved = move(qpos, np.clip(-step, -_LONGEST_STEP, _LONGEST_STEP)[:, _TO_MUJOCO])
+        self.qpos[window.kept] = moved[window.inner]
+        return np.asarray(turns.swapaxes(1, 2) @ covariances @ turns)
+
+    def _estimate_noise(self, *, learns: bool) -> None:
+        """Noise and flesh of the markers by their residuals; their biases, if these are learned."""
+        residuals = self._residuals
+        seen = np.isfinite(residuals[..., 0])
+        bias = np.nan_to_num(np.nansum(residuals, axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None])
+        changes = np.diff(residuals, axis=0)
+        noise = _spread(changes[seen[1:] & seen[:-1]]) / np.sqrt(2.0)
+        self._noise = max(noise, _LEAST_NOISE)
+        slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
+        self._flesh = float(np.sqrt(3.0 * slow)) * freedom_factor(seen.shape[1])
+        if learns:
+            self._hand.positions[:, 0] -= _OVERSHOOT * bias
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    """Standard deviation of values around zero [m], without wrong labels."""
+    near = values[np.abs(values) < _OUTLIER]
+    return float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
+
+
+@kernel
+def _frame_equations(
+    hand: HandArrays,
+    targets: Float[np.ndarray, "T M 3"],
+    qpos: Float[np.ndarray, "T 27"],
+    precision: float,
+    robust_scale: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normal matrices, gradients and residuals in the frames of the bones, of frames one by one."""
+    frames, count = targets.shape[:2]
+    normal, gradient = np.zeros((frames, NUM_UNKNOWNS, NUM_UNKNOWNS)), np.zeros((frames, NUM_UNKNOWNS))
+    local, work, weights = np.zeros((frames, count, 3)), workspace(count), np.empty(count)
+    for frame in range(frames):
+        marker_residuals(hand, targets[frame], qpos[frame], work)
+        for marker in range(count):
+            residual, bone = work.residuals[marker], work.rotations[hand.bones[marker, 0]]
+            square = 0.0
+            for i in range(3):
+                square += residual[i] ** 2
+                for j in range(3):
+                    local[frame, marker, i] += bone[j, i] * residual[j]
+            seen = not np.isnan(square)
+            weights[marker] = precision / (1.0 + robust_scale * square) ** 2 if seen else 0.0
+        accumulate_normal_equations(hand, weights, work)
+        for row in range(NUM_UNKNOWNS):
+            gradient[frame, row] = work.gradient[row]
+            for column in range(NUM_UNKNOWNS):
+                normal[frame, row, column] = work.normal[min(row, column), max(row, column)]
+        for hinge in range(NUM_JOINTS):
+            angle = qpos[frame, 7 + hinge]
+            beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
+            if beyond != 0.0:
+                gradient[frame, hinge] += LIMIT_PRECISION * beyond
+                normal[frame, hinge, hinge] += LIMIT_PRECISION
+    return normal, gradient, local
+
+
+def _solve_in_time(
+    normal: Float[np.ndarray, "T U U"], gradient: Float[np.ndarray, "T U"], precision: Float[np.ndarray, "U"]
+) -> tuple[Float[np.ndarray, "T U"], Float[np.ndarray, "T U U"]]:
+    """Solve frames that second differences of a precision connect; with the covariances of each frame."""
+    # Two frames are one block, so that the system is block tridiagonal: forward elimination, then backward.
+    count, size = gradient.shape
+    pairs = (count + 1) // 2
+    connected = np.zeros((3, 2 * pairs))  # by the distance of two frames, at the first of them
+    for distance, values in enumerate(((1.0, 4.0, 1.0), (-2.0, -2.0), (1.0,))):
+        for start, value in enumerate(values):
+            connected[distance, start : max(count - 2, 0) + start] += value
+    process = connected[:, :, None, None] * np.diag(precision)
+    own = np.tile(np.eye(size), (2 * pairs, 1, 1))
+    own[:count] = normal + process[0, :count]
+    right = np.zeros((2 * pairs, size))
+    right[:count] = gradient
+    nothing = np.zeros_like(own[::2])
+    blocks = np.block([[own[::2], process[1, ::2]], [process[1, ::2], own[1::2]]])
+    ahead = np.block([[process[2, ::2], nothing], [process[1, 1::2], process[2, 1::2]]])
+    right = right.reshape(pairs, 2 * size)
+    covariances, back = np.empty_like(blocks), np.empty_like(blocks)
+    for pair in range(pairs):
+        if pair:
+            blocks[pair] -= ahead[pair - 1].T @ back[pair - 1]
+            right[pair] -= back[pair - 1].T @ right[pair - 1]
+        covariances[pair] = np.linalg.inv(blocks[pair])
+        back[pair] = covariances[pair] @ ahead[pair]
+    solution = np.einsum("pij,pj->pi", covariances, right)
+    for pair in range(pairs - 2, -1, -1):
+        solution[pair] -= back[pair] @ solution[pair + 1]
+        covariances[pair] += back[pair] @ covariances[pair + 1] @ back[pair].T
+    both = np.stack([covariances[:, :size, :size], covariances[:, size:, size:]], axis=1)
+    return solution.reshape(-1, size)[:count], both.reshape(-1, size, size)[:count]
