@@ -25,9 +25,8 @@ from handsim.app.output import (
     Make,
     Output,
     Place,
-    changed_files,
+    checked_list,
     checksums_name,
-    load_checksums,
     open_output,
     place_of,
     save_checksums,
@@ -492,7 +491,7 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
 def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
     """The shards that need not be drawn; damaged files are told. Stores themselves check what they keep."""
     done, changed = whole_shards(output.folder, formats)
-    _tell_changed(output, changed, "drawn again")
+    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
     return done
 
 
@@ -503,16 +502,9 @@ def _is_complete(output: Output) -> bool:
         return SHEET in output.sizes()
     if not path.exists() and not any(output.folder.glob(CHECKSUMS)):  # of an earlier version
         return sheet.is_file()
-    record = load_checksums(path)
-    changed = changed_files(record, {name: output.folder / name for name in record})
-    _tell_changed(output, changed if record or not path.exists() else [_MERGED], "written again")
+    record, changed = checked_list(path, {})
+    output.warn_of(changed, "are damaged (other checksums), and are written again")
     return bool(record) and not changed
-
-
-def _tell_changed(output: Output, names: Sequence[str], doing: str) -> None:
-    if names:
-        told = f"{output}: {', '.join(names)} are damaged (other checksums), and are {doing}"
-        warnings.warn(told, HandSimWarning, stacklevel=5)
 
 
 @functools.lru_cache(maxsize=1)
