@@ -147,7 +147,7 @@ class UserBody:
             costs += np.square(np.where((depth > 0.0) & (depth < length), hides, 0.0)).max(axis=-1)
             near = np.maximum(_NEAR[0] - far, 0.0) / _NEAR[1]
             costs += np.square(np.where(depth > _VIEW * far, near, 0.0)).max(axis=-1)
-        return costs
+        return np.asarray(costs)
 
 
 def _middle(points: Doubles) -> Doubles:
