@@ -66,8 +66,9 @@ def set_stage(
     scene.add_light_hemisphere(
         "/light/sky", sky_color=(255, 255, 255), ground_color=(150, 140, 130), intensity=0.55
     )
-    scene.add_light_directional("/light/key", intensity=1.3, position=turn @ (1.5, -1.0, 2.5))
-    scene.add_light_directional("/light/fill", intensity=0.3, position=turn @ (-2.0, 1.5, 1.0))
+    for name, intensity, place in (("key", 1.3, (1.5, -1.0, 2.5)), ("fill", 0.3, (-2.0, 1.5, 1.0))):
+        x, y, z = (turn @ place).tolist()
+        scene.add_light_directional(f"/light/{name}", intensity=intensity, position=(x, y, z))
     scene.add_grid(
         "/ground",
         width=200 * cell,
