@@ -192,7 +192,7 @@ def _lead(take: Take) -> str:
         user = f"size {user}"
     parts = [f"capture {settings['capture']}"] if "capture" in settings else []
     parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
-    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
+    end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)
     return f"{first[0].upper()}{first[1:]}; {end}"
 

@@ -256,9 +256,9 @@ def test_angles_have_names_and_frames_a_status(take):
     angles = take.angles("right")
     assert tuple(angles) == take.joint_names and len(take.joint_names) == 20
     np.testing.assert_array_equal(angles["index_PIP_flexion"], take.qpos[:, 1, 7 + 6])
-    assert np.isnan(take.angle_spreads("left")["thumb_CMC_flexion"]).all(), "not known"
+    assert np.isnan(take.angle_spreads("left")["thumb_metacarpal_flexion"]).all(), "not known"
     known = dataclasses.replace(take, angle_spread=spread).angle_spreads("left")
-    np.testing.assert_allclose(known["thumb_CMC_flexion"], spread[:, 0, 1], rtol=1e-6)
+    np.testing.assert_allclose(known["thumb_metacarpal_flexion"], spread[:, 0, 1], rtol=1e-6)
     np.testing.assert_array_equal(take.is_tracked("left"), take.status[:, 0] >= INITIALIZED)
     assert not take.made_by_tracker
     with pytest.raises(ArgumentError, match="unknown hand 'middle'"):
