@@ -65,7 +65,7 @@ BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
 NUM_BONES: Final = len(BONES)
 
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
-# the published sets (docs/anatomy.md lists them side by side). The first metacarpal's count from the relaxed
+# the published sets (docs/angles.md lists them side by side). The first metacarpal's count from the relaxed
 # thumb.
 _RANGES: Final = {
     "thumb": ((-33.0, 35.0), (-42.0, 45.0), (-15.0, 65.0), (-20.0, 85.0)),
