@@ -83,9 +83,13 @@ def smooth_take(take: Take) -> Take:
             qpos[:, number], fits = hand.qpos, np.isfinite(rms[:, number])
             rms[fits, number] = hand.rms()[fits]
             angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
-    known = {"angle_spread": angles, "keypoint_spread": keypoints}
     return dataclasses.replace(
-        take, **known, qpos=qpos, rms=rms, settings={**take.settings, "filter": cutoffs, "budget": budgets}
+        take,
+        qpos=qpos,
+        rms=rms,
+        angle_spread=angles,
+        keypoint_spread=keypoints,
+        settings={**take.settings, "filter": cutoffs, "budget": budgets},
     )
 
 

@@ -307,13 +307,13 @@ def _range_section(title: str, hand: HandFigures) -> Section:
 
 
 def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
-    """What each angle's standard deviation is made of, what filtered it, and how long its digit lacked a marker."""
+    """The parts of the deviation of each angle, its filter, and the longest gap of its digit."""
     cutoffs, budget = (take.settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
     filtered = cutoffs is not None and budget is not None
     text = (
-        "Filter: all poses were solved together, forward and backward in time, without a delay. At the cut-off an "
-        "oscillation keeps half of its size. The standard deviation [deg], root of the mean square, is the root of "
-        "the sum of the squares of its parts; gluing, flesh and bones are the same or nearly so in all frames."
+        "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
+        "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares of "
+        "its parts, as root of the mean square over all frames. Gluing and bones are alike in all of them."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )

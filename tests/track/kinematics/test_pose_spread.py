@@ -20,6 +20,7 @@ from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
+    NOT_SMOOTHED,
     MarkerPrediction,
     SpreadModel,
     digit_prior,
@@ -36,7 +37,8 @@ INDEX = slice(4, 8)
 
 
 def spreads_of(fit, doubt, qpos, unseen, prior=NOTHING):
-    return pose_spreads(with_keypoints(fit), prior, doubt, qpos, unseen)
+    variances, keypoints = pose_spreads(with_keypoints(fit), prior, doubt, qpos, unseen, NOT_SMOOTHED)
+    return np.sqrt(variances.sum(axis=-1)), keypoints
 
 
 @pytest.mark.parametrize("side", SIDES)

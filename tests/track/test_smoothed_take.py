@@ -1,0 +1,115 @@
+"""Smooth poses of whole takes: nearer to the truth, the same wherever a frame stands, labels untouched."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.takes.take import LOST, TRACKED
+from track.captures import track_capture
+from track.smoothed_take import _solve_in_time, smooth_take, times_unseen
+from train import simulate_take
+
+
+def angle_error(take, truth):
+    """RMS over hands, frames and angles [deg]."""
+    return np.rad2deg(np.sqrt(np.nanmean((take.qpos - truth.qpos)[..., 7:] ** 2)))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return simulate_take("real-like", num_frames=240, seed=5)
+
+
+@pytest.fixture(scope="module")
+def fitted(truth):
+    """Tracked frame by frame."""
+    return track_capture(truth.capture(), smooth=False)
+
+
+@pytest.fixture(scope="module")
+def smooth(fitted):
+    return smooth_take(fitted)
+
+
+def test_poses_are_nearer_to_the_truth_and_labels_stay(truth, fitted, smooth):
+    assert angle_error(smooth, truth) < 0.8 * angle_error(fitted, truth)
+    np.testing.assert_array_equal(smooth.point_list.labels, fitted.point_list.labels)
+    np.testing.assert_array_equal(smooth.status, fitted.status)
+    jumps = [np.abs(np.diff(take.qpos[..., 7:], n=2, axis=0)).mean() for take in (fitted, smooth)]
+    assert jumps[1] < 0.2 * jumps[0]
+
+
+def test_the_parts_of_the_deviations_sum_up_to_them(smooth):
+    for number, side in enumerate(smooth.sides):
+        spread = np.rad2deg(smooth.angle_spread[:, number])
+        budget = np.array(smooth.settings["budget"][side])
+        np.testing.assert_allclose(
+            np.sqrt(np.nanmean(spread**2, axis=0)), np.linalg.norm(budget, axis=1), rtol=0.01
+        )
+        assert (np.array(smooth.settings["filter"][side]) > 0.5).all()
+
+
+def test_a_frame_has_the_same_pose_at_the_start_and_at_the_end(fitted):
+    """A hand that turns back in time: the same frames follow in the opposite order."""
+    again = np.concatenate([np.arange(240), np.arange(240)[::-1]])
+    tables = {name: getattr(fitted, name)[again] for name in ("points", "ids", "labels", "confidence")}
+    frames = {name: getattr(fitted, name)[again] for name in ("qpos", "rms")}
+    status = np.where(fitted.status == LOST, LOST, TRACKED)[
+        again
+    ]  # a hand begins anew where it was initialized
+    twice = dataclasses.replace(
+        fitted,
+        times=np.arange(480) / fitted.rate,
+        body_poses=fitted.body_poses[again],
+        body_status=fitted.body_status[again],
+        body_rms=fitted.body_rms[again],
+        status=status,
+        angle_spread=None,
+        keypoint_spread=None,
+        **frames,
+        **tables,
+    )
+    angles = smooth_take(twice).qpos[..., 7:]
+    there = np.isfinite(angles[:120, :, 0]) & np.isfinite(angles[360:][::-1, :, 0])
+    off = (angles[:120] - angles[360:][::-1])[there]
+    assert np.rad2deg(np.sqrt((off**2).mean())) < 0.3
+
+
+def test_a_lost_hand_stays_lost(fitted):
+    status, qpos = fitted.status.copy(), fitted.qpos.copy()
+    status[:, 0], qpos[:, 0] = LOST, np.nan
+    rms = fitted.rms.copy()
+    rms[:, 0] = np.nan
+    found = smooth_take(dataclasses.replace(fitted, status=status, qpos=qpos, rms=rms))
+    assert np.isnan(found.qpos[:, 0]).all()
+    assert set(found.settings["filter"]) == {found.sides[1]}
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_the_blocks_solve_the_whole_system(count, rng):
+    """Against one dense system of all frames."""
+    size, precision = 26, rng.uniform(0.5, 2.0, 26)
+    root = rng.standard_normal((count, size, size))
+    normal, gradient = root @ root.swapaxes(1, 2) + np.eye(size), rng.standard_normal((count, size))
+    differences = np.zeros((max(count - 2, 0), count))
+    for row in range(len(differences)):
+        differences[row, row : row + 3] = 1.0, -2.0, 1.0
+    whole = np.kron(differences.T @ differences, np.diag(precision))
+    for frame in range(count):
+        part = slice(size * frame, size * (frame + 1))
+        whole[part, part] += normal[frame]
+    step, covariances = _solve_in_time(normal, gradient, precision)
+    np.testing.assert_allclose(step.ravel(), np.linalg.solve(whole, gradient.ravel()), rtol=1e-6, atol=1e-9)
+    inverse = np.linalg.inv(whole).reshape(count, size, count, size)
+    for frame in range(count):
+        np.testing.assert_allclose(covariances[frame], inverse[frame, :, frame], rtol=1e-6, atol=1e-9)
+
+
+def test_a_marker_is_unseen_since_or_until_the_nearest_frame_with_it():
+    seen = np.array([[False, True, False, False, True], [False] * 5]).T
+    unseen = times_unseen(0.1 * np.arange(5), seen)
+    np.testing.assert_allclose(unseen[:, 0], [0.1, 0.0, 0.1, 0.1, 0.0])
+    assert np.isinf(unseen[:, 1]).all()
