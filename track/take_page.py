@@ -312,8 +312,8 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
     filtered = cutoffs is not None and budget is not None
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
-        "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares of "
-        "its parts, as root of the mean square over all frames. Gluing and bones are alike in all of them."
+        "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
+        "of its parts, as root of the mean square over all frames. Gluing and bones are alike in all of them."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
