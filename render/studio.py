@@ -39,7 +39,7 @@ from render.frames import (
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before, whole_levels
-from render.painting.rasterizer import NEAR, faces_for, see, warp
+from render.painting.rasterizer import NEAR, see
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
@@ -344,8 +344,7 @@ class Studio:
     def _colors_of(self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Bytes:
         """The perfect color picture."""
         background = choices.background
-        painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
-        whole = warp(camera, painted, cv2.INTER_LINEAR)
+        whole = paint(camera, drawn, choices.lighting, self.painter)
         if choices.enclosure is not None:
             behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
             return put_before(whole, behind)

@@ -138,6 +138,13 @@ class Backdrop:
     gap: float  # distance from the nearest point of the hands [m]
     recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
     softness: float = 0.1  # tangent of half the angle under which it sees the lamp
+    level: float | None = None
+    """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
+
+    @property
+    def normal(self) -> Float[np.ndarray, "3"]:
+        """Unit normal in the camera's axes, towards the camera."""
+        return np.array([*self.recedes, -1.0]) / np.linalg.norm([*self.recedes, 1.0])
 
 
 def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
@@ -371,6 +378,7 @@ Corner = tuple[float, float, float]
 _MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camera or hand and a wall [m]
 _FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
 _TEXTURE: Final = 512  # width and height of a wall's picture [px]
+_TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
 _SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
@@ -381,6 +389,7 @@ class Enclosure:
     low: Corner  # [m]
     high: Corner
     free: tuple[Corner, Corner]  # low and high corner of the box that hands and cameras stay in [m]
+    lamp: Corner  # place of a room's lamp, which is the first lamp of the hands [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -402,12 +411,34 @@ class Surroundings:
         return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
 
 
-def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
-    """A random box around cameras and hands."""
+def enclose(
+    positions: Float[np.ndarray, "N 3"], seed: int, towards_lamp: Float[np.ndarray, "3"]
+) -> Enclosure:
+    """A random box around cameras and hands, with its lamp in this direction from their middle."""
     below, above = np.random.default_rng([seed, 0]).uniform(*_MARGIN, (2, 3))
     low, high = positions.min(axis=0), positions.max(axis=0)
-    free = _corner(low - _FREE), _corner(high + _FREE)
-    return Enclosure(_corner(low - below), _corner(high + above), free)
+    free, middle = (_corner(low - _FREE), _corner(high + _FREE)), 0.5 * (low + high)
+    low, high = low - below, high + above
+    way = (np.where(towards_lamp > 0.0, high - middle, low - middle) / towards_lamp).min()
+    return Enclosure(_corner(low), _corner(high), free, _corner(middle + _TO_WALL * way * towards_lamp))
+
+
+def light_in(
+    background: Background, enclosure: Enclosure, directions: Float[np.ndarray, "D 3"]
+) -> Float[np.ndarray, "D 3"]:
+    """Linear light that comes to the middle of the free box from these directions."""
+    return np.clip(_meet(background, enclosure, np.mean(enclosure.free, axis=0), directions).light, 0.0, 1.0)
+
+
+def _meet(background: Background, enclosure: Enclosure, eye: Doubles, rays: Doubles) -> RoomLight:
+    """What rays (N, 3) from an eye in the world [m] meet in the box."""
+    rays = np.where(np.abs(rays) < _SHORTEST, _SHORTEST, rays)
+    low, high = np.array(enclosure.low), np.array(enclosure.high)
+    if background.kind != "room":
+        return _meet_walls(rays, eye - low, high - low, _wall_pictures(background, enclosure))
+    free, lamp = np.array(enclosure.free) - low, np.array(enclosure.lamp) - low
+    rng = np.random.default_rng([background.seed, 1])
+    return cast_room(rays.astype(np.float32), eye - low, high - low, free, lamp, rng=rng)
 
 
 def _corner(point: Doubles) -> Corner:
@@ -434,14 +465,7 @@ def _drawn(
     rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
     known = np.isfinite(rays).all(axis=-1)
     world = (np.where(known[..., None], rays, 1.0) @ T_world_camera[:3, :3].T).reshape(-1, 3)
-    world[np.abs(world) < _SHORTEST] = _SHORTEST
-    low, high = np.array(enclosure.low), np.array(enclosure.high)
-    eye, rng = T_world_camera[:3, 3] - low, np.random.default_rng([background.seed, 1])
-    if background.kind == "room":
-        free = np.array(enclosure.free) - low
-        met = cast_room(world.astype(np.float32), eye, high - low, free, rng=rng)
-    else:
-        met = _meet_walls(world, eye, high - low, _wall_pictures(background, enclosure))
+    met = _meet(background, enclosure, T_world_camera[:3, 3], world)
     shape = size[::-1]
     light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3) * known[..., None]
     if background.blur * shape[0] > 0.3:
