@@ -201,6 +201,8 @@ def test_every_option_acts(command, line, other, usual, files, tmp_path):
 
 
 REFUSED = {
+    "evaluate labeled.trc --truth single.truth.npz --glove dense19": "--truth is given with 1 captures",
+    "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
     "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
     "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
     "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
@@ -212,6 +214,8 @@ REFUSED = {
     "render take.npz --out p --placement rig --views 2": "given views and the placement rig",
     "render take.npz --out p --share 0.5 --distance 1 2": "given share 0.5 and distance (1.0, 2.0)",
     "render take.npz --out p --cameras own.toml --share 0.5": "leave out the placement",
+    "render take.npz --out p --glove dense19": "--hands, --people and --glove belong to --poses",
+    "render --merge a b --out p --glove dense19": "leave out the options of drawing",
     "render --merge a b --out p --people 3": "leave out the options of drawing",
     "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
     "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
