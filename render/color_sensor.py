@@ -37,9 +37,6 @@ class Exposure:
 
     stops: float = 0.0
     """Exposure over the nominal exposure, as a power of two."""
-    metering: float = 0.0
-    """Share of the difference between a picture's mean light and middle gray that the camera makes up for, a
-    stop at most."""
     balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors on red, green and blue after the sensor."""
     white_electrons: float = 0.0
@@ -52,6 +49,9 @@ class Exposure:
     """Quality of JPEG compression, 1 to 100; None without it."""
     blur: float = 0.0
     """Standard deviation of what lens and color filters spread a point of light by [px]."""
+    metering: float = 0.0
+    """Share of the difference between a picture's mean light and middle gray that the camera makes up for, a
+    stop at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +106,8 @@ def expose(
     white = exposure.white_electrons
     words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
     away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
-    gain, lost = (
-        np.float32(2.0**exposure.stops * _metered(linear) ** exposure.metering),
-        np.float32(exposure.vignetting),
-    )
+    gain = np.float32(2.0**exposure.stops * _metered(linear) ** exposure.metering)
+    lost = np.float32(exposure.vignetting)
     shot = np.float32(1.0 / white if white > 0.0 else 0.0)
     dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
     balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)

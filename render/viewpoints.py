@@ -288,7 +288,7 @@ class Viewpoints:
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
         self._framing = framing
-        self.viewer: Doubles = looking(-_towards_user(take)[None])[0]
+        self.viewer: Doubles = looking(-_towards_user(framing.forearms)[None])[0]
         """Axes of somebody before the user, as columns in the world's; light is drawn for them."""
 
     @property
