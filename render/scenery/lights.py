@@ -29,6 +29,7 @@ from render.scenery.backgrounds import (
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
+_LEVEL: Final = 1.65  # usual light of a white surface before all lamps, 1 for the picture's full white
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
@@ -77,8 +78,9 @@ STUDIO: Final = Lighting(
 
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its color."""
-    exposure = float(np.exp(np.clip(rng.normal(0.06, 0.18), -0.35, 0.4)))
-    warmth = rng.normal(0.06, 0.06)  # lamps are warm, and white balances keep some of it
+    # The back of a hand sends back the light of its own color in the median of views.
+    exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
+    warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
     key_share, ambient_share = rng.uniform(0.52, 0.86), rng.uniform(0.09, 0.19)
     # The key light comes from above more often than from below, and seldom from behind the hand.
