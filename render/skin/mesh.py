@@ -238,10 +238,10 @@ def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]
     yield _Hill(None, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
     yield _Hill(None, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * scale, 0.0075))
     muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
-    yield _Hill("thumb_CMC_abduction", 15.0, -25.0, muscle)
+    yield _Hill("thumb_metacarpal_abduction", 15.0, -25.0, muscle)
     # The balls of thumb and little finger, and the hollow between them.
     for joint, start, full, center, height, width in (
-        ("thumb_CMC_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
+        ("thumb_metacarpal_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
         ("little_MCP_flexion", 10.0, 80.0, (0.035, -0.028), 0.0028, 0.0140),
         ("ring_MCP_flexion", 10.0, 80.0, (0.055, -0.004), -0.0025, 0.0120),
     ):
