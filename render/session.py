@@ -239,7 +239,7 @@ def open_studio(
         people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
-    return Studio(hands, people, bodies, colors, config.passes, config.painter)
+    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=config.room_depth)
 
 
 def sample_choices(

@@ -197,8 +197,10 @@ class Studio:
         body_colors: Sequence[tuple[float, float, float]] = (),
         passes: Sequence[str] = PASSES,
         painter: Painter = "compiled",
+        *,
+        room_depth: bool = True,
     ) -> None:
-        self.passes, self.painter = tuple(passes), painter
+        self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -239,7 +241,7 @@ class Studio:
             rgb = self._colors_of(camera, drawn, choices)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
-        if choices.enclosure is not None:
+        if choices.enclosure is not None and self._room_depth:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
         if sensor is not None:
             noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)

@@ -144,7 +144,7 @@ class Backdrop:
     @property
     def normal(self) -> Float[np.ndarray, "3"]:
         """Unit normal in the camera's axes, towards the camera."""
-        return np.array([*self.recedes, -1.0]) / np.linalg.norm([*self.recedes, 1.0])
+        return np.asarray(np.array([*self.recedes, -1.0]) / np.linalg.norm([*self.recedes, 1.0]))
 
 
 def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
@@ -433,7 +433,8 @@ def light_in(
     background: Background, enclosure: Enclosure, directions: Float[np.ndarray, "D 3"]
 ) -> Float[np.ndarray, "D 3"]:
     """Linear light that comes to the middle of the free box from these directions."""
-    return np.clip(_meet(background, enclosure, np.mean(enclosure.free, axis=0), directions).light, 0.0, 1.0)
+    met = _meet(background, enclosure, np.mean(enclosure.free, axis=0), directions)
+    return np.asarray(np.clip(met.light, 0.0, 1.0))
 
 
 def _meet(background: Background, enclosure: Enclosure, eye: Doubles, rays: NDArray[Any]) -> RoomLight:
