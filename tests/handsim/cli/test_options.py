@@ -35,7 +35,7 @@ ELSEWHERE = {
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
-SHOWN = {"view": "rig time glove size shape hands body labeler", "glove improve": "captures"}
+SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
 """Options of what is shown and not written."""
 SEARCHED = {"glove improve": "keep rig minutes seed", "glove score": "labeler"}
 """Options of a search, whose outcome another value may leave as it is, and one that takes minutes to try."""
@@ -224,6 +224,7 @@ REFUSED = {
     "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
     "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
     "view user.json --rig six": "--rig is six, but user.json is a user",
+    "view dense19 --up y": "--up is y, but dense19 is a layout, in which z points up",
     "view take.npz --video v.mp4 --time 0": "given --time 0 and --video v.mp4",
     "train set --out r --labeler cnn --network.width 32": "given network with the labeler cnn",
     "train set --out r --knee 0.5": "given knee with the labeler set",
