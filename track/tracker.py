@@ -123,6 +123,21 @@ class Tracker:
         for cloud in unsure:  # labels that a pose has to verify
             self.labeler.label_frames([cloud])
 
+    def resize(self, user: User, sizes: Sequence[HandState], keep: float) -> None:
+        """Go on with the same hands of another size, which keep poses, labels and a share of their biases.
+
+        Args:
+            user: The hands, in the order of those before.
+            sizes: Their states, without history: to make them takes longer than a frame.
+            keep: The share, from 0 to 1.
+        """
+        self.user, self.hands = user, user.hands
+        for state, size in zip(self._states, sizes, strict=True):
+            state.resize(size, keep)
+        self._digits = digit_table(self._states, self._numbering)
+        if not keep:  # this takes some milliseconds, and a few millimeters are nothing to it
+            self._initializer = HandInitializer(self._states, self.labeler, self.config)
+
     def step(
         self,
         points: Float[np.ndarray, "N 3"],

@@ -260,6 +260,16 @@ class HandState:
         self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
         self._shift_markers()
 
+    def resize(self, other: HandState, keep: float) -> None:
+        """Go on as the same hand of another size, which is that of `other`, with a share of the biases."""
+        self.hand, self.solver, self.digits = other.hand, other.solver, other.digits
+        self.adapted, self._designed, self._ranges = other.adapted, other._designed, other._ranges
+        self._spread_model = other._spread_model
+        self._bias *= keep
+        self._bias_frames[:] = self._bias_frames if keep else 0.0
+        np.maximum(self._variance, _INITIAL_SPREAD_LEAST**2, out=self._variance)
+        self._shift_markers()
+
     def rms_without_bias(self, estimate: HandEstimate) -> float:
         """RMS distance of the markers from their positions on the hand as it was given [m]."""
         return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
