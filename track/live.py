@@ -72,6 +72,8 @@ class LiveTake(NamedTuple):
     """The take, only some blocks of a long one; None if nothing was recorded."""
     num_frames: int
     """Number of all frames."""
+    duration: float
+    """Time of all frames [s], those included that are missing."""
     notes: tuple[str, ...]
     """Lines to print at the end."""
 
@@ -143,12 +145,12 @@ def track_live(
             doubt.tell()
         stream.end(until)
         counts = stream.counts
-        take, step = (None, 1) if recorder is None else _written(recorder, out, counts, status)
+        take, step, duration = (None, 1, 0.0) if recorder is None else _written(recorder, out, counts, status)
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
     counts["frames_after_end"] = max(0, after - pace.frames)
     notes = _notes(counts, step, pace, stream.order.interval)
     sent = (note for output in outputs for note in output.notes())
-    return LiveTake(take, pace.frames, (*notes, *sent, *filter(None, [stream.point_doubt])))
+    return LiveTake(take, pace.frames, duration, (*notes, *sent, *filter(None, [stream.point_doubt])))
 
 
 def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
@@ -175,11 +177,12 @@ def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus)
 
 def _written(
     recorder: Recorder, out: Path | None, counts: dict[str, int], status: LiveStatus
-) -> tuple[Take, int]:
-    """Write the take of a recording."""
+) -> tuple[Take, int, float]:
+    """Write the take of a recording, see `Recorder.finish`; also the time of all its frames [s]."""
     status.show(f"writing {out}", now=True)
     kept = f"writing {out}; {recorder.part} is kept until then"
-    return recorder.finish(counts, told=lambda: status.show(kept))
+    take, step = recorder.finish(counts, told=lambda: status.show(kept))
+    return take, step, recorder.duration + 1.0 / take.rate
 
 
 @contextmanager

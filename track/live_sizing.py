@@ -21,7 +21,6 @@ import numpy as np
 from handsim.app.workers import LocalProcesses
 from handsim.callbacks import Closing
 from handsim.errors import HandSimError, HandSimWarning
-from track.association.hand_state import HandState
 from track.frames import StreamedFrame, TrackedFrame
 from track.hand_size import hand_between, sample_frames
 from track.settings import TrackerSetup, TrackSettings
@@ -44,8 +43,6 @@ class _Measured(NamedTuple):
 
     users: Sequence[User] = ()
     """The hands on the way to their measured size, in small steps; none if no hand was found."""
-    states: Sequence[Sequence[HandState]] = ()
-    """The same for a tracker."""
     told: Sequence[str] = ()
     """What seems wrong with glove, hands or scale, in words."""
 
@@ -64,7 +61,7 @@ class LiveSizing(Closing):
         self._is_brief, self._is_done = True, False  # of the last measurement, and of what is measured
         self._processes: LocalProcesses | None = None
         self._measuring: Future[_Measured] | None = None
-        self._steps: deque[tuple[User, Sequence[HandState]]] = deque()
+        self._steps: deque[User] = deque()
 
     @property
     def is_settled(self) -> bool:
@@ -95,8 +92,8 @@ class LiveSizing(Closing):
             self._begin_measuring(tracker.user)
         if not self._steps:
             return False
-        user, states = self._steps.popleft()
-        tracker.resize(user, states, len(self._steps) / (len(self._steps) + 1))
+        user = self._steps.popleft()
+        tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
         return True
 
     def _begin_measuring(self, user: User) -> None:
@@ -122,7 +119,7 @@ class LiveSizing(Closing):
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
         is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
         if not (self._is_brief and is_same):
-            self._steps = deque(zip(found.users, found.states, strict=True))
+            self._steps = deque(found.users)
 
 
 def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User) -> _Measured:
@@ -139,9 +136,8 @@ def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: 
     places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
     farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
     count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
-    users = [_user_between(before, after, number / count) for number in range(1, count)] + [after]
-    states = [[HandState(hand, setup.config, origin=one.origin(hand.side)) for hand in one] for one in users]
-    return _Measured(users, states, told)
+    users = [_user_between(before, after, number / count) for number in range(1, count)]
+    return _Measured([*users, after], told)
 
 
 def _user_between(before: User, after: User, share: float) -> User:

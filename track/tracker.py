@@ -123,19 +123,19 @@ class Tracker:
         for cloud in unsure:  # labels that a pose has to verify
             self.labeler.label_frames([cloud])
 
-    def resize(self, user: User, sizes: Sequence[HandState], keep: float) -> None:
-        """Go on with the same hands of another size, which keep poses, labels and a share of their biases.
+    def resize(self, user: User, keep: float = 0.0) -> None:
+        """Go on with the same hands of another size; they keep their poses and labels.
 
         Args:
             user: The hands, in the order of those before.
-            sizes: Their states, without history: to make them takes longer than a frame.
-            keep: The share, from 0 to 1.
+            keep: Share of the learned biases of markers that is kept, from 0 to 1. More than 0 is a step on
+                the way to another size, which takes a tenth of the time.
         """
         self.user, self.hands = user, user.hands
-        for state, size in zip(self._states, sizes, strict=True):
-            state.resize(size, keep)
+        for state, hand in zip(self._states, self.hands, strict=True):
+            state.resize(hand, user.origin(hand.side), keep)
         self._digits = digit_table(self._states, self._numbering)
-        if not keep:  # this takes some milliseconds, and a few millimeters are nothing to it
+        if not keep:
             self._initializer = HandInitializer(self._states, self.labeler, self.config)
 
     def step(

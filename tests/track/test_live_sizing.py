@@ -14,7 +14,6 @@ from gloves.takes.take import keypoints_of
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.hand.shape import NUM_QPOS
 from track import Status, StreamedFrame, TrackedFrame, TrackedHand, live_sizing
-from track.association.hand_state import HandState
 from track.live_sizing import LiveSizing
 from track.settings import TrackerSetup, TrackSettings
 from train import simulate_take
@@ -90,7 +89,7 @@ def found(length):
         calls.append(len(frames))
         user = TrackerSetup.of(TrackSettings(hands="right", size="M" if length < 0.19 else "XL")).user
         user = dataclasses.replace(user, notes="auto, measured")
-        return live_sizing._Measured([user], [[HandState(user[0])]])
+        return live_sizing._Measured([user])
 
     calls = []
     return measure, calls
@@ -102,7 +101,7 @@ class FakeTracker:
     def __init__(self, user):
         self.user, self.sizes = user, []
 
-    def resize(self, user, states, keep):
+    def resize(self, user, keep):
         self.user = user
         self.sizes.append((user, keep))
 

@@ -260,11 +260,14 @@ class HandState:
         self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
         self._shift_markers()
 
-    def resize(self, other: HandState, keep: float) -> None:
-        """Go on as the same hand of another size, which is that of `other`, with a share of the biases."""
-        self.hand, self.solver, self.digits = other.hand, other.solver, other.digits
-        self.adapted, self._designed, self._ranges = other.adapted, other._designed, other._ranges
-        self._spread_model = other._spread_model
+    def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
+        """Go on as the same hand of another size, with a share of the biases."""
+        self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
+        self.digits = np.array([BONES[bone].digit for bone in hand.attachment.main_bones])
+        self.adapted = self.solver.hand
+        self._designed = self.adapted.positions[:, 0].copy()
+        if not keep:
+            self._ranges = digit_ranges(hand)
         self._bias *= keep
         self._bias_frames[:] = self._bias_frames if keep else 0.0
         np.maximum(self._variance, _INITIAL_SPREAD_LEAST**2, out=self._variance)
