@@ -25,9 +25,8 @@ from handsim.app.output import (
     Make,
     Output,
     Place,
-    changed_files,
+    checked_list,
     checksums_name,
-    load_checksums,
     open_output,
     place_of,
     save_checksums,
@@ -63,6 +62,7 @@ from render.scenery.lights import sample_surroundings
 from render.skin.look import SkinLook
 from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
+from render.user_body import UserBody
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
 _MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
@@ -137,7 +137,10 @@ class Drawing:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
         self.subject, self.config = subject.upright(config.up), config
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
-        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up)
+        # Poses that are no motion are many people's, except before one person's eyes.
+        has_user = self.subject.is_motion or config.view.placement == "head"
+        self._user = UserBody(self.take) if has_user else None
+        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up, user=self._user)
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
@@ -173,7 +176,7 @@ class Drawing:
         size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = open_studio(self.take.hands, config, bodies=self.take.bodies, rng=rng)
+            studio = self._open_studio(self.take.hands, rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
             person = shard if cast is None else cast.person_in(frame, shard)
@@ -189,7 +192,7 @@ class Drawing:
                 chosen = kept[person]
             cameras = self.viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
-            moment = studio.reaching(moment, cameras)
+            moment = studio.reaching(moment, cameras, self._user)
             if leave_out is not None and not studio.is_clear(moment, cameras):
                 leave_out(frame)
                 continue
@@ -203,7 +206,12 @@ class Drawing:
         cast = self.subject.cast
         assert cast is not None
         hands = cast.hands(person, self.take.hands)
-        return open_studio(hands, self.config, bodies=self.take.bodies, rng=cast.rng(person))
+        return self._open_studio(hands, cast.rng(person))
+
+    def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
+        return open_studio(
+            hands, self.config, bodies=self.take.bodies, rng=rng, has_user=self._user is not None
+        )
 
 
 def open_studio(
@@ -212,9 +220,13 @@ def open_studio(
     *,
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
+    has_user: bool = False,
 ) -> Studio:
-    """A studio of one person with random looks."""
+    """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
+    if has_user:
+        straight = dataclasses.replace(people[0].forearm, flexion=0.0, deviation=0.0)
+        people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
     return Studio(hands, people, bodies, colors, config.passes, config.painter)
@@ -479,7 +491,7 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
 def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
     """The shards that need not be drawn; damaged files are told. Stores themselves check what they keep."""
     done, changed = whole_shards(output.folder, formats)
-    _tell_changed(output, changed, "drawn again")
+    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
     return done
 
 
@@ -490,16 +502,9 @@ def _is_complete(output: Output) -> bool:
         return SHEET in output.sizes()
     if not path.exists() and not any(output.folder.glob(CHECKSUMS)):  # of an earlier version
         return sheet.is_file()
-    record = load_checksums(path)
-    changed = changed_files(record, {name: output.folder / name for name in record})
-    _tell_changed(output, changed if record or not path.exists() else [_MERGED], "written again")
+    record, changed = checked_list(path, {})
+    output.warn_of(changed, "are damaged (other checksums), and are written again")
     return bool(record) and not changed
-
-
-def _tell_changed(output: Output, names: Sequence[str], doing: str) -> None:
-    if names:
-        told = f"{output}: {', '.join(names)} are damaged (other checksums), and are {doing}"
-        warnings.warn(told, HandSimWarning, stacklevel=5)
 
 
 @functools.lru_cache(maxsize=1)

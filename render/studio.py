@@ -44,6 +44,7 @@ from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
+from render.user_body import UserBody
 
 
 def _allowed_parts() -> Flags:
@@ -140,6 +141,8 @@ class Moment:
     """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's upper arm; see `Studio.reaching`."""
+    forearms: Float[np.ndarray, "H 3"] | None = None
+    """Unit direction of each hand's forearm; None for wrists at rest."""
 
     def hand(self, number: int, shift: float = 0.0) -> Doubles | None:
         """Pose (27,) of a hand `shift` seconds after the frame; None where the frame has none."""
@@ -264,16 +267,21 @@ class Studio:
             choices=self._record(choices) if recorded else {},
         )
 
-    def reaching(self, moment: Moment, cameras: Sequence[Camera]) -> Moment:
-        """The moment with arms that leave the pictures of these cameras."""
+    def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
+        """The moment with the user's arms, or others, that leave the pictures of these cameras."""
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}
+        forearms = None if user is None else user.forearms(moment.take.qpos[moment.frame])
         if there:
-            lines = (self._hands[number].skin.forearm_line(pose) for number, pose in there.items())
-            elbows, forearms = zip(*lines, strict=True)
-            found[[*there]] = upper_arms(np.array(elbows), np.array(forearms), cameras)
-        return dataclasses.replace(moment, upper_arms=found)
+            lines = (
+                self._hands[number].skin.forearm_line(pose, None if forearms is None else forearms[number])
+                for number, pose in there.items()
+            )
+            elbows, ways = map(np.array, zip(*lines, strict=True))
+            shoulders = None if user is None else user.shoulders[[*there]]
+            found[[*there]] = upper_arms(elbows, ways, cameras, shoulders)
+        return dataclasses.replace(moment, upper_arms=found, forearms=forearms)
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
@@ -293,8 +301,8 @@ class Studio:
         for index, hand in enumerate(self._hands):
             pose = moment.hand(index, shift)
             if pose is not None:
-                upper_arm = None if moment.upper_arms is None else moment.upper_arms[index]
-                drawn += hand.drawn(pose, number, upper_arm)
+                arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
+                drawn += hand.drawn(pose, number, *arm)
                 number += 1
         for index, body in enumerate(self._bodies):
             T_world_body = moment.body(index, shift)

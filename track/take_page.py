@@ -128,20 +128,23 @@ class HandFigures:
         """
         return self.fitted[:, None] & (~self.beyond.any(axis=1) | (self.seen @ self.beyond.T))
 
-    def joints(self) -> Float[np.ndarray, "20 7"]:
-        """`_RANGE` of each angle over its measured frames, its median spread [deg], its share at a limit.
-
-        They are NaN if unknown.
-        """
-        found = np.full((self.angles.shape[1], len(_RANGE) + 2), np.nan)
-        for row, joint, angles, measured in zip(found, JOINTS, self.angles.T, self.measured.T, strict=True):
+    def joints(self) -> Float[np.ndarray, "20 6"]:
+        """`_RANGE` of each angle over its measured frames, and its median spread [deg]; NaN if unknown."""
+        found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
+        for row, angles, measured in zip(found, self.angles.T, self.measured.T, strict=True):
             if measured.any():
-                row[:-2] = np.percentile(angles[measured], list(_RANGE.values()))
-                at_limit = (angles < joint.low + AT_LIMIT) | (angles > joint.high - AT_LIMIT)
-                row[-1] = at_limit[measured].mean()
+                row[:-1] = np.percentile(angles[measured], list(_RANGE.values()))
         if self.angle_spread is not None and self.fitted.any():
-            found[:, -2] = np.median(self.angle_spread[self.fitted], axis=0)
+            found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
         return found
+
+    def at_limits(self) -> Float[np.ndarray, "20"]:
+        """Share of the fitted frames in which each joint stands at a limit of the model; NaN without any."""
+        low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
+        angles = self.angles[self.fitted]
+        if not len(angles):
+            return np.full(len(JOINTS), np.nan)
+        return np.asarray(((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0))
 
     def markers(self) -> Iterator[MarkerFigures]:
         """What was seen of each marker, in the order of the glove."""
@@ -218,7 +221,7 @@ def _lead(take: Take) -> str:
         user = f"size {user}"
     parts = [f"capture {settings['capture']}"] if "capture" in settings else []
     parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
-    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
+    end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)
     return f"{first[0].upper()}{first[1:]}; {end}"
 
@@ -260,8 +263,9 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
     if not hand.fitted.any():
         return [Section(f"{side} hand", "It has no pose in any frame.")]
     angles = (
-        "Zero is the flat hand. Flexion counts positive towards the palm, extension negative. Abduction "
-        "counts positive towards the thumb; for the thumb itself away from the palm."
+        "Angles of the model (docs/angles.md): zero is the flat hand. Flexion counts positive towards the "
+        "palm, extension negative. Abduction counts positive towards the thumb; that of the first "
+        "metacarpal, which is relative to the hand, away from the palm."
     )
     if hand.angle_spread is not None:
         angles += " The band is one standard deviation to either side."
@@ -307,17 +311,17 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
 
 
 def _range_section(title: str, hand: HandFigures) -> Section:
-    table = [["joint [deg]", *_RANGE, "range of the model", "at its limit [%]", "usual spread"]]
-    for joint, row in zip(JOINTS, hand.joints(), strict=True):
-        *cells, spread = (NOTHING if np.isnan(value) else f"{value:.1f}" for value in row[:-1])
-        limits = f"{joint.low:g} to {joint.high:g}", percent(row[-1])
+    table = [["joint [deg]", *_RANGE, "range of the model", "at its limits [%]", "usual spread"]]
+    for joint, row, share in zip(JOINTS, hand.joints(), hand.at_limits().tolist(), strict=True):
+        *cells, spread = (NOTHING if np.isnan(value) else f"{value:.1f}" for value in row)
+        limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
         table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of each joint those in "
-        "which a marker beyond it is seen, if the glove has one: other angles are predicted. A joint at the "
-        "model's limit may have gone farther. 5th and 95th are "
-        "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
-        "angle, from what is not known of the hand, hidden markers and noise."
+        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in which "
+        "a marker beyond it is seen, if the glove has one: other angles are predicted. 5th and 95th are "
+        "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
+        "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
+        "of the angle, from what is not known of the hand, hidden markers and noise."
     )
     return Section(title, text, table=table)
 
@@ -462,11 +466,11 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
     """The range of motion of each joint, beside the model's."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    rows: _Rows = [["hand", "joint", *columns, "at_limit_share"]]
+    rows: _Rows = [["hand", "joint", *columns, "at_limits_share"]]
     for hand in hands:
-        for joint, (*row, spread, limit) in zip(JOINTS, hand.joints().tolist(), strict=True):
-            values = *row, joint.low, joint.high, spread, limit
-            rows.append([hand.side, joint.name, *map(_number, values)])
+        shares = hand.at_limits().tolist()
+        for joint, (*row, spread), share in zip(JOINTS, hand.joints().tolist(), shares, strict=True):
+            rows.append([hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread, share))])
     return rows
 
 

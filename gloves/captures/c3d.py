@@ -1,8 +1,9 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
 Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file, silently
-pads a file that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read,
-no analog channels, events and force plates.
+pads a file that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read.
+Analog channels, events, force plates and all other parameters are copied from the file that a capture was
+read from to the file of its labeled points.
 
 Header and parameters both state where the frames lie and how numbers are written, and some programs get one
 of them wrong. Where they contradict each other, the size of the data decides, with a warning; where it does
@@ -13,9 +14,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -105,9 +108,24 @@ def _walk(
     data: bytes, at: int, processor: int, tell: Tell
 ) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
     """Names of groups by number, and (group, name, record from its type on) of each parameter."""
-    order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     groups: dict[int, str] = {}
     found: list[tuple[int, str, memoryview]] = []
+    for number, name, record in _records(data, at, processor, tell):
+        if number < 0:
+            groups[-number] = _plain(name)
+        else:
+            found.append((number, _plain(name), record))
+    return groups, found
+
+
+def _plain(name: bytes) -> str:
+    """The name of a group or parameter as it is compared."""
+    return name.decode("latin-1").upper().strip()
+
+
+def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple[int, bytes, memoryview]]:
+    """Number of its group (negative for the group itself), name, and content of each record."""
+    order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     view = memoryview(data)
     points_at = (int.from_bytes(data[16:18], order) - 1) * BLOCK
     end = points_at if points_at > at else len(data)  # of the section
@@ -117,19 +135,15 @@ def _walk(
         if name_length == 0:
             break
         offset_at = at + 2 + name_length
-        name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
+        name = data[at + 2 : offset_at]
         offset = int.from_bytes(data[offset_at : offset_at + 2], order)
-        if group < 0:
-            groups[-group] = name
-        else:
-            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]))
+        yield group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]
         if offset == 0:
             break
         at = offset_at + offset
         if at > end:
-            tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
+            tell(f"the parameter section ends with {shortened(_plain(name))!r}, which points behind it")
             break
-    return groups, found
 
 
 def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
@@ -214,10 +228,30 @@ class _Extent:
         return self.stated is not None and 0 <= self.room - self.stated * frame_bytes < _MAX_PADDING
 
 
+class _Frames(NamedTuple):
+    """The numbers of all frames as they are stored."""
+
+    numbers: NDArray[np.generic]
+    """Those of the points, then the analog numbers (T, K)."""
+    num_points: int
+    scale: float
+    """See `Header.scale`."""
+
+
 def read_points(
     data: bytes, parameters: Parameters, header: Header, tell: Tell
 ) -> Float[np.ndarray, "T N 4"]:
     """Coordinates in the file's unit, and residuals."""
+    frames = _read_frames(data, parameters, header, tell)
+    points = frames.numbers[:, : 4 * frames.num_points].reshape(-1, frames.num_points, 4)
+    if frames.scale < 0.0:
+        return to_native(points, parameters.processor)
+    scaled: NDArray[np.float64] = points * np.array([*[frames.scale] * 3, 1.0])
+    return scaled
+
+
+def _read_frames(data: bytes, parameters: Parameters, header: Header, tell: Tell) -> _Frames:
+    """The frames of a file, whatever of header and parameters states their size."""
     processor = parameters.processor
     num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
     if not num_points:
@@ -239,11 +273,7 @@ def read_points(
         while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
             end -= 1
         frames = frames[:end]
-    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
-    if scale < 0.0:
-        return to_native(points, processor)
-    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
-    return scaled
+    return _Frames(frames, num_points, scale)
 
 
 def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
@@ -363,8 +393,12 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     return without_outputs(capture, [name for group in _OUTPUTS for name in _list(parameters, group)])
 
 
-def write_c3d(path: Path, capture: Capture) -> None:
+def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
+
+    Of a `source`, the bytes of the C3D that the capture was made from, all but the points is kept: analog
+    channels, events, the number of the first frame and all parameters, but no rotations (group ROTATION).
+    Then lengths have its unit, as its force plates have.
 
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
@@ -378,27 +412,134 @@ def write_c3d(path: Path, capture: Capture) -> None:
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
     try:
         written.touch()  # ezc3d does not report that it may not write
+        unit = "mm" if source is None else _unit(source)
         with plain_path(written) as plain:
-            _content(capture).write(str(plain))
+            _content(capture, unit).write(str(plain))
         _check_written(written, capture)
+        if source is not None:
+            written.write_bytes(_with_source(written.read_bytes(), source))
         written.replace(path)
     except BaseException:
         written.unlink(missing_ok=True)
         raise
 
 
-def _content(capture: Capture) -> ezc3d.c3d:
+def _unit(source: bytes) -> str:
+    """The unit of length of a C3D."""
+    parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
+    return next(iter(parameters.strings("POINT", "UNITS")), "") or "mm"
+
+
+_OF_POINTS: Final = {"USED", "SCALE", "RATE", "DATA_START", "FRAMES", "LONG_FRAMES", "UNITS"}
+_LISTS: Final = ("LABELS", "DESCRIPTIONS")
+"""Parameters of the group POINT, and beginnings of their names, that state what the points are."""
+_MOST_BLOCKS: Final = 255  # of a parameter section
+_EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
+
+
+def _with_source(written: bytes, source: bytes) -> bytes:
+    """A written file with all of its source but the points: analogs, events, parameters, first frame."""
+    ours, theirs = (Parameters.parse(data, (data[0] - 1) * BLOCK, _silent) for data in (written, source))
+    processor = theirs.processor
+    header = Header.parse(source, processor)
+    points = _read_frames(written, ours, Header.parse(written, ours.processor), _silent).numbers
+    frames = _read_frames(source, theirs, header, _silent)
+    analogs = frames.numbers[:, 4 * frames.num_points :]
+    if len(points) != len(analogs):
+        raise CaptureError(
+            f"the source has {len(analogs)} frames and the capture {len(points)}, expected as many"
+        )
+    if frames.scale < 0.0:
+        analogs = to_native(analogs, processor)
+    elif "UNSIGNED" in theirs.strings("ANALOG", "FORMAT"):
+        analogs = analogs.view(analogs.dtype.str.replace("i", "u"))
+    group, records = _merged_records(written, source, processor)
+    blocks = -(-(4 + len(records) + len(_data_start(0, group)) + 2) // BLOCK)
+    if blocks > _MOST_BLOCKS:
+        raise CaptureError(f"the parameters take {blocks} blocks, a C3D has {_MOST_BLOCKS} at most")
+    section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(2 + blocks, group)
+    words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<i2")
+    times = np.frombuffer(source[_EVENTS_AT], FLOAT_DTYPES[processor])
+    head = bytearray(words.tobytes())
+    head[_EVENTS_AT] = to_native(times, processor).astype("<f4").tobytes()
+    head[_EVENTS_AT.stop :] = source[_EVENTS_AT.stop : BLOCK]
+    first, count, per_frame = int(words.view("<u2")[3]), len(points), analogs.shape[1]
+    channels = int(theirs.number("ANALOG", "USED", default=0.0))
+    samples = per_frame // channels if channels > 0 else header.samples
+    last = min(first + count - 1, MOST_FRAMES)
+    struct.pack_into("<2B4H", head, 0, 2, 0x50, points.shape[1] // 4, per_frame, first, last)
+    head[12:16], head[20:24] = written[12:16], written[20:24]  # scale and rate
+    struct.pack_into("<2H", head, 16, 2 + blocks, samples)
+    data = np.concatenate([points, analogs], axis=1).astype("<f4").tobytes()
+    content = bytes(head) + section.ljust(blocks * BLOCK, b"\0") + data
+    return content + bytes(-len(content) % BLOCK)
+
+
+def _silent(text: str) -> None:
+    """What a source has that is odd was told when it was read."""
+
+
+def _data_start(block: int, group: int) -> bytes:
+    """The record of POINT:DATA_START."""
+    return _record(group, b"DATA_START", struct.pack("<2BHB", _INTEGER, 0, block, 0))
+
+
+def _record(group: int, name: bytes, content: bytes) -> bytes:
+    """A record of a parameter section; the number of a group itself is negative."""
+    return struct.pack("<2b", len(name), group) + name + struct.pack("<H", len(content) + 2) + content
+
+
+def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int, bytes]:
+    """Number of the group POINT, and all records of a source; of those that state points the written ones."""
+    merged: list[bytes] = []
+    numbers: dict[str, int] = {}
+    for data, kind in ((source, processor), (written, _INTEL)):
+        records = list(_records(data, (data[0] - 1) * BLOCK + 4, kind, _silent))
+        groups = {-group: _plain(name) for group, name, _ in records if group < 0}
+        numbers = numbers or {name: group for group, name in groups.items()}  # the source's
+        rotated = any(
+            (groups.get(group), _plain(name)) == ("ROTATION", "USED") and any(content[2:4])
+            for group, name, content in records
+        )
+        for group, name, content in records:
+            if rotated and groups.get(abs(group)) == "ROTATION":  # their numbers lie behind the frames
+                continue
+            plain = _plain(name)
+            is_point = groups.get(group) == "POINT"
+            of_points = is_point and (plain in _OF_POINTS or plain.startswith(_LISTS))
+            if of_points == (data is written) and not (is_point and plain == "DATA_START"):
+                number = numbers["POINT"] if of_points else group
+                merged.append(_record(number, name, _in_intel(content, kind, is_group=group < 0)))
+    return numbers["POINT"], b"".join(merged)
+
+
+def _in_intel(content: memoryview, processor: int, *, is_group: bool) -> bytes:
+    """The content of a record up to its end, with numbers in Intel's format."""
+    if is_group:
+        return bytes(content[: 1 + content[0]])
+    kind = int.from_bytes(content[:1], "little", signed=True)
+    begin = 2 + content[1]
+    end = begin + math.prod(content[2:begin]) * abs(kind)
+    values = bytes(content[begin:end])
+    if kind == _INTEGER:
+        values = np.frombuffer(values, INTEGER_DTYPES[processor]).astype("<i2").tobytes()
+    elif kind == _FLOAT:
+        values = to_native(np.frombuffer(values, FLOAT_DTYPES[processor]), processor).astype("<f4").tobytes()
+    return bytes(content[:begin]) + values + bytes(content[end : end + 1 + content[end]])
+
+
+def _content(capture: Capture, unit: str) -> ezc3d.c3d:
     """The capture as an ezc3d object."""
     import ezc3d
 
     missing = np.isnan(capture.positions[..., 0]).T
     points = np.ones((4, *missing.shape))
-    points[:3] = np.moveaxis(capture.positions, (0, 1, 2), (2, 1, 0)) * 1e3
+    points[:3] = np.moveaxis(capture.positions, (0, 1, 2), (2, 1, 0)) * (1.0 / meters_per(unit))
     content = ezc3d.c3d()
     group = content["parameters"]["POINT"]
     group["RATE"]["value"] = [capture.rate]
     group["LABELS"]["value"] = list(capture.names)
-    group["UNITS"]["value"] = ["mm"]
+    group["UNITS"]["value"] = [unit]
     content["data"]["points"] = points
     content["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)[None]
     if capture.num_frames > MOST_FRAMES:

@@ -6,6 +6,7 @@ import platform
 import re
 import shutil
 import tempfile
+import warnings
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from typing import Any, Final
 from upath import UPath
 
 from handsim.app.workers import Job
-from handsim.errors import ArgumentError, DatasetError, HandSimError, shortened
+from handsim.errors import ArgumentError, DatasetError, HandSimError, HandSimWarning, shortened
 from handsim.files.inputs import checksum, load_json
 from handsim.files.outputs import (
     claim,
@@ -56,9 +57,25 @@ def load_checksums(path: Path) -> dict[str, str]:
         return {}
 
 
-def changed_files(record: Mapping[str, str], files: Mapping[str, Path]) -> list[str]:
-    """Names of files that are missing or have other checksums than those of a record."""
-    return [name for name in record if not files[name].is_file() or checksum(files[name]) != record[name]]
+def checked_list(path: Path, files: Mapping[str, Path]) -> tuple[dict[str, str], list[str]]:
+    """The checksums of a list, and the names of files that are missing or have others, or of a damaged list.
+
+    Files are beside the list, unless `files` says where they are.
+    """
+    record = load_checksums(path)
+    if not record and path.exists():
+        return {}, [path.name]
+
+    def checksum_of(name: str) -> str:
+        file = files.get(name, path.parent / name)
+        return checksum(file) if file.is_file() else ""
+
+    return record, changed_files(record, checksum_of)
+
+
+def changed_files(record: Mapping[str, str], checksum_of: Callable[[str], str]) -> list[str]:
+    """Names of the files that have other checksums than those of a record."""
+    return [name for name in record if checksum_of(name) != record[name]]
 
 
 def place_of(out: str | Place) -> Place:
@@ -176,6 +193,11 @@ class Output:
         """SHA-256 of a file in the output."""
         with _one_sentence(self.place, f"reading {name}"):
             return checksum(self.place / name)
+
+    def warn_of(self, files: Collection[str], what: str) -> None:
+        """Warn of files that are not as they were written; `what` says so, and what becomes of them."""
+        if files:
+            warnings.warn(f"{self}: {', '.join(sorted(files))} {what}", HandSimWarning, stacklevel=5)
 
     def publish(self, last: str) -> None:
         """Put all files that were made in the local folder, `last` after all others."""

@@ -21,7 +21,7 @@ def evaluate(
     captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
     settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")],
     *,
-    glove: str = "dense19",
+    glove: str | None = None,
     labeler: str | None = None,
     truth: Path | None = None,
     json: Path | None = None,
@@ -34,7 +34,7 @@ def evaluate(
             or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
             a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         settings: What is evaluated.
-        glove: Marker layout: a shipped name or the path of a .toml file.
+        glove: Marker layout: a shipped name or the path of a .toml file; dense19 when not given.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
         truth: The .truth.npz of a simulated take. Labels that a capture of it already has, or a tracked take
@@ -48,13 +48,14 @@ def evaluate(
 
     check_outputs((*captures, glove, labeler, truth), [json])
     if truth is None:
+        glove = glove or "dense19"
         label_on(threads)
         report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)
         found: dict[str, Any] = {"glove": glove, **settings.record()}
-    elif len(captures) != 1 or labeler is not None or settings != EvaluateSettings():
+    elif len(captures) != 1 or (glove, labeler, threads, settings) != (None, None, 1, EvaluateSettings()):
         raise ArgumentError(
-            f"--truth is given with {len(captures)} captures, expected one and none of --labeler, --occlude, "
-            "--ghosts, --every and --seed: the labels of a capture are counted as they are"
+            f"--truth is given with {len(captures)} captures, expected one and none of --glove, --labeler, "
+            "--threads, --occlude, --ghosts, --every and --seed: a capture's labels are counted as they are"
         )
     else:
         report = evaluate_labels(captures[0], truth)

@@ -52,7 +52,7 @@ def label(
     right, left = (
         np.bincount(points.frames[sides == side], minlength=take.num_frames) > 0 for side in ("right", "left")
     )
-    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
+    write_capture(out, take.labeled_capture(sides=bool((right & left).any())), source=capture)
     sure = f", median confidence {np.median(points.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
         f"{out}: {take.num_frames} frames, {labeled.sum()} of {len(labeled)} points labeled{sure}; "

@@ -78,7 +78,7 @@ def render(
     poses: Path | None = None,
     hands: tuple[Side, ...] | None = None,
     people: int | None = None,
-    glove: str = "dense19",
+    glove: str | None = None,
     merge: tuple[Path, ...] = (),
     options: Annotated[RenderOptions, _FLAT],
     format: tuple[str, ...] = ("webdataset",),
@@ -99,7 +99,8 @@ def render(
         hands: Whose poses an .npz has, in its order: right (when not given), left, or both. A .csv names its
             hands, and all are drawn when not given.
         people: Number of people that they are distributed over; one for each shard when not given.
-        glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file.
+        glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file; dense19
+            when not given.
         merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.
         format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
@@ -114,15 +115,15 @@ def render(
     if merge:
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
-        own = (hands, people, glove, workers, cluster) == (None, None, "dense19", None, None)
-        if options != RenderOptions() or format != ("webdataset",) or not own:
+        own = {hands, people, glove, workers, cluster} - {None}
+        if options != RenderOptions() or format != ("webdataset",) or own:
             raise HandSimError("--merge copies pictures as they are; leave out the options of drawing")
         print_line(f"{out}: {merge_renderings(merge, place)} shards of {len(merge)} renderings")
         return
     table = poses if take is None or take.suffix.lower() != CSV else take
-    if table is None and (hands, people, glove) != (None, None, "dense19"):
+    if table is None and {hands, people, glove} != {None}:
         raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
-    source = cast("Path", take) if table is None else PoseFile(table, hands, people, glove)
+    source = cast("Path", take) if table is None else PoseFile(table, hands, people, glove or "dense19")
     check_outputs(
         (take, poses, cast("str | None", options.view.cameras)), (place if isinstance(place, Path) else None,)
     )

@@ -1,6 +1,7 @@
 """Motions of hands and things for writers, and joints of hands as tables, as BVH and as OpenXR's joints.
 
-A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name.
+A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name, and
+a last column that tells the convention of the angles.
 Numbers of a hand without a pose are empty in a .csv and null in a .parquet. OpenSim's .mot has a row per
 frame, angles in degrees, and y up as OpenSim's world; a hand without a pose keeps its last one, because
 OpenSim ends at NaN.
@@ -22,8 +23,9 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -36,7 +38,17 @@ from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values
-from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
+from handsim.hand.shape import (
+    BONE_NAMES,
+    BONES,
+    DIGITS,
+    FORMER_JOINT_NAMES,
+    JOINT_NAMES,
+    PALM,
+    SIDES,
+    Side,
+    bones_of,
+)
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import (
     UpAxis,
@@ -75,6 +87,8 @@ class PosedHand(NamedTuple):
     """Frames with a pose, at least one."""
     qpos: Float[np.ndarray, "T 27"]
     """Poses [m, rad]; missing ones repeat the last pose, or else the first."""
+    isb: Mapping[str, Float[np.ndarray, "T"]] = MappingProxyType({})
+    """Angles of the ISB by their names [rad], which tables have beside the model's; none if not wanted."""
 
     @property
     def side(self) -> Side:
@@ -82,10 +96,15 @@ class PosedHand(NamedTuple):
         return self.model.shape.side
 
     @classmethod
-    def of(cls, model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> PosedHand:
+    def of(
+        cls,
+        model: HandModel,
+        qpos: Float[np.ndarray, "T 27"],
+        isb: Mapping[str, Float[np.ndarray, "T"]] = MappingProxyType({}),
+    ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present))
+        return cls(model, present, _held(qpos, present), isb)
 
 
 class PosedBody(NamedTuple):
@@ -115,6 +134,8 @@ class Motion(NamedTuple):
     """Time of each frame [s], increasing."""
     hands: Sequence[PosedHand]
     bodies: Sequence[PosedBody]
+    convention: str = "model"
+    """What the angles are, in words of `handsim.hand.angles`."""
 
     @property
     def seconds(self) -> Float[np.ndarray, "T"]:
@@ -196,6 +217,8 @@ NUMBERS: Final[tuple[str, ...]] = (
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`, with positions in the world."""
+_LAST: Final = "convention"
+_FORMER_TITLES: Final = {f"{old}_rad": f"{new}_rad" for new, old in FORMER_JOINT_NAMES.items()}
 
 
 class JointTable(NamedTuple):
@@ -215,6 +238,7 @@ def read_joint_csv(path: Path) -> JointTable:
     lines = csv.reader(text.splitlines())
     try:
         titles = [title.strip() for title in next(lines, [])]
+        titles = [_FORMER_TITLES.get(title, title) for title in titles]
         wanted = [*_FIRST, *_QPOS]
         missing = [name for name in wanted if name not in titles]
         if missing:
@@ -260,13 +284,14 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as text with nine digits, in the take's axes whatever `up` is."""
     hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
-    row_format = ",%.9g" * len(NUMBERS)
+    titles = _titles(motion)
+    row_format = ",%.9g" * len(titles) + f",{motion.convention}"
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join([*_FIRST, *NUMBERS]) + "\n")
+        file.write(",".join([*_FIRST, *titles, _LAST]) + "\n")
         for frame, time in enumerate(motion.times.tolist()):
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
-                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(NUMBERS)
+                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * (len(titles) + 1)
                 file.write(f"{frame},{time:.9g},{hand.side}{text}\n")
 
 
@@ -279,25 +304,34 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         raise HandSimError(".parquet needs pyarrow; run `pip install 'handsim[parquet]'`") from error
     hands = motion.hands
     count = len(hands)
-    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(NUMBERS))
+    titles = _titles(motion)
+    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(titles))
     columns = {
         "frame": pyarrow.array(np.repeat(np.arange(len(motion.times)), count)),
         "time_s": pyarrow.array(np.repeat(motion.times, count)),
         "hand": pyarrow.array([hand.side for hand in hands] * len(motion.times)),
         **{
             name: pyarrow.array(np.ascontiguousarray(column), from_pandas=True)  # NaN becomes null
-            for name, column in zip(NUMBERS, numbers.T, strict=True)
+            for name, column in zip(titles, numbers.T, strict=True)
         },
+        _LAST: pyarrow.array(
+            [motion.convention if there else None for there in np.isfinite(numbers[:, 0]).tolist()]
+        ),
     }
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         parquet.write_table(pyarrow.table(columns), file)
 
 
+def _titles(motion: Motion) -> tuple[str, ...]:
+    """The columns of numbers of a table."""
+    return *NUMBERS, *(f"{name}_isb_rad" for name in motion.hands[0].isb)
+
+
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
-    """The columns `NUMBERS`; NaN in frames without a pose."""
+    """The columns `NUMBERS`, and the angles of the ISB if wanted; NaN in frames without a pose."""
     qpos = hand.qpos
     keypoints = hand_keypoints(hand.model, qpos)[:, 1:].reshape(len(qpos), -1)
-    numbers = np.concatenate([qpos, keypoints], axis=1)
+    numbers = np.column_stack([qpos, keypoints, *hand.isb.values()])
     numbers[~hand.present] = np.nan
     return numbers
 
@@ -316,6 +350,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         f"nRows={len(table)}",
         f"nColumns={table.shape[1]}",
         "inDegrees=yes",
+        f"convention={motion.convention}",
         "endheader",
         "\t".join(names),
     ]

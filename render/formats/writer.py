@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from handsim._checks import check_choice, check_type
-from handsim.app.output import CHECKSUMS, changed_files, checksums_name, load_checksums, save_checksums
+from handsim.app.output import CHECKSUMS, checked_list, checksums_name, save_checksums
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, save_json
@@ -133,11 +133,8 @@ def whole_shards(folder: Path, formats: Sequence[str]) -> tuple[frozenset[int], 
         return done, []
     whole, changed = [], []
     for shard in sorted(done):
-        path = folder / checksums_name(shard)
-        record, files = load_checksums(path), shard_files(folder, formats, shard)
-        found = changed_files(record, {name: files.get(name, folder / name) for name in record})
-        if not record and path.exists():
-            found = [path.name]
+        files = shard_files(folder, formats, shard)
+        record, found = checked_list(folder / checksums_name(shard), files)
         changed += found
         whole += [shard] if record and not found else []
     return frozenset(whole), changed

@@ -19,7 +19,7 @@ from handsim import HandModel, HandSimError
 from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES
 from tests.sentences import error_names
-from track import TrackedFrame, Tracker
+from track import TrackedFrame, Tracker, TrackerConfig
 from train import Labeler, load_labeler, simulate_take
 
 
@@ -45,6 +45,7 @@ def tracker(users, labeler) -> Tracker:
 
 NUM_MARKERS = 38
 SURE = Status.TRACKED, Status.INITIALIZED
+LIMITS = TrackerConfig()
 FARTHEST = 0.004
 """[m] that joints may be off on average wherever a hand is said to be tracked."""
 
@@ -104,7 +105,7 @@ def check_frame(tracked: TrackedFrame, points: np.ndarray) -> None:
         assert set(hand.filled) == set(range(19)) - set(tracked.labels[mine] - 19 * number)
         np.testing.assert_array_equal(hand.markers[tracked.labels[mine] - 19 * number], points[mine])
         if hand.status in SURE:
-            assert hand.rms <= 0.008 and mine.sum() >= 5
+            assert hand.rms <= LIMITS.most_rms and mine.sum() >= LIMITS.fewest_labels
 
 
 def joint_errors(

@@ -21,6 +21,7 @@ from handsim.app.output import (
     CHECKSUMS,
     Output,
     Place,
+    changed_files,
     checksums_name,
     load_checksums,
     open_output,
@@ -192,10 +193,10 @@ def _whole_files(output: Output) -> dict[str, str]:
         (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
     own, there = _shard_records(output), output.sizes()
     recorded = _recorded_files(output, own)
-    damaged = {name for name in recorded if name in there and output.checksum(name) != recorded[name]}
+    damaged = changed_files({name: recorded[name] for name in recorded if name in there}, output.checksum)
     lists = MANIFEST if (output.folder / MANIFEST).is_file() else CHECKSUMS
-    _tell(output, damaged, f"are not what {lists} lists (other checksums)")
-    _tell(output, [name for name, table in own.items() if not table], "are damaged")
+    output.warn_of(damaged, f"are not what {lists} lists (other checksums), and are made again")
+    output.warn_of([name for name in own if not own[name]], "are damaged, and are made again")
     numbers = {_number(name) for name in damaged}
     return {name: one for name, one in recorded.items() if _number(name) not in numbers}
 
@@ -209,13 +210,6 @@ def _number(name: str) -> int:
 def _names(shard: int) -> tuple[str, str, str]:
     """Names of the files of a shard."""
     return hands_name(shard), redrawn_name(shard), rows_name(shard)
-
-
-def _tell(output: Output, files: Collection[str], what: str) -> None:
-    """Warn of files that are made again."""
-    if files:
-        told = f"{output}: {', '.join(sorted(files))} {what}, and are made again"
-        warnings.warn(told, HandSimWarning, stacklevel=5)
 
 
 def _make_shards(

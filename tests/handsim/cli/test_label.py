@@ -6,6 +6,7 @@ import dataclasses
 import json
 import signal
 
+import ezc3d
 import numpy as np
 import pytest
 
@@ -124,3 +125,21 @@ def test_ctrl_c_in_compiled_code_is_no_mistake_of_ours(take, tmp_path, capsys, m
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert wrapped and not (tmp_path / "out.trc").exists()
+
+
+def test_a_labeled_c3d_keeps_what_its_source_has_beside_points(tmp_path, rng):
+    source, out = tmp_path / "in.c3d", tmp_path / "out.c3d"
+    content = ezc3d.c3d()
+    content["header"]["points"]["first_frame"] = 41
+    parameters, data = content["parameters"], content["data"]
+    parameters["POINT"]["RATE"]["value"], parameters["POINT"]["UNITS"]["value"] = [100.0], ["mm"]
+    parameters["POINT"]["LABELS"]["value"] = [f"*{number}" for number in range(40)]
+    data["points"] = np.ones((4, 40, 10))
+    data["points"][:3] = rng.uniform(-900.0, 900.0, size=(3, 40, 1))
+    parameters["ANALOG"]["RATE"]["value"], parameters["ANALOG"]["LABELS"]["value"] = [1000.0], ["EMG"]
+    data["analogs"] = rng.normal(size=(1, 1, 100))
+    content.write(str(source))
+    assert main(["label", str(source), "--out", str(out)]) == 0
+    before, after = ezc3d.c3d(str(source)), ezc3d.c3d(str(out))
+    assert after["header"]["points"]["first_frame"] == before["header"]["points"]["first_frame"] == 41
+    np.testing.assert_array_equal(after["data"]["analogs"], before["data"]["analogs"])

@@ -45,6 +45,8 @@ QUICK = [
     ("glove check", "dense19 --out g.png", "size XS"),
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y"),
+    ("export", "take.npz --out x.csv", "convention isb"),
+    ("export", "take.npz --out x.csv --convention isb", "neutral 0 0.1"),
     ("evaluate", "labeled.trc --json f.json --occlude 4 --ghosts 2",
      "glove sparse13|labeler run|occlude 1|ghosts 0|every 7|seed 4"),
     ("evaluate", "labeled.trc --json f.json", "truth single.truth.npz"),
@@ -201,8 +203,14 @@ def test_every_option_acts(command, line, other, usual, files, tmp_path):
 
 
 REFUSED = {
+    "evaluate labeled.trc --truth single.truth.npz --glove dense19": "--truth is given with 1 captures",
+    "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
     "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
     "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
+    "export user.json --out x.glb --neutral 0 1": "given --neutral (0.0, 1.0) and user.js",
+    "export take.npz --out x.mot --convention isb": "convention is isb and the file x.mot; ",
+    "export take.npz --out x.csv --neutral 0 1": "neutral is (0.0, 1.0), convention is model",
+    "export take.npz --out x.csv --convention isb --neutral 7 9": "neutral is 7 to 9 s, where the ",
     "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
     "render take.npz --out p --passes depth --tones dark": "given tones and the passes depth, expected rgb",
     "render take.npz --out p --passes depth --motion-blur": "given shutter and the passes depth",
@@ -212,6 +220,8 @@ REFUSED = {
     "render take.npz --out p --placement rig --views 2": "given views and the placement rig",
     "render take.npz --out p --share 0.5 --distance 1 2": "given share 0.5 and distance (1.0, 2.0)",
     "render take.npz --out p --cameras own.toml --share 0.5": "leave out the placement",
+    "render take.npz --out p --glove dense19": "--hands, --people and --glove belong to --poses",
+    "render --merge a b --out p --glove dense19": "leave out the options of drawing",
     "render --merge a b --out p --people 3": "leave out the options of drawing",
     "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
     "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
