@@ -47,6 +47,7 @@ AT_LIMIT: Final = 0.5
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames
 _SIDE_FRAMES: Final = 40  # frames in which a hand is compared with its mirror image
 _FITS: Final = 1.5  # times our RMS distance up to which the mirror image fits as well
+_FITS_WELL: Final = 0.0012  # [m] distance up to which it may be the hand in any case
 
 
 class SuspectSpan(NamedTuple):
@@ -154,7 +155,7 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
             if there.mean() > _OFTEN_AT_LIMIT:
                 first = int(hand.frames[there.argmax()])
                 share, start = 100 * there.mean(), hand.take.times[first]
-                why = f"is at the model's limit of {limit:g} deg in {share:.0f} % of frames, from {start:.2f} s on"
+                why = f"is at the model's limit, {limit:g} deg, in {share:.0f} % of frames from {start:.2f} s"
                 remedy = "calibrate the hand, or do not use this angle"
                 yield hand.span(first, joint.name, why, remedy, of_labels=False)
 
@@ -206,7 +207,7 @@ def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     theirs = min(
         np.median(PoseSolver(mirrored).solve(seen[:, order]).rms) for order in _exchanges(worn, mirrored)
     )
-    if theirs < _FITS * ours:
+    if theirs < max(_FITS * ours, _FITS_WELL):
         why = f"may be the {other} one: that fits the points to {1e3 * theirs:.1f} mm, this {1e3 * ours:.1f}"
         yield hand.span(0, "", why, "put a marker on the thumb, or name the hand (--hands)")
 

@@ -317,8 +317,8 @@ def _range_section(title: str, hand: HandFigures) -> Section:
         limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
         table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in which "
-        "a marker beyond it is seen, if the glove has one: other angles are predicted. 5th and 95th are "
+        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in "
+        "which a marker beyond it is seen, if the glove has one: others are predicted. 5th and 95th are "
         "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
         "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
         "of the angle, from what is not known of the hand, hidden markers and noise."

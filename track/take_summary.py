@@ -25,11 +25,14 @@ _CERTAIN: Final = 0.85  # confidence in every point of a frame that needs no loo
 _AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
 _APART: Final = 0.2  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
-# The bound on a take's share of wrong frames among those not listed: a factor of their mean doubt and a least
-# one. Of 100 takes of other people, gloves, rigs and noise the share was below it in 96, which by split
-# conformal prediction holds for the next one with 95 % (python -m benchmarks.doubtful_frames --fit).
-_VOUCH_FACTOR: Final = 3.0
+# One of 37 takes of other people, rigs and noise had more wrong frames among those not listed than this factor
+# times their mean doubt and a least one: a bound with 95 % for the next take (split conformal prediction). Where
+# it would be too wide nothing is vouched for: of few markers, many listed frames or points without a label.
+_VOUCH_FACTOR: Final = 2.8
 _VOUCH_LEAST: Final = 0.002
+_VOUCH_LISTED: Final = 0.5  # share of listed frames up to which the others are vouched for
+_VOUCH_MARKERS: Final = 12  # of the glove, at least
+_VOUCH_UNLABELED: Final = 0.1  # share of the points at the hands, at most
 
 
 class Vouch(NamedTuple):
@@ -48,7 +51,7 @@ class Vouch(NamedTuple):
 
     def __str__(self) -> str:
         """One sentence."""
-        if self.listed == 1.0 or self.right <= 0.0:
+        if self.right <= 0.0:
             return (
                 f"labels: {100 * self.listed:.1f} % of the frames are listed as doubtful, the rest is unsure"
             )
@@ -102,14 +105,19 @@ def suspicions(take: Take) -> list[str]:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
     found += [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
-    near = _unlabeled_at_hands(take)
-    share = near / max(1, near + int((points.labels >= 0).sum()))
+    share = _unlabeled_share(take)
     if share > _MOST_UNLABELED:
         found.append(
             f"{100 * share:.1f} % of the points at the hands are not markers of what was tracked; name the "
             "glove worn (--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
         )
     return found
+
+
+def _unlabeled_share(take: Take) -> float:
+    """Share of the points at the hands, and of those with a label, that have none."""
+    near = _unlabeled_at_hands(take)
+    return near / max(1, near + int((take.point_list.labels >= 0).sum()))
 
 
 def _unlabeled_at_hands(take: Take) -> int:
@@ -207,8 +215,9 @@ def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
             part = slice(span.first, span.last + 1)
             masses.append(float(doubt[part][~listed[part]].sum()))
             listed[part] = True
-    if listed.all():
-        return Vouch(1.0, 0.0, ())
+    few = take.hands[0].layout.num_markers < _VOUCH_MARKERS
+    if few or listed.mean() > _VOUCH_LISTED or _unlabeled_share(take) > _VOUCH_UNLABELED:
+        return Vouch(float(listed.mean()), 0.0, ())
     wrong = min(1.0, _VOUCH_FACTOR * (float(doubt[~listed].mean()) + _VOUCH_LEAST))
     left = wrong * (~listed).sum() + sum(masses) - np.cumsum([0.0, *masses])
     return Vouch(float(listed.mean()), 1.0 - wrong, tuple((1.0 - left / take.num_frames).tolist()))
