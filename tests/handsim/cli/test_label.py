@@ -13,7 +13,7 @@ import pytest
 from gloves import Capture, load_layout, read_capture, write_capture
 from handsim.cli.main import main
 from track.kinematics import pose_solver
-from train import simulate_take
+from train import load_labeler, simulate_take
 
 FRAMES = 40
 NAMES = load_layout("dense19").names
@@ -71,6 +71,51 @@ def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
     assert labeled.names[:19] == NAMES
     assert "a left hand in 30 frames, no hand in 10 frames" in said.out
     assert np.isclose(labeled.positions[:30, :19], positions[:30], atol=1e-5, equal_nan=True).mean() > 0.97
+
+
+def test_a_folder_is_labeled_by_one_labeler_past_a_capture_that_cannot_be_read(
+    take, tmp_path, capsys, monkeypatch
+):
+    loaded = []
+    monkeypatch.setattr("track.user.load_labeler", lambda *of: loaded.append(of) or load_labeler(*of))
+    captures, out = tmp_path / "captures", tmp_path / "captures" / "labeled"
+    short = dataclasses.replace(take.capture(), positions=take.capture().positions[:4])
+    for name in ("a.c3d", "b.trc", "day/a.c3d"):
+        write_capture(captures / name, short)
+    (captures / "b.trc").write_text("no marker file")
+    for _ in range(2):  # what is labeled already is no capture of the second time
+        loaded.clear()
+        assert main(["label", str(captures), "--out", str(out)]) == 1
+        said = capsys.readouterr()
+        assert len([line for line in said.out.splitlines() if "two hands in 4 frames" in line]) == 2
+        assert f"{captures / 'b.trc'}: not labeled: not a TRC file" in said.err
+        assert said.err.splitlines()[-1] == "handsim label: 1 of 3 captures were not labeled"
+        assert len({id(of[1]) for of in loaded if hasattr(of[1], "label_frames")}) == 1
+        assert len([of for of in loaded if of[1] is None]) == 1
+    files = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
+    assert files == {"a.c3d", "day/a.c3d"}
+    assert read_capture(out / "day" / "a.c3d").names[0] == f"right:{NAMES[0]}"
+
+
+@pytest.mark.parametrize(
+    ("captures", "out", "words"),
+    [
+        ("a.c3d b.c3d", "labeled.c3d", "labeled.c3d for several captures, expected a folder"),
+        ("a.c3d a.tsv", "labeled", "two outputs are labeled/a.c3d, expected two files"),
+        ("a.c3d b.c3d", ".", "is the input"),
+        ("", "labeled", "no capture outside of labeled is given"),
+        ("a.c3d", "labeled.txt", "labeled.txt: unknown file type"),
+        ("empty", "labeled", "empty holds no capture"),
+    ],
+)
+def test_outputs_of_several_captures_are_checked_first(captures, out, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    for name in captures.split():
+        if name != "empty":
+            (tmp_path / name).write_text("not read")
+    assert main(["label", *captures.split(), "--out", out]) == 1
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
