@@ -177,7 +177,7 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
             off = (free - places[row, marker]) @ pose[:3, :3]
             off = off[np.linalg.norm(off, axis=1) < _ELSEWHERE]
             found.append(off)
-            owners += [row] * len(off)
+            owners += [int(row)] * len(off)
         every, frames = np.concatenate(found), np.array(owners)
         tried = every[:: max(1, len(every) // _TRIED)]
         steady = [np.linalg.norm(every - one, axis=1) < _STEADY for one in tried]

@@ -25,9 +25,9 @@ _CERTAIN: Final = 0.85  # confidence in every point of a frame that needs no loo
 _AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
 _APART: Final = 0.2  # [s] between two spans that are two
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
-# One of 37 takes of other people, rigs and noise had more wrong frames among those not listed than this factor
-# times their mean doubt and a least one: a bound with 95 % for the next take (split conformal prediction). Where
-# it would be too wide nothing is vouched for: of few markers, many listed frames or points without a label.
+# Of 37 takes of other people, rigs and noise one had more wrong frames among those not listed than this
+# factor times their mean doubt and a least one: with 95 %, a bound for the next take (split conformal
+# prediction). Few markers, many listed frames or many points without a label leave no useful bound.
 _VOUCH_FACTOR: Final = 2.8
 _VOUCH_LEAST: Final = 0.002
 _VOUCH_LISTED: Final = 0.5  # share of listed frames up to which the others are vouched for

@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, Take, load_layout
+from gloves import MarkerLayout, MarkerPlace, Take, load_layout
 from handsim.hand.shape import JOINTS, PALM
 from track import find_suspect_spans, track_capture
-from track.take_faults import find_faults
+from track.kinematics.pose_solver import PoseSolver
+from track.take_faults import _exchanges, find_faults
 from track.take_page import hand_figures
 from track.take_summary import summarize, suspicions, vouch
 from train import simulate_take
@@ -126,3 +127,42 @@ def test_a_joint_at_its_limit_is_named(tracked):
     assert hand_figures(take)[0].joints()[joint, -1] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)
     assert fault.of == "right:ring_MCP_flexion" and fault.first == HALF and not fault.of_labels
+
+
+@pytest.fixture(scope="module")
+def mirror_like() -> Take:
+    """A right hand in a glove without a thumb marker that is like its own mirror image, as if tracked."""
+    places = [
+        MarkerPlace(f"{digit}Tip", f"{digit}_distal", along=0.7, around=0.0)
+        for digit in ("index", "middle", "ring", "little")
+    ]
+    back = ((0.3, 0.2), (0.3, -0.2), (0.7, 0.2), (0.7, -0.2))
+    places += [
+        MarkerPlace(f"Back{n}", "palm", along=x, around=0.0, across=y) for n, (x, y) in enumerate(back)
+    ]
+    layout = MarkerLayout("mirror8", tuple(places), load_layout("dense19").radius)
+    take = simulate_take("single-hand", glove=layout, num_frames=FRAMES, seed=652).without_body()
+    right = take.observed("right")
+    return as_tracked(take.hands[:1], take.qpos[:, :1], right)
+
+
+def as_tracked(hands, qpos: np.ndarray, markers: np.ndarray) -> Take:
+    labels = np.where(np.isfinite(markers[..., 0]), np.arange(markers.shape[1]), -1)
+    return Take.of_truth(hands, qpos, markers, labels, labels, rate=RATE, settings={"tracker": {}})
+
+
+def test_a_side_that_motion_shows_is_sure(mirror_like):
+    assert not [fault for fault in find_faults(mirror_like) if "may be" in fault.why]
+
+
+@pytest.mark.parametrize("turned", [0, 1])
+def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
+    (hand,) = mirror_like.hands
+    other = hand.with_side("left")
+    seen = mirror_like.observed("right")[:, list(_exchanges(hand, other))[turned]]
+    (fault,) = (
+        one
+        for one in find_faults(as_tracked([other], PoseSolver(other).solve(seen).qpos[:, None], seen))
+        if one.of == "the left hand"
+    )
+    assert fault.why.startswith("may be the right one") and fault.of_labels
