@@ -126,7 +126,8 @@ class HandFigures:
 
         In the others its angle is predicted.
         """
-        return self.fitted[:, None] & (~self.beyond.any(axis=1) | (self.seen @ self.beyond.T))
+        told = ~self.beyond.any(axis=1) | (self.seen @ self.beyond.T)
+        return np.asarray(self.fitted[:, None] & told)
 
     def joints(self) -> Float[np.ndarray, "20 6"]:
         """`_RANGE` of each angle over its measured frames, and its median spread [deg]; NaN if unknown."""
