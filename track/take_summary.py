@@ -30,7 +30,7 @@ _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 # prediction). Few markers, many listed frames or many points without a label leave no useful bound.
 _VOUCH_FACTOR: Final = 2.8
 _VOUCH_LEAST: Final = 0.002
-_VOUCH_LISTED: Final = 0.5  # share of listed frames up to which the others are vouched for
+_VOUCH_LISTED: Final = 0.33  # share of listed frames up to which the others are vouched for
 _VOUCH_MARKERS: Final = 12  # of the glove, at least
 _VOUCH_UNLABELED: Final = 0.1  # share of the points at the hands, at most
 
