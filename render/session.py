@@ -57,9 +57,8 @@ from render.formats.writer import (
 )
 from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import enclose, photo_files
+from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
-from render.skin.look import SkinLook
 from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.user_body import UserBody
@@ -172,8 +171,9 @@ class Drawing:
     ) -> Iterator[RenderedFrame]:
         """Pictures of frames by all cameras; the frames are given with their places in the shard."""
         config, cast = self.config, self.subject.cast
-        around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
-        size = self.viewpoints.size
+        viewpoints = self.viewpoints
+        several = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
+        around = viewpoints.positions() if several else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
             studio = self._open_studio(self.take.hands, rng)
@@ -185,12 +185,13 @@ class Drawing:
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
-                chosen = sample_choices(config, studio.skin, own, size, around)
+                chosen = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=own)
             else:
                 if person not in kept:
-                    kept[person] = sample_choices(config, studio.skin, rng, size, around)
+                    scene = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=rng)
+                    kept[person] = self._held(scene)
                 chosen = kept[person]
-            cameras = self.viewpoints.cameras(frame)
+            cameras = viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
             moment = studio.reaching(moment, cameras, self._user)
             if leave_out is not None and not studio.is_clear(moment, cameras):
@@ -200,6 +201,15 @@ class Drawing:
                 fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
                 drawn = studio.photograph(moment, camera, fresh)
                 yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
+
+    def _held(self, scene: FrameChoices) -> FrameChoices:
+        """The choices with a backdrop that stays where it is, behind the hands of all frames."""
+        backdrop = scene.background.backdrop
+        if backdrop is None:
+            return scene
+        level = self.viewpoints.nearest(backdrop.normal) - backdrop.gap
+        held = dataclasses.replace(backdrop, level=level)
+        return dataclasses.replace(scene, background=dataclasses.replace(scene.background, backdrop=held))
 
     def _studio_of_person(self, person: int) -> Studio:
         """The studio of one of the people of `subject.cast`."""
@@ -229,18 +239,22 @@ def open_studio(
         people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
-    return Studio(hands, people, bodies, colors, config.passes, config.painter)
+    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=config.room_depth)
 
 
 def sample_choices(
     config: RenderConfig,
-    skin: SkinLook | None,
-    rng: np.random.Generator,
+    viewer: Doubles,
     size: tuple[int, int],
     around: Doubles | None = None,
+    *,
+    rng: np.random.Generator,
 ) -> FrameChoices:
-    """Random choices of a picture; several cameras at positions `around` (N, 3) share an enclosure."""
-    background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
+    """Random choices of a picture, with light for a viewer with these axes (3, 3).
+
+    Several places `around` (N, 3) of cameras and hands share an enclosure.
+    """
+    background, lighting, enclosure = sample_surroundings(config.background, viewer, size, around, rng=rng)
     sensor = config.depth_sensor
     assert sensor != "auto"
     return FrameChoices(
@@ -250,7 +264,7 @@ def sample_choices(
         shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
         depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
         seed=0,
-        enclosure=None if around is None else enclose(around, background.seed),
+        enclosure=enclosure,
     )
 
 

@@ -39,7 +39,7 @@ from render.frames import (
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before, whole_levels
-from render.painting.rasterizer import NEAR, faces_for, see, warp
+from render.painting.rasterizer import NEAR, see
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
@@ -197,8 +197,10 @@ class Studio:
         body_colors: Sequence[tuple[float, float, float]] = (),
         passes: Sequence[str] = PASSES,
         painter: Painter = "compiled",
+        *,
+        room_depth: bool = True,
     ) -> None:
-        self.passes, self.painter = tuple(passes), painter
+        self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -239,7 +241,7 @@ class Studio:
             rgb = self._colors_of(camera, drawn, choices)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
-        if choices.enclosure is not None:
+        if choices.enclosure is not None and self._room_depth:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
         if sensor is not None:
             noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)
@@ -352,8 +354,7 @@ class Studio:
     def _colors_of(self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Bytes:
         """The perfect color picture."""
         background = choices.background
-        painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
-        whole = warp(camera, painted, cv2.INTER_LINEAR)
+        whole = paint(camera, drawn, choices.lighting, self.painter)
         if choices.enclosure is not None:
             behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
             return put_before(whole, behind)

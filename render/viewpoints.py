@@ -287,7 +287,9 @@ class Viewpoints:
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-        self._centers = framing.centers
+        self._framing = framing
+        self.viewer: Doubles = looking(-_towards_user(framing.forearms)[None])[0]
+        """Axes of somebody before the user, as columns in the world's; light is drawn for them."""
 
     @property
     def num_cameras(self) -> int:
@@ -299,9 +301,19 @@ class Viewpoints:
         """Width and height of the first camera's pictures [px]."""
         return self._paths[0].camera.size
 
+    @property
+    def moves(self) -> bool:
+        """Whether a camera moves, turns or zooms."""
+        return any(path.zoom is not None or bool(np.ptp(path.poses, axis=0).any()) for path in self._paths)
+
+    def nearest(self, normal: Float[np.ndarray, "3"]) -> float:
+        """Least position of all frames' hands along a direction in the first camera's axes [m]."""
+        points = self._framing.points.reshape(-1, 3)
+        return float(np.nanmin(self.cameras(0)[0].local(points) @ normal)) - _SKIN
+
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """Positions of the cameras and of the hands' centers in all frames [m]."""
-        return np.concatenate([self._centers, *(path.poses[:, :3, 3] for path in self._paths)])
+        return np.concatenate([self._framing.centers, *(path.poses[:, :3, 3] for path in self._paths)])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""

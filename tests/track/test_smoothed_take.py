@@ -26,7 +26,7 @@ def truth():
 @pytest.fixture(scope="module")
 def fitted(truth):
     """Tracked frame by frame."""
-    return track_capture(truth.capture(), smooth=False)
+    return track_capture(truth.capture())
 
 
 @pytest.fixture(scope="module")
