@@ -134,6 +134,13 @@ class Drawing:
     def __init__(self, subject: Subject, config: RenderConfig) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
+        for body in subject.take.bodies:
+            if body.shape is None and not len(body.positions):
+                told = (
+                    f"{body.name} has neither a surface nor markers and is not drawn; "
+                    "RigidBody.of gives a body the surface of its object"
+                )
+                warnings.warn(told, HandSimWarning, stacklevel=3)
         self.subject, self.config = subject.upright(config.up), config
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion are many people's, except before one person's eyes.
