@@ -258,3 +258,16 @@ def test_arguments(tmp_path):
     path = saved(tmp_path, qpos=BASE, person=[0, 1])
     with pytest.raises(CaptureError, match="leave out --people"):
         load_poses(PoseFile(path, people=3))
+
+
+def test_poses_that_are_given_as_a_take_are_told(tmp_path, qpos):
+    np.savez(tmp_path / "poses.npz", qpos=qpos)
+    with pytest.raises(CaptureError, match="no take, but poses of your own; give them to --poses"):
+        load_subject(source_of(tmp_path / "poses.npz"), seed=0)
+
+
+def test_frames_without_a_hand_are_counted(tmp_path, qpos):
+    lost = qpos[:3].copy()
+    lost[1] = np.nan
+    with pytest.warns(HandSimWarning, match=r"frames without a hand are not drawn: 1 of 3 \(the first: 1\)"):
+        assert render_take(lost, tmp_path / "pictures", "png", passes=("ids",), workers=1) == 2
