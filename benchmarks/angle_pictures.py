@@ -33,14 +33,14 @@ _PANELS: Final[tuple[tuple[str, Side, dict[str, float], NDArray[np.float64], tup
         "right hand from the back, X into the page",
         "right",
         {},
-        _OBLIQUE,
+        _BACK,
         ("palm", "index_proximal", "thumb_metacarpal"),
     ),
     (
         "left hand: mirrored, equal signs",
         "left",
         {},
-        _OBLIQUE,
+        _BACK,
         ("palm", "index_proximal", "thumb_metacarpal"),
     ),
     (

@@ -18,7 +18,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -69,7 +69,8 @@ class Parameters:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
         try:
-            groups, found = _walk(data, start + 4, processor, tell)
+            found = list(_records(data, start + 4, processor, tell))
+            groups = {-group: name for group, name, _ in found if group < 0}
             read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
             sizes = (
                 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
@@ -104,26 +105,7 @@ class Parameters:
         return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
 
 
-def _walk(
-    data: bytes, at: int, processor: int, tell: Tell
-) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
-    """Names of groups by number, and (group, name, record from its type on) of each parameter."""
-    groups: dict[int, str] = {}
-    found: list[tuple[int, str, memoryview]] = []
-    for number, name, record in _records(data, at, processor, tell):
-        if number < 0:
-            groups[-number] = _plain(name)
-        else:
-            found.append((number, _plain(name), record))
-    return groups, found
-
-
-def _plain(name: bytes) -> str:
-    """The name of a group or parameter as it is compared."""
-    return name.decode("latin-1").upper().strip()
-
-
-def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple[int, bytes, memoryview]]:
+def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple[int, str, memoryview]]:
     """Number of its group (negative for the group itself), name, and content of each record."""
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     view = memoryview(data)
@@ -135,14 +117,14 @@ def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple
         if name_length == 0:
             break
         offset_at = at + 2 + name_length
-        name = data[at + 2 : offset_at]
+        name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
         offset = int.from_bytes(data[offset_at : offset_at + 2], order)
         yield group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]
         if offset == 0:
             break
         at = offset_at + offset
         if at > end:
-            tell(f"the parameter section ends with {shortened(_plain(name))!r}, which points behind it")
+            tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
             break
 
 
@@ -228,30 +210,22 @@ class _Extent:
         return self.stated is not None and 0 <= self.room - self.stated * frame_bytes < _MAX_PADDING
 
 
-class _Frames(NamedTuple):
-    """The numbers of all frames as they are stored."""
-
-    numbers: NDArray[np.generic]
-    """Those of the points, then the analog numbers (T, K)."""
-    num_points: int
-    scale: float
-    """See `Header.scale`."""
-
-
 def read_points(
     data: bytes, parameters: Parameters, header: Header, tell: Tell
 ) -> Float[np.ndarray, "T N 4"]:
     """Coordinates in the file's unit, and residuals."""
-    frames = _read_frames(data, parameters, header, tell)
-    points = frames.numbers[:, : 4 * frames.num_points].reshape(-1, frames.num_points, 4)
-    if frames.scale < 0.0:
+    frames, num_points, scale = _read_frames(data, parameters, header, tell)
+    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
+    if scale < 0.0:
         return to_native(points, parameters.processor)
-    scaled: NDArray[np.float64] = points * np.array([*[frames.scale] * 3, 1.0])
+    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
     return scaled
 
 
-def _read_frames(data: bytes, parameters: Parameters, header: Header, tell: Tell) -> _Frames:
-    """The frames of a file, whatever of header and parameters states their size."""
+def _read_frames(
+    data: bytes, parameters: Parameters, header: Header, tell: Tell
+) -> tuple[NDArray[np.generic], int, float]:
+    """Numbers of frames as stored (T, K), those of points first; the number of points; `Header.scale`."""
     processor = parameters.processor
     num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
     if not num_points:
@@ -273,7 +247,7 @@ def _read_frames(data: bytes, parameters: Parameters, header: Header, tell: Tell
         while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
             end -= 1
         frames = frames[:end]
-    return _Frames(frames, num_points, scale)
+    return frames, num_points, scale
 
 
 def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
@@ -399,7 +373,6 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     Of a `source`, the bytes of the C3D that the capture was made from, all but the points is kept: analog
     channels, events, the number of the first frame and all parameters, but no rotations (group ROTATION).
     Then lengths have its unit, as its force plates have.
-
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
@@ -417,7 +390,7 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
             _content(capture, unit).write(str(plain))
         _check_written(written, capture)
         if source is not None:
-            written.write_bytes(_with_source(written.read_bytes(), source))
+            written.write_bytes(_with_source(written.read_bytes(), capture.num_frames, source))
         written.replace(path)
     except BaseException:
         written.unlink(missing_ok=True)
@@ -430,47 +403,44 @@ def _unit(source: bytes) -> str:
     return next(iter(parameters.strings("POINT", "UNITS")), "") or "mm"
 
 
-_OF_POINTS: Final = {"USED", "SCALE", "RATE", "DATA_START", "FRAMES", "LONG_FRAMES", "UNITS"}
-_LISTS: Final = ("LABELS", "DESCRIPTIONS")
-"""Parameters of the group POINT, and beginnings of their names, that state what the points are."""
+_OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
+"""How parameters of the group POINT begin that state what the points are."""
 _MOST_BLOCKS: Final = 255  # of a parameter section
 _EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
 
 
-def _with_source(written: bytes, source: bytes) -> bytes:
+def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
     """A written file with all of its source but the points: analogs, events, parameters, first frame."""
-    ours, theirs = (Parameters.parse(data, (data[0] - 1) * BLOCK, _silent) for data in (written, source))
-    processor = theirs.processor
+    parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
+    processor = parameters.processor
     header = Header.parse(source, processor)
-    points = _read_frames(written, ours, Header.parse(written, ours.processor), _silent).numbers
-    frames = _read_frames(source, theirs, header, _silent)
-    analogs = frames.numbers[:, 4 * frames.num_points :]
-    if len(points) != len(analogs):
-        raise CaptureError(
-            f"the source has {len(analogs)} frames and the capture {len(points)}, expected as many"
-        )
-    if frames.scale < 0.0:
+    frames, num_points, scale = _read_frames(source, parameters, header, _silent)
+    if len(frames) != num_frames:
+        raise CaptureError(f"the source has {len(frames)} frames and the capture {num_frames}")
+    analogs = frames[:, 4 * num_points :]
+    if scale < 0.0:
         analogs = to_native(analogs, processor)
-    elif "UNSIGNED" in theirs.strings("ANALOG", "FORMAT"):
+    elif "UNSIGNED" in parameters.strings("ANALOG", "FORMAT"):
         analogs = analogs.view(analogs.dtype.str.replace("i", "u"))
+    ours = Header.parse(written, _INTEL)
+    points = np.frombuffer(written, "<f4", 4 * num_frames * ours.num_points, ours.start)
+    data = np.concatenate([points.reshape(num_frames, -1), analogs], axis=1).astype("<f4").tobytes()
     group, records = _merged_records(written, source, processor)
-    blocks = -(-(4 + len(records) + len(_data_start(0, group)) + 2) // BLOCK)
+    blocks = -(-(len(records) + len(_data_start(group, 0)) + 6) // BLOCK)
     if blocks > _MOST_BLOCKS:
         raise CaptureError(f"the parameters take {blocks} blocks, a C3D has {_MOST_BLOCKS} at most")
-    section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(2 + blocks, group)
-    words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<i2")
-    times = np.frombuffer(source[_EVENTS_AT], FLOAT_DTYPES[processor])
+    section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(group, 2 + blocks)
+    words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<u2")
     head = bytearray(words.tobytes())
+    times = np.frombuffer(source[_EVENTS_AT], FLOAT_DTYPES[processor])
     head[_EVENTS_AT] = to_native(times, processor).astype("<f4").tobytes()
     head[_EVENTS_AT.stop :] = source[_EVENTS_AT.stop : BLOCK]
-    first, count, per_frame = int(words.view("<u2")[3]), len(points), analogs.shape[1]
-    channels = int(theirs.number("ANALOG", "USED", default=0.0))
-    samples = per_frame // channels if channels > 0 else header.samples
-    last = min(first + count - 1, MOST_FRAMES)
-    struct.pack_into("<2B4H", head, 0, 2, 0x50, points.shape[1] // 4, per_frame, first, last)
+    first, channels = int(words[3]), int(parameters.number("ANALOG", "USED", default=0.0))
+    sizes = ours.num_points, analogs.shape[1], first, min(first + num_frames - 1, MOST_FRAMES)
+    struct.pack_into("<2B4H", head, 0, 2, 0x50, *sizes)
     head[12:16], head[20:24] = written[12:16], written[20:24]  # scale and rate
+    samples = analogs.shape[1] // channels if channels > 0 else header.samples
     struct.pack_into("<2H", head, 16, 2 + blocks, samples)
-    data = np.concatenate([points, analogs], axis=1).astype("<f4").tobytes()
     content = bytes(head) + section.ljust(blocks * BLOCK, b"\0") + data
     return content + bytes(-len(content) % BLOCK)
 
@@ -479,46 +449,41 @@ def _silent(text: str) -> None:
     """What a source has that is odd was told when it was read."""
 
 
-def _data_start(block: int, group: int) -> bytes:
+def _data_start(group: int, block: int) -> bytes:
     """The record of POINT:DATA_START."""
-    return _record(group, b"DATA_START", struct.pack("<2BHB", _INTEGER, 0, block, 0))
+    return _record(group, "DATA_START", struct.pack("<2BHB", _INTEGER, 0, block, 0))
 
 
-def _record(group: int, name: bytes, content: bytes) -> bytes:
+def _record(group: int, name: str, content: bytes) -> bytes:
     """A record of a parameter section; the number of a group itself is negative."""
-    return struct.pack("<2b", len(name), group) + name + struct.pack("<H", len(content) + 2) + content
+    raw = name.encode("latin-1")
+    return struct.pack("<2b", len(raw), group) + raw + struct.pack("<H", len(content) + 2) + content
 
 
 def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int, bytes]:
     """Number of the group POINT, and all records of a source; of those that state points the written ones."""
     merged: list[bytes] = []
-    numbers: dict[str, int] = {}
+    numbers: list[int] = []
     for data, kind in ((source, processor), (written, _INTEL)):
         records = list(_records(data, (data[0] - 1) * BLOCK + 4, kind, _silent))
-        groups = {-group: _plain(name) for group, name, _ in records if group < 0}
-        numbers = numbers or {name: group for group, name in groups.items()}  # the source's
-        rotated = any(
-            (groups.get(group), _plain(name)) == ("ROTATION", "USED") and any(content[2:4])
-            for group, name, content in records
-        )
+        groups = {-group: name for group, name, _ in records if group < 0}
+        numbers += [group for group, name in groups.items() if name == "POINT"]
+        values = {(groups.get(group), name): content[2:4] for group, name, content in records}
+        rotated = any(values.get(("ROTATION", "USED"), b""))
         for group, name, content in records:
-            if rotated and groups.get(abs(group)) == "ROTATION":  # their numbers lie behind the frames
-                continue
-            plain = _plain(name)
             is_point = groups.get(group) == "POINT"
-            of_points = is_point and (plain in _OF_POINTS or plain.startswith(_LISTS))
-            if of_points == (data is written) and not (is_point and plain == "DATA_START"):
-                number = numbers["POINT"] if of_points else group
-                merged.append(_record(number, name, _in_intel(content, kind, is_group=group < 0)))
-    return numbers["POINT"], b"".join(merged)
+            of_points = is_point and name.startswith(_OF_POINTS)
+            behind = rotated and groups.get(abs(group)) == "ROTATION"  # their numbers follow the frames
+            if of_points == (data is written) and not behind and not (is_point and name == "DATA_START"):
+                number = numbers[0] if of_points else group
+                kept = bytes(content[: 1 + content[0]]) if group < 0 else _in_intel(content, kind)
+                merged.append(_record(number, name, kept))
+    return numbers[0], b"".join(merged)
 
 
-def _in_intel(content: memoryview, processor: int, *, is_group: bool) -> bytes:
-    """The content of a record up to its end, with numbers in Intel's format."""
-    if is_group:
-        return bytes(content[: 1 + content[0]])
-    kind = int.from_bytes(content[:1], "little", signed=True)
-    begin = 2 + content[1]
+def _in_intel(content: memoryview, processor: int) -> bytes:
+    """The content of a parameter's record up to its end, with numbers in Intel's format."""
+    kind, begin = int.from_bytes(content[:1], "little", signed=True), 2 + content[1]
     end = begin + math.prod(content[2:begin]) * abs(kind)
     values = bytes(content[begin:end])
     if kind == _INTEGER:

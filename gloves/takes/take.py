@@ -477,13 +477,13 @@ class Take:
         """
         check_choice(convention, get_args(Convention), noun="convention")
         angles = self.qpos[:, self.hand_index(side), 7:]
-        zero = None if neutral is None else self._mean_pose(side, neutral)
+        zero = None if neutral is None else self.mean_pose(side, neutral)
         if convention == "isb":
             shape = self.hands[self.hand_index(side)].model.shape
             return dict(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
         return dict(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
-    def _mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
+    def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
         first, last = between
         there = self.is_tracked(side) & (self.times >= first) & (self.times <= last)
@@ -495,12 +495,9 @@ class Take:
         angles = self.qpos[there, self.hand_index(side), 7:]
         spread = np.rad2deg(angles.std(axis=0))
         if spread.max() > _STILL:
-            warnings.warn(
-                f"the {side} hand moves from {first:g} to {last:g} s: {JOINT_NAMES[spread.argmax()]} by "
-                f"{spread.max():.1f} degrees (standard deviation), expected a still neutral pose",
-                HandSimWarning,
-                stacklevel=3,
-            )
+            moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
+            text = f"the {side} hand moves from {first:g} to {last:g} s, {moving}; expected a still pose"
+            warnings.warn(text, HandSimWarning, stacklevel=3)
         return np.asarray(angles.mean(axis=0))
 
     def angle_spreads(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
@@ -672,17 +669,18 @@ class Take:
     def capture(self) -> Capture:
         """The points without labels, as an optical system exports them: one trajectory per column.
 
+        Frames that a stream lacks are there without points.
+
         Raises:
             CaptureError: There are no points.
         """
         names = tuple(f"*{column}" for column in range(self.point_list.num_columns))
-        return Capture(names, self.points, self.rate)
+        return self._steady(Capture(names, self.points, self.rate))
 
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
-        A hand without any label has no columns if the other hand has one. Frames that a stream lacks are
-        there without points, because marker files have no times.
+        A hand without any label has no columns if the other hand has one. See `capture` for streams.
 
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
@@ -704,13 +702,17 @@ class Take:
             labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
-        capture = labeled_columns(frames, rows, names, self.rate)
+        return self._steady(labeled_columns(frames, rows, names, self.rate))
+
+    def _steady(self, capture: Capture) -> Capture:
+        """The capture with frames without points where a stream lacks some: marker files have no times."""
         if self.numbers is None:
             return capture
-        order, count = np.arange(self.num_frames), len(times_at(self.times, self.rate))
+        times_at(self.times, self.rate)  # refuses too many frames
+        order = np.arange(self.num_frames)
         places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
         places = np.maximum.accumulate(places) + order  # two late frames have two places
-        positions = np.full((max(count, places[-1] + 1), *capture.positions.shape[1:]), np.nan)
+        positions = np.full((places[-1] + 1, *capture.positions.shape[1:]), np.nan)
         positions[places] = capture.positions
         return dataclasses.replace(capture, positions=positions)
 
@@ -742,7 +744,6 @@ class Take:
         *,
         rate: float | None = None,
         up: UpAxis = "z",
-        convention: Convention = "model",
         neutral: tuple[float, float] | None = None,
     ) -> None:
         """Write the motion for other programs, in a format by the ending of the file name.
@@ -752,18 +753,16 @@ class Take:
                 positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
-            convention: `isb` adds the angles of the ISB to a table, .csv or .parquet; see `angles`.
-            neutral: The first and the last time [s] of a pose in which the angles of the ISB are zero.
+            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero;
+                see `angles`.
 
         Raises:
-            ArgumentError: The ending, the axis or the convention is unknown, the file has no angles of the
-                ISB, no hand has a pose, or the rate is out of range.
+            ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
             HandSimError: A package that the format needs is not installed.
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a file")
         check_choice(up, get_args(UpAxis), noun="axis that points up")
-        check_choice(convention, get_args(Convention), noun="convention")
         path = Path(path)
         form = motion_format(path)
         if up != "z" and form.keeps_axes:
@@ -771,14 +770,12 @@ class Take:
                 f"up is {up} and the file {path}, expected a format with a direction that is up: "
                 f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
             )
-        if (convention == "isb" and not form.keeps_axes) or (neutral is not None and convention != "isb"):
-            given = f"neutral is {neutral}, " if neutral is not None else ""
+        if neutral is not None and not form.keeps_axes:
             raise ArgumentError(
-                f"{given}convention is {convention} and the file {path}; expected isb and a table, .csv or "
-                ".parquet, because other files and the model's angles are poses of the model"
+                f"neutral is {neutral} and the file {path}, expected .csv or .parquet with the ISB's angles"
             )
         take = form.take_of(self, None if rate is None else float(rate))
-        form.write(path, posed_motion(take, convention, neutral), up)
+        form.write(path, posed_motion(take, neutral), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take as an .npz file, whole or not at all, which `load_take` reads.
@@ -803,23 +800,12 @@ class Take:
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
 
 
-def posed_motion(
-    take: Take, convention: Convention = "model", neutral: tuple[float, float] | None = None
-) -> Motion:
+def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
-    hands = [
-        PosedHand.of(
-            hand.model,
-            take.qpos[:, n],
-            take.angles(hand.side, convention="isb", neutral=neutral) if convention == "isb" else {},
-        )
-        for n, hand in enumerate(take.hands)
-    ]
+    zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
+    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
-    words = "model and isb" if convention == "isb" else "model"
-    if neutral is not None:
-        words += f" from the pose at {neutral[0]:g} to {neutral[1]:g} s"
-    return Motion(take.rate, take.times, hands, bodies, words)
+    return Motion(take.rate, take.times, hands, bodies)
 
 
 def load_take(path: str | Path) -> Take:
@@ -860,10 +846,7 @@ def keypoints_of(
 
 
 def usual_rate(times: Float[np.ndarray, "T"], numbers: Int[np.ndarray, "T"]) -> float:
-    """Median rate of the first frames of a stream [Hz], those included that are missing by their numbers.
-
-    It has seven digits: times are rounded, and 59.99999999997783 Hz is the rate of no system.
-    """
+    """Median rate of the first frames of a stream [Hz], missing ones included, to seven digits."""
     spans, steps = np.diff(times[:RATED_FRAMES]), np.diff(numbers[:RATED_FRAMES])
     steps[steps <= 0] = 1  # the server began to count anew
     steps //= np.gcd.reduce(steps)  # some servers number every n-th frame
@@ -952,9 +935,7 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         columns, num_columns = arrays[POINT_COLUMNS.name], int(header["num_columns"])
         points = PointList(counted, **entries, columns=columns, num_columns=num_columns)
     return Take(
-        rate=usual_rate(*(arrays[name] for name in ("times", NUMBERS.name)))
-        if header["rate"] is None
-        else float(header["rate"]),
+        rate=float(header["rate"] or usual_rate(arrays["times"], arrays[NUMBERS.name])),
         hands=hands,
         bodies=bodies,
         settings=settings_of(header),

@@ -65,8 +65,7 @@ BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
 NUM_BONES: Final = len(BONES)
 
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
-# the published sets (docs/angles.md lists them side by side). The first metacarpal's count from the relaxed
-# thumb.
+# the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.
 _RANGES: Final = {
     "thumb": ((-33.0, 35.0), (-42.0, 45.0), (-15.0, 65.0), (-20.0, 85.0)),
     "index": ((-22.0, 22.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
@@ -90,10 +89,6 @@ JOINTS: Final[tuple[Joint, ...]] = tuple(
     for index, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
 )
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
-FORMER_JOINT_NAMES: Final = {
-    f"thumb_metacarpal_{motion}": f"thumb_CMC_{motion}" for motion in ("abduction", "flexion")
-}
-"""Names in files of earlier versions: skin markers do not measure the carpometacarpal joint."""
 NUM_JOINTS: Final = len(JOINTS)
 NUM_QPOS: Final = 7 + NUM_JOINTS
 NUM_KEYPOINTS: Final = 1 + 4 * len(DIGITS)

@@ -1,7 +1,6 @@
 """Motions of hands and things for writers, and joints of hands as tables, as BVH and as OpenXR's joints.
 
-A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name, and
-a last column that tells the convention of the angles.
+A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name.
 Numbers of a hand without a pose are empty in a .csv and null in a .parquet. OpenSim's .mot has a row per
 frame, angles in degrees, and y up as OpenSim's world; a hand without a pose keeps its last one, because
 OpenSim ends at NaN.
@@ -23,9 +22,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -36,19 +34,10 @@ from scipy import sparse
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
+from handsim.hand.angles import ISB_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values
-from handsim.hand.shape import (
-    BONE_NAMES,
-    BONES,
-    DIGITS,
-    FORMER_JOINT_NAMES,
-    JOINT_NAMES,
-    PALM,
-    SIDES,
-    Side,
-    bones_of,
-)
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import (
     UpAxis,
@@ -87,8 +76,8 @@ class PosedHand(NamedTuple):
     """Frames with a pose, at least one."""
     qpos: Float[np.ndarray, "T 27"]
     """Poses [m, rad]; missing ones repeat the last pose, or else the first."""
-    isb: Mapping[str, Float[np.ndarray, "T"]] = MappingProxyType({})
-    """Angles of the ISB by their names [rad], which tables have beside the model's; none if not wanted."""
+    neutral: Float[np.ndarray, "20"] | None = None
+    """Joint angles [rad] of the pose in which those of the ISB are zero; None for the convention's zero."""
 
     @property
     def side(self) -> Side:
@@ -97,14 +86,11 @@ class PosedHand(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        model: HandModel,
-        qpos: Float[np.ndarray, "T 27"],
-        isb: Mapping[str, Float[np.ndarray, "T"]] = MappingProxyType({}),
+        cls, model: HandModel, qpos: Float[np.ndarray, "T 27"], neutral: Float[np.ndarray, "20"] | None = None
     ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present), isb)
+        return cls(model, present, _held(qpos, present), neutral)
 
 
 class PosedBody(NamedTuple):
@@ -134,8 +120,6 @@ class Motion(NamedTuple):
     """Time of each frame [s], increasing."""
     hands: Sequence[PosedHand]
     bodies: Sequence[PosedBody]
-    convention: str = "model"
-    """What the angles are, in words of `handsim.hand.angles`."""
 
     @property
     def seconds(self) -> Float[np.ndarray, "T"]:
@@ -217,8 +201,8 @@ NUMBERS: Final[tuple[str, ...]] = (
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`, with positions in the world."""
-_LAST: Final = "convention"
-_FORMER_TITLES: Final = {f"{old}_rad": f"{new}_rad" for new, old in FORMER_JOINT_NAMES.items()}
+_FORMER: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
+"""Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
 
 
 class JointTable(NamedTuple):
@@ -237,8 +221,7 @@ def read_joint_csv(path: Path) -> JointTable:
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:
-        titles = [title.strip() for title in next(lines, [])]
-        titles = [_FORMER_TITLES.get(title, title) for title in titles]
+        titles = [_FORMER.get(title.strip(), title.strip()) for title in next(lines, [])]
         wanted = [*_FIRST, *_QPOS]
         missing = [name for name in wanted if name not in titles]
         if missing:
@@ -285,13 +268,13 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
     titles = _titles(motion)
-    row_format = ",%.9g" * len(titles) + f",{motion.convention}"
+    row_format = ",%.9g" * len(titles)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join([*_FIRST, *titles, _LAST]) + "\n")
+        file.write(",".join([*_FIRST, *titles]) + "\n")
         for frame, time in enumerate(motion.times.tolist()):
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
-                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * (len(titles) + 1)
+                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(titles)
                 file.write(f"{frame},{time:.9g},{hand.side}{text}\n")
 
 
@@ -314,24 +297,23 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             name: pyarrow.array(np.ascontiguousarray(column), from_pandas=True)  # NaN becomes null
             for name, column in zip(titles, numbers.T, strict=True)
         },
-        _LAST: pyarrow.array(
-            [motion.convention if there else None for there in np.isfinite(numbers[:, 0]).tolist()]
-        ),
     }
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         parquet.write_table(pyarrow.table(columns), file)
 
 
 def _titles(motion: Motion) -> tuple[str, ...]:
-    """The columns of numbers of a table."""
-    return *NUMBERS, *(f"{name}_isb_rad" for name in motion.hands[0].isb)
+    """The columns `NUMBERS`, and the angles of the ISB, whose names say if a neutral pose is zero."""
+    isb = "isb" if motion.hands[0].neutral is None else "isb_neutral"
+    return *NUMBERS, *(f"{name}_{isb}_rad" for name in ISB_NAMES)
 
 
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
-    """The columns `NUMBERS`, and the angles of the ISB if wanted; NaN in frames without a pose."""
+    """The columns of `_titles`; NaN in frames without a pose."""
     qpos = hand.qpos
     keypoints = hand_keypoints(hand.model, qpos)[:, 1:].reshape(len(qpos), -1)
-    numbers = np.column_stack([qpos, keypoints, *hand.isb.values()])
+    isb = isb_angles(hand.model.shape, qpos[:, 7:], hand.neutral)
+    numbers = np.concatenate([qpos, keypoints, isb], axis=1)
     numbers[~hand.present] = np.nan
     return numbers
 
@@ -350,7 +332,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         f"nRows={len(table)}",
         f"nColumns={table.shape[1]}",
         "inDegrees=yes",
-        f"convention={motion.convention}",
+        "convention=model",
         "endheader",
         "\t".join(names),
     ]
