@@ -587,18 +587,23 @@ class Take:
         fits poses to markers with these offsets, so markers computed from its poses need them too.
         """
         number = self.hand_index(side)
-        worn, qpos = self.hands[number], self.qpos[:, number]
         fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
         fits = fits[:: -(-len(fits) // _MAX_BIAS_FRAMES) or 1]
-        bias = np.zeros((worn.layout.num_markers, 3))
+        bias = np.zeros((self.hands[number].layout.num_markers, 3))
         if len(fits) < _MIN_BIAS_FRAMES:
             return bias
-        seen = self.point_list.labeled(self.hand_labels[number], fits)
-        rotations = worn.model.forward_kinematics(qpos[fits])[:, worn.attachment.main_bones, :3, :3]
-        local = np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos[fits])[0] - seen)
+        local = self.marker_offsets(side, fits)
         enough = np.isfinite(local[..., 0]).sum(axis=0) >= _MIN_BIAS_FRAMES
         bias[enough] = np.nanmedian(local[:, enough], axis=0)
         return bias
+
+    def marker_offsets(self, side: Side, frames: Int[np.ndarray, "F"]) -> Float[np.ndarray, "F M 3"]:
+        """Offset of a hand's markers from where they were seen, in the frames of their bones [m]; or NaN."""
+        number = self.hand_index(side)
+        worn, qpos = self.hands[number], self.qpos[frames, number]
+        seen = self.point_list.labeled(self.hand_labels[number], frames)
+        rotations = worn.model.forward_kinematics(qpos)[:, worn.attachment.main_bones, :3, :3]
+        return np.asarray(np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos)[0] - seen))
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
         """Whether each marker of all hands has a point in each frame."""
@@ -658,17 +663,18 @@ class Take:
     def capture(self) -> Capture:
         """The points without labels, as an optical system exports them: one trajectory per column.
 
+        Frames that a stream lacks are there without points.
+
         Raises:
             CaptureError: There are no points.
         """
         names = tuple(f"*{column}" for column in range(self.point_list.num_columns))
-        return Capture(names, self.points, self.rate)
+        return self._steady(Capture(names, self.points, self.rate))
 
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
-        A hand without any label has no columns if the other hand has one. Frames that a stream lacks are
-        there without points, because marker files have no times.
+        A hand without any label has no columns if the other hand has one. See `capture` for streams.
 
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
@@ -690,13 +696,17 @@ class Take:
             labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
-        capture = labeled_columns(frames, rows, names, self.rate)
+        return self._steady(labeled_columns(frames, rows, names, self.rate))
+
+    def _steady(self, capture: Capture) -> Capture:
+        """The capture with frames without points where a stream lacks some: marker files have no times."""
         if self.numbers is None:
             return capture
-        order, count = np.arange(self.num_frames), len(times_at(self.times, self.rate))
+        times_at(self.times, self.rate)  # refuses too many frames
+        order = np.arange(self.num_frames)
         places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
         places = np.maximum.accumulate(places) + order  # two late frames have two places
-        positions = np.full((max(count, places[-1] + 1), *capture.positions.shape[1:]), np.nan)
+        positions = np.full((places[-1] + 1, *capture.positions.shape[1:]), np.nan)
         positions[places] = capture.positions
         return dataclasses.replace(capture, positions=positions)
 
@@ -830,10 +840,7 @@ def keypoints_of(
 
 
 def usual_rate(times: Float[np.ndarray, "T"], numbers: Int[np.ndarray, "T"]) -> float:
-    """Median rate of the first frames of a stream [Hz], those included that are missing by their numbers.
-
-    It has seven digits: times are rounded, and 59.99999999997783 Hz is the rate of no system.
-    """
+    """Median rate of the first frames of a stream [Hz], missing ones included, to seven digits."""
     spans, steps = np.diff(times[:RATED_FRAMES]), np.diff(numbers[:RATED_FRAMES])
     steps[steps <= 0] = 1  # the server began to count anew
     steps //= np.gcd.reduce(steps)  # some servers number every n-th frame
