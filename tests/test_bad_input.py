@@ -187,7 +187,7 @@ CASES = {
     "render good.truth.npz --tones green --out out": "'green' | very-light | dark",
     "render good.truth.npz --placement rig --rig figure6 --out out": "'figure6' | 'figure5' | eight",
     "render good.truth.npz --views 0 --out out": "views is 0 | at least 1",
-    "render good.truth.npz --distance 0.8 0.5 --out out": "distance is 0.8",
+    "render good.truth.npz --distance 0.8 0.5 --out out": "distance is (0.8, 0.5) | smaller number first",
     "render good.truth.npz --distance 0.01 0.01 --out out": "distance is 0.01 | from 0.05 to 20",
     "render good.truth.npz --photos missing --out out": "missing | folder of photographs",
     "render good.truth.npz --photos photos --out out": "photos | .jpg, .jpeg, .png",
