@@ -27,7 +27,6 @@ some = {n: one for n, one in enumerate(compiling.read_list()) if one.name.starts
 compiling.missing_kernels = lambda listed, missing=compiling.missing_kernels: missing(some)
 print(len(some), *compiling.compile_kernels())
 """
-FEW = SOME.replace("compiling.missing", "some = dict(list(some.items())[:4])\ncompiling.missing", 1)
 
 
 def start(folder: Path, program: str, **options: object) -> subprocess.Popen[str]:
@@ -94,14 +93,14 @@ def test_a_kernel_calls_others():
 
 
 def test_an_empty_cache_is_filled_by_processes(tmp_path):
-    process = start(tmp_path, FEW)
+    process = start(tmp_path, SOME)
     out, errors = process.communicate(timeout=300)
     count, compiled, missing = map(int, out.split())
-    assert count == compiled == 4 and missing == 0
+    assert count == compiled > 3 and missing == 0
     first, *_ = errors.splitlines()
     assert first == f"compiling {count} kernels, once on this machine"
     assert len(list(tmp_path.rglob("*.nbc"))) == count
-    again = start(tmp_path, FEW)
+    again = start(tmp_path, SOME)
     out, errors = again.communicate(timeout=300)
     assert out.split() == [str(count), "0", "0"] and errors == ""
 
